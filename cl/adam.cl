@@ -1,0 +1,98 @@
+/* Activations and one step of Adam on the raw parameters of all Gaussians: the chain through softplus,
+   bounded sigmoid and normalisation, the density and shape terms of the objective, the moments, the step.
+   Twins: fields/gaussians.py and optim/adam.py. */
+#include "common/gaussian.h"
+
+inline vf logistic(vf x) { return 1.0f / (1.0f + exp(-x)); }
+inline vf softplus(vf x) { return max(max(x, 0.0f) + log1p(exp(-fabs(x))), 1e-12f); }
+
+__kernel void activate(
+    __global const float *raw, const int count, const int stride, const float scale_min, const float scale_max,
+    __global float *gaussians)
+{
+    const int first = (int)get_global_id(0) * LANES;
+    if (first >= stride)
+        return;
+    __global const float *r = raw + first;
+    __global float *g = gaussians + first;
+    for (int k = 0; k < 3; ++k) {
+        V_STORE(V_LOAD(r + (size_t)k * stride), g + (size_t)k * stride);
+        V_STORE(scale_min + (scale_max - scale_min) * logistic(V_LOAD(r + (size_t)(ROW_SCALE + k) * stride)),
+                g + (size_t)(ROW_SCALE + k) * stride);
+    }
+    const vf w = V_LOAD(r + 6 * (size_t)stride), x = V_LOAD(r + 7 * (size_t)stride);
+    const vf y = V_LOAD(r + 8 * (size_t)stride), z = V_LOAD(r + 9 * (size_t)stride);
+    const vf inv = rsqrt(w * w + x * x + y * y + z * z);
+    V_STORE(w * inv, g + 6 * (size_t)stride);
+    V_STORE(x * inv, g + 7 * (size_t)stride);
+    V_STORE(y * inv, g + 8 * (size_t)stride);
+    V_STORE(z * inv, g + 9 * (size_t)stride);
+    V_STORE(softplus(V_LOAD(r + 10 * (size_t)stride)), g + 10 * (size_t)stride);
+}
+
+/* dL/dparameter -> dL/draw, in place; adds the regularisers whose gradient needs no image.
+   shape term: weight / count * (relu(longest / shortest - ratio)^2 + relu(floor - shortest)^2) */
+__kernel void chain_activations(
+    __global const float *raw, __global const float *gaussians, const int count, const int stride,
+    const float scale_min, const float scale_max,
+    const float density_weight,      /* weight / count of the mean density */
+    const float shape_weight, const float shape_ratio, const float shape_floor,
+    __global float *gradients,       /* (13, stride) */
+    __global float *statistics)      /* (2, stride): sum of centre-gradient norms, iterations in view */
+{
+    const int first = (int)get_global_id(0) * LANES;
+    if (first >= stride)
+        return;
+    __global const float *r = raw + first;
+    __global const float *g = gaussians + first;
+    __global float *d = gradients + first;
+    vf s[3], ds[3];
+    for (int k = 0; k < 3; ++k) {
+        s[k] = V_LOAD(g + (size_t)(ROW_SCALE + k) * stride);
+        ds[k] = V_LOAD(d + (size_t)(ROW_SCALE + k) * stride);
+    }
+    const vf longest = max(s[0], max(s[1], s[2])), shortest = min(s[0], min(s[1], s[2]));
+    const vf excess = max(longest / shortest - shape_ratio, 0.0f), lack = max(shape_floor - shortest, 0.0f);
+    const vf by_longest = 2.0f * shape_weight * excess / shortest;
+    const vf by_shortest = -2.0f * shape_weight * (excess * longest / (shortest * shortest) + lack);
+    for (int k = 0; k < 3; ++k) {
+        const vf total = ds[k] + V_PICK(0.0f, by_longest, s[k] == longest) + V_PICK(0.0f, by_shortest, s[k] == shortest);
+        const vf sigma = (s[k] - scale_min) / (scale_max - scale_min);
+        V_STORE(total * (scale_max - scale_min) * sigma * (1.0f - sigma), d + (size_t)(ROW_SCALE + k) * stride);
+    }
+    vf length2 = (vf)(0.0f);
+    for (int k = 0; k < 4; ++k) {
+        const vf q = V_LOAD(r + (size_t)(ROW_QUATERNION + k) * stride);
+        length2 += q * q;
+    }
+    const vf inv = rsqrt(length2);
+    for (int k = 0; k < 4; ++k) {
+        __global float *at = d + (size_t)(ROW_QUATERNION + k) * stride;
+        V_STORE(V_LOAD(at) * inv, at);
+    }
+    __global float *at = d + (size_t)ROW_DENSITY * stride;
+    V_STORE((V_LOAD(at) + density_weight) * logistic(V_LOAD(r + (size_t)ROW_DENSITY * stride)), at);
+
+    const vf gu = V_LOAD(d + 11 * (size_t)stride), gv = V_LOAD(d + 12 * (size_t)stride);
+    const vf norm = sqrt(gu * gu + gv * gv);
+    __global float *stat = statistics + first;
+    V_STORE(V_LOAD(stat) + norm, stat);
+    V_STORE(V_LOAD(stat + stride) + V_PICK(0.0f, 1.0f, norm > 0.0f), stat + stride);
+}
+
+__kernel void adam_step(
+    __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride) */
+    const int stride, __constant float *rates,  /* (11,), bias corrections folded in */
+    const float beta1, const float beta2, const float epsilon)
+{
+    const int first = (int)get_global_id(0) * LANES, row = (int)get_global_id(1);
+    if (first >= stride)
+        return;
+    const size_t at = (size_t)row * stride + first, second = (size_t)11 * stride;
+    const vf g = V_LOAD(gradients + at);
+    const vf m = beta1 * V_LOAD(moments + at) + (1.0f - beta1) * g;
+    const vf v = beta2 * V_LOAD(moments + second + at) + (1.0f - beta2) * g * g;
+    V_STORE(m, moments + at);
+    V_STORE(v, moments + second + at);
+    V_STORE(V_LOAD(raw + at) - rates[row] * m / (sqrt(v) + epsilon), raw + at);
+}

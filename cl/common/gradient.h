@@ -1,0 +1,31 @@
+/* Rows of a gradient matrix (13, stride): the parameters' rows, then the two numbers that density control
+   watches. Rotations are differentiated by a small turn in the Gaussian's own frame (a torque) and stored
+   as the tangent 2 q (0, torque) of the unit quaternion. */
+#include "common/gaussian.h"
+
+#define ROW_STATISTIC 11
+
+inline void gradient_store(__global float *out, const int stride, const int add, v3 mean, v3 scale,
+                           v3 torque, vf w, vf x, vf y, vf z, vf density)
+{
+    const vf values[11] = {
+        mean.x, mean.y, mean.z, scale.x, scale.y, scale.z,
+        2.0f * (-x * torque.x - y * torque.y - z * torque.z),
+        2.0f * (w * torque.x + y * torque.z - z * torque.y),
+        2.0f * (w * torque.y + z * torque.x - x * torque.z),
+        2.0f * (w * torque.z + x * torque.y - y * torque.x),
+        density};
+    for (int r = 0; r < 11; ++r) {
+        __global float *at = out + (size_t)r * stride;
+        const vf before = add ? V_LOAD(at) : (vf)(0.0f);
+        V_STORE(before + values[r], at);
+    }
+}
+
+/* sums (.., 16) of LANES Gaussians that lie `step` floats apart, turned into one vector a field */
+inline void gather_sums(__global const float *sums, const size_t step, const int fields, __private float *buffer)
+{
+    for (int lane = 0; lane < LANES; ++lane)
+        for (int f = 0; f < fields; ++f)
+            buffer[f * LANES + lane] = sums[lane * step + f];
+}

@@ -1,0 +1,51 @@
+/* Vectors of LANES floats. Width 1 is a plain scalar, where comparisons give 1 instead of -1 and
+   select/any have no scalar form, so everything that differs is hidden here. */
+#ifndef LANES
+#error "build with -DLANES=1, 4, 8 or 16"
+#endif
+
+#if LANES == 1
+typedef float vf;
+typedef int vi;
+#define V_LOAD(p) (*(p))
+#define V_STORE(v, p) (*(p) = (v))
+#define VI_LOAD(p) (*(p))
+#define VI_STORE(v, p) (*(p) = (v))
+#define V_IOTA (0.0f)
+#define V_PICK(no, yes, condition) ((condition) ? (yes) : (no))
+#define VI_PICK(no, yes, condition) ((condition) ? (yes) : (no))
+#define V_ANY(condition) (condition)
+#define V_INT(v) convert_int(v)
+#define V_FLOAT(v) convert_float(v)
+inline float v_sum(vf v) { return v; }
+#else
+#define LANE_PASTE(a, b) a##b
+#define LANE_TYPE(a, b) LANE_PASTE(a, b)
+typedef LANE_TYPE(float, LANES) vf;
+typedef LANE_TYPE(int, LANES) vi;
+#define V_LOAD(p) LANE_TYPE(vload, LANES)(0, (p))
+#define V_STORE(v, p) LANE_TYPE(vstore, LANES)((v), 0, (p))
+#define VI_LOAD(p) LANE_TYPE(vload, LANES)(0, (p))
+#define VI_STORE(v, p) LANE_TYPE(vstore, LANES)((v), 0, (p))
+#define V_PICK(no, yes, condition) select((vf)(no), (vf)(yes), (condition))
+#define VI_PICK(no, yes, condition) select((vi)(no), (vi)(yes), (condition))
+#define V_ANY(condition) any(condition)
+#define V_INT(v) LANE_TYPE(convert_int, LANES)(v)
+#define V_FLOAT(v) LANE_TYPE(convert_float, LANES)(v)
+#if LANES == 4
+#define V_IOTA ((vf)(0, 1, 2, 3))
+inline float v_sum(vf v) { float2 b = v.lo + v.hi; return b.x + b.y; }
+#elif LANES == 8
+#define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7))
+inline float v_sum(vf v) { float4 a = v.lo + v.hi; float2 b = a.lo + a.hi; return b.x + b.y; }
+#else
+#define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+inline float v_sum(vf v)
+{
+    float8 c = v.lo + v.hi;
+    float4 a = c.lo + c.hi;
+    float2 b = a.lo + a.hi;
+    return b.x + b.y;
+}
+#endif
+#endif

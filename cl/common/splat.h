@@ -1,0 +1,85 @@
+/* What the projector keeps of a Gaussian seen from one time cell, and its value at a pixel.
+
+   With pixel offset D = (u - u0, v - v0), num = D'SD (S from the Gram form, kept as its triangular
+   factor L), B = 1 + b.D and Q = B^2 + num/kappa, the line integral of the Gaussian along the pixel's ray is
+
+       p = amp * sqrt(|d|^2 / Q) * exp(-num / (2 Q))
+
+   with d the vector from source to pixel. This is exact, perspective included: docs/mathematics.md.
+   The affine (R2-Gaussian) splat is Q = 1 and |d| of the central ray. */
+#include "common/lanes.h"
+
+#define RECORD 16
+#define REC_U_REST 0      /* u0 - REC_U_WHOLE */
+#define REC_V_REST 1
+#define REC_L11 2
+#define REC_L12 3
+#define REC_L22 4
+#define REC_B1 5
+#define REC_B2 6
+#define REC_INV_KAPPA 7
+#define REC_AMP 8         /* density, ray factor and cell weight */
+#define REC_U_WHOLE 9     /* int */
+#define REC_V_WHOLE 10    /* int */
+#define REC_U_LO 11       /* int: the pixels to visit, empty when HI < LO */
+#define REC_U_HI 12
+#define REC_V_LO 13
+#define REC_V_HI 14
+
+/* constants of a cell, floats */
+#define CELL 24
+#define CELL_SOURCE 0     /* 3 */
+#define CELL_EU 3         /* 3: step to the next pixel across the lines */
+#define CELL_EV 6         /* 3: step to the next line */
+#define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source) */
+#define CELL_WEIGHT 10
+#define CELL_D00 11       /* |d|^2 = D00 + u (DU + DUV v + DUU u) + v (DV + DVV v) */
+#define CELL_DU 12
+#define CELL_DV 13
+#define CELL_DUU 14
+#define CELL_DUV 15
+#define CELL_DVV 16
+
+#define MINUS_HALF_LOG2E (-0.72134752044f)
+
+/* constants of a splat along one line */
+typedef struct {
+    float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
+} splat_line;
+
+inline splat_line splat_on_line(__global const float *rec, __global const float *cell, float v, float dv)
+{
+    splat_line s;
+    s.l11 = rec[REC_L11];
+    s.t0 = rec[REC_L12] * dv;
+    s.k = (rec[REC_L22] * dv) * (rec[REC_L22] * dv);
+    s.b1 = rec[REC_B1];
+    s.b0 = 1.0f + rec[REC_B2] * dv;
+    s.inv_kappa = rec[REC_INV_KAPPA];
+    s.amp = rec[REC_AMP];
+    s.d0 = cell[CELL_D00] + v * (cell[CELL_DV] + cell[CELL_DVV] * v);
+    s.d1 = cell[CELL_DU] + cell[CELL_DUV] * v;
+    s.d2 = cell[CELL_DUU];
+    return s;
+}
+
+/* exponent (num/Q) and value at pixels u (absolute) with offset du from the centre */
+inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
+{
+    vf t = s.l11 * du + s.t0;
+    vf num = t * t + s.k;
+#if AFFINE
+    *big_b = (vf)(1.0f);
+    *inv_q = (vf)(1.0f);
+    *num_out = num;
+    return s.amp * exp2(MINUS_HALF_LOG2E * num);
+#else
+    vf b = s.b1 * du + s.b0;
+    vf rq = 1.0f / (b * b + num * s.inv_kappa);
+    vf d2 = (s.d2 * u + s.d1) * u + s.d0;
+    *big_b = b;
+    *inv_q = rq;
+    *num_out = num;
+    return s.amp * sqrt(d2 * rq) * exp2(MINUS_HALF_LOG2E * (num * rq));
+#endif
+}

@@ -1,0 +1,131 @@
+/* L1 + D-SSIM of one frame and its gradient, as separable passes over images with zero padding:
+   guard floats, then (lines, pitch), pitch at least width + guard and everything past width zero, so that
+   a window may reach past either end of a line. Twin: objective/image_terms.py. */
+#include "common/lanes.h"
+
+#define RADIUS 5
+
+inline vf masked(__global const float *image, __global const float *mask, const size_t at)
+{
+    return V_LOAD(image + at) * V_LOAD(mask + at);
+}
+
+/* rows pass: five moments x, y, xx, yy, xy blurred along the line */
+__kernel void ssim_moments(
+    __global const float *rendered, __global const float *measured, __global const float *mask,
+    __constant float *window, const int lines, const int width, const int pitch,
+    __global float *moments)         /* 5 images */
+{
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1);
+    if (u >= width || v >= lines)
+        return;
+    const size_t row = IMAGE_GUARD + (size_t)v * pitch + u, image = IMAGE_GUARD + (size_t)lines * pitch;
+    vf x = (vf)(0.0f), y = x, xx = x, yy = x, xy = x;
+    for (int k = -RADIUS; k <= RADIUS; ++k) {
+        const float w = window[k + RADIUS];
+        const vf a = masked(rendered, mask, row + k), b = masked(measured, mask, row + k);
+        const vf wa = w * a, wb = w * b;
+        x += wa;
+        y += wb;
+        xx += wa * a;
+        yy += wb * b;
+        xy += wa * b;
+    }
+    V_STORE(x, moments + row);
+    V_STORE(y, moments + image + row);
+    V_STORE(xx, moments + 2 * image + row);
+    V_STORE(yy, moments + 3 * image + row);
+    V_STORE(xy, moments + 4 * image + row);
+}
+
+/* columns pass, the SSIM map, its derivatives by mean(x), mean(xx), mean(xy), and the sums of a line */
+__kernel void ssim_map(
+    __global const float *moments, __global const float *rendered, __global const float *measured,
+    __global const float *mask, __constant float *window,
+    const int lines, const int width, const int pitch, const float c1, const float c2,
+    __global float *partials,        /* 3 images */
+    __global float *line_sums)       /* (lines, 4): ssim, |x - y|, masked pixels, 0 */
+{
+    const int v = (int)get_global_id(0);
+    if (v >= lines)
+        return;
+    const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
+    vf ssim_sum = (vf)(0.0f), l1_sum = ssim_sum, pixels = ssim_sum;
+    for (int u = 0; u < width; u += LANES) {
+        const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
+        vf m[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+        for (int k = max(-RADIUS, -v); k <= min(RADIUS, lines - 1 - v); ++k) {
+            const float w = window[k + RADIUS];
+            const size_t there = at + (long)k * pitch;
+            for (int f = 0; f < 5; ++f)
+                m[f] += w * V_LOAD(moments + f * image + there);
+        }
+        const vi inside = V_INT((vf)(u) + V_IOTA) < width;
+        const vf xx = m[2] - m[0] * m[0], yy = m[3] - m[1] * m[1], xy = m[4] - m[0] * m[1];
+        const vf n1 = 2.0f * m[0] * m[1] + c1, n2 = 2.0f * xy + c2;
+        const vf d1 = m[0] * m[0] + m[1] * m[1] + c1, d2 = xx + yy + c2;
+        const vf inv = 1.0f / (d1 * d2);
+        const vf ssim = n1 * n2 * inv;
+        const vf by_xx = -ssim / d2, by_xy = 2.0f * n1 * inv;
+        const vf by_x = 2.0f * (m[1] * n2 * inv - m[0] * ssim / d1) - 2.0f * m[0] * by_xx - m[1] * by_xy;
+        V_STORE(V_PICK(0.0f, by_x, inside), partials + at);
+        V_STORE(V_PICK(0.0f, by_xx, inside), partials + image + at);
+        V_STORE(V_PICK(0.0f, by_xy, inside), partials + 2 * image + at);
+        const vf weight = V_LOAD(mask + at);
+        ssim_sum += V_PICK(0.0f, ssim, inside);
+        l1_sum += weight * fabs(V_LOAD(rendered + at) - V_LOAD(measured + at));
+        pixels += weight;
+    }
+    line_sums[4 * v] = v_sum(ssim_sum);
+    line_sums[4 * v + 1] = v_sum(l1_sum);
+    line_sums[4 * v + 2] = v_sum(pixels);
+    line_sums[4 * v + 3] = 0.0f;
+}
+
+/* rows pass of the three derivative images */
+__kernel void ssim_spread(
+    __global const float *partials, __constant float *window, const int lines, const int width, const int pitch,
+    __global float *spread)          /* 3 images */
+{
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1);
+    if (u >= width || v >= lines)
+        return;
+    const size_t row = IMAGE_GUARD + (size_t)v * pitch + u, image = IMAGE_GUARD + (size_t)lines * pitch;
+    for (int f = 0; f < 3; ++f) {
+        vf sum = (vf)(0.0f);
+        for (int k = -RADIUS; k <= RADIUS; ++k)
+            sum += window[k + RADIUS] * V_LOAD(partials + f * image + row + k);
+        V_STORE(sum, spread + f * image + row);
+    }
+}
+
+/* columns pass, and the gradient l1_weight sign(x - y) - ssim_weight dSSIM/dx */
+__kernel void image_gradient(
+    __global const float *spread, __global const float *rendered, __global const float *measured,
+    __global const float *mask, __constant float *window,
+    const int lines, const int width, const int pitch, const float l1_weight, const float ssim_weight,
+    __global float *gradient)        /* guard, then (lines, pitch) */
+{
+    const int v = (int)get_global_id(0);
+    if (v >= lines)
+        return;
+    const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
+    for (int u = 0; u < pitch; u += LANES) {
+        const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
+        if (u >= width) {
+            V_STORE((vf)(0.0f), gradient + at);
+            continue;
+        }
+        vf m[3] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+        if (ssim_weight != 0.0f)
+            for (int k = max(-RADIUS, -v); k <= min(RADIUS, lines - 1 - v); ++k)
+                for (int f = 0; f < 3; ++f)
+                    m[f] += window[k + RADIUS] * V_LOAD(spread + f * image + at + (long)k * pitch);
+        const vf weight = V_LOAD(mask + at);
+        const vf x = V_LOAD(rendered + at), y = V_LOAD(measured + at);
+        const vf by_ssim = m[0] + 2.0f * weight * x * m[1] + weight * y * m[2];
+        const vf difference = x - y;
+        const vf sign_of = V_PICK(V_PICK(0.0f, -1.0f, difference < 0.0f), 1.0f, difference > 0.0f);
+        V_STORE(weight * (l1_weight * sign_of - ssim_weight * by_ssim), gradient + at);
+    }
+}

@@ -1,0 +1,125 @@
+/* Adjoint of the splat, second pass: from the pixel sums of every time cell to the gradients of mean, scale,
+   rotation and density. A work-item takes LANES Gaussians and walks the cells in a fixed order. */
+#include "common/precise.h"
+#include "common/gradient.h"
+#include "common/splat.h"
+
+__kernel void splat_chain(
+    __global const float *gaussians,      /* (11, stride) */
+    __global const float *cells,          /* (C, CELL) */
+    __global const coefficient *matrices, /* (C, 12) */
+    __global const float *records,        /* (stride, C, RECORD) */
+    __global const float *sums,           /* (stride, C, RECORD) */
+    const int cell_count, const int count, const int stride,
+    const float half_width, const float half_lines,
+    __global float *gradients)            /* (13, stride) */
+{
+    const int first = (int)get_global_id(0) * LANES;
+    if (first >= stride)
+        return;
+    __global const float *g = gaussians + first;
+    const v3 mean = v3_make(V_LOAD(g), V_LOAD(g + stride), V_LOAD(g + 2 * stride));
+    const v3 scale = v3_make(V_LOAD(g + 3 * stride), V_LOAD(g + 4 * stride), V_LOAD(g + 5 * stride));
+    const vf qw = V_LOAD(g + 6 * stride), qx = V_LOAD(g + 7 * stride);
+    const vf qy = V_LOAD(g + 8 * stride), qz = V_LOAD(g + 9 * stride);
+    const frame3 axes = quaternion_frame(qw, qx, qy, qz);
+    const vf density = V_LOAD(g + 10 * stride);
+    const v3 inv_scale = v3_make(1.0f / scale.x, 1.0f / scale.y, 1.0f / scale.z);
+    const vf det = scale.x * scale.y * scale.z;
+
+    const vf zero = (vf)(0.0f);
+    v3 by_mean = v3_make(zero, zero, zero), by_scale = by_mean, torque = by_mean;
+    vf by_log_density = zero, by_u0 = zero, by_v0 = zero;
+
+    for (int c = 0; c < cell_count; ++c) {
+        float fields[10 * LANES];
+        int drawn = 0;
+        for (int lane = 0; lane < LANES; ++lane) {
+            const size_t at = ((size_t)(first + lane) * cell_count + c) * RECORD;
+            __global const int *whole = (__global const int *)(records + at);
+            const int here = first + lane < count && whole[REC_V_HI] >= whole[REC_V_LO];
+            drawn |= here;
+            for (int f = 0; f < 10; ++f)
+                fields[f * LANES + lane] = here ? sums[at + f] : 0.0f;
+        }
+        if (!drawn)
+            continue;
+        const vf w = V_LOAD(fields), by_ik = V_LOAD(fields + LANES);
+        const vf s_uu = V_LOAD(fields + 2 * LANES), s_uv = 2.0f * V_LOAD(fields + 3 * LANES);
+        const vf s_vv = V_LOAD(fields + 4 * LANES);
+        const vf s_u = V_LOAD(fields + 5 * LANES), s_v = V_LOAD(fields + 6 * LANES);
+        const vf s_b = V_LOAD(fields + 7 * LANES), by_b1 = V_LOAD(fields + 8 * LANES), by_b2 = V_LOAD(fields + 9 * LANES);
+
+        __global const float *cell = cells + c * CELL;
+        __global const coefficient *m = matrices + c * 12;
+        const vf z = wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z));
+        const vf inv_z = 1.0f / z;
+        const vf u0 = wide_value(wide_dot(m, mean.x, mean.y, mean.z)) * inv_z;
+        const vf v0 = wide_value(wide_dot(m + 4, mean.x, mean.y, mean.z)) * inv_z;
+        const v3 ray = to_local(axes, v3_make(mean.x - cell[CELL_SOURCE], mean.y - cell[CELL_SOURCE + 1],
+                                              mean.z - cell[CELL_SOURCE + 2]));
+        const v3 eu = to_local(axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
+        const v3 ev = to_local(axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
+        const v3 white = v3_mul(ray, inv_scale);
+        const vf kappa = v3_dot(white, white);
+        const vf inv_kappa = 1.0f / kappa;
+
+        /* S = z^2 / (kappa det^2) a_i.a_j with a_i = scale * (ray x e_i) */
+        const v3 mu = v3_cross(ray, eu), mv = v3_cross(ray, ev);
+        const v3 au = v3_mul(scale, mu), av = v3_mul(scale, mv);
+        const vf factor = (z / det) * (z / det) * inv_kappa;
+        const vf s11 = factor * v3_dot(au, au), s12 = factor * v3_dot(au, av), s22 = factor * v3_dot(av, av);
+        const vf t_s = s_uu * s11 + s_uv * s12 + s_vv * s22;
+        const v3 by_au = v3_scale(v3_add(v3_scale(au, 2.0f * s_uu), v3_scale(av, s_uv)), factor);
+        const v3 by_av = v3_scale(v3_add(v3_scale(av, 2.0f * s_vv), v3_scale(au, s_uv)), factor);
+        const v3 by_mu = v3_mul(scale, by_au), by_mv = v3_mul(scale, by_av);
+        v3 by_ray = v3_add(v3_cross(eu, by_mu), v3_cross(ev, by_mv));
+        v3 by_eu = v3_cross(by_mu, ray), by_ev = v3_cross(by_mv, ray);
+        v3 by_s = v3_add(v3_mul(mu, by_au), v3_mul(mv, by_av));
+        by_s = v3_add(by_s, v3_scale(inv_scale, -2.0f * t_s));
+
+        vf by_kappa = -inv_kappa * (t_s + 0.5f * w);
+        vf by_z = inv_z * 2.0f * t_s;
+        v3 by_white = v3_make(zero, zero, zero);
+#if AFFINE
+        const vf b1 = zero, b2 = zero;
+        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray)));
+#else
+        /* b_i = z white.(e_i / scale) / kappa */
+        const v3 wu = v3_mul(eu, inv_scale), wv = v3_mul(ev, inv_scale);
+        const vf ratio = z * inv_kappa;
+        const vf b1 = ratio * v3_dot(white, wu), b2 = ratio * v3_dot(white, wv);
+        const vf t_b = by_b1 * b1 + by_b2 * b2;
+        by_kappa -= inv_kappa * (t_b + by_ik * inv_kappa);
+        by_z += inv_z * (t_b + w);
+        by_white = v3_scale(v3_add(v3_scale(wu, by_b1), v3_scale(wv, by_b2)), ratio);
+        const v3 by_wu = v3_scale(white, ratio * by_b1), by_wv = v3_scale(white, ratio * by_b2);
+        by_eu = v3_add(by_eu, v3_mul(by_wu, inv_scale));
+        by_ev = v3_add(by_ev, v3_mul(by_wv, inv_scale));
+        by_s = v3_add(by_s, v3_scale(v3_mul(inv_scale, v3_add(v3_mul(by_wu, wu), v3_mul(by_wv, wv))), -1.0f));
+#endif
+        by_white = v3_add(by_white, v3_scale(white, 2.0f * by_kappa));
+        const v3 by_white_s = v3_mul(by_white, inv_scale);
+        by_ray = v3_add(by_ray, by_white_s);
+        by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
+
+        const vf g_u0 = -(2.0f * (s11 * s_u + s12 * s_v) + b1 * s_b);
+        const vf g_v0 = -(2.0f * (s12 * s_u + s22 * s_v) + b2 * s_b);
+        torque = v3_add(torque, v3_add(v3_cross(by_ray, ray), v3_add(v3_cross(by_eu, eu), v3_cross(by_ev, ev))));
+        by_scale = v3_add(by_scale, by_s);
+        by_log_density += w;
+        by_u0 += g_u0;
+        by_v0 += g_v0;
+
+        /* u0 = (row 0 . x) / z, v0 = (row 1 . x) / z, z = row 2 . x */
+        const vf cu = g_u0 * inv_z, cv = g_v0 * inv_z, cz = by_z - cu * u0 - cv * v0;
+        const v3 world = to_world(axes, by_ray);
+        by_mean.x += world.x + cu * COEFFICIENT(m[0]) + cv * COEFFICIENT(m[4]) + cz * COEFFICIENT(m[8]);
+        by_mean.y += world.y + cu * COEFFICIENT(m[1]) + cv * COEFFICIENT(m[5]) + cz * COEFFICIENT(m[9]);
+        by_mean.z += world.z + cu * COEFFICIENT(m[2]) + cv * COEFFICIENT(m[6]) + cz * COEFFICIENT(m[10]);
+    }
+    __global float *out = gradients + first;
+    gradient_store(out, stride, 0, by_mean, by_scale, torque, qw, qx, qy, qz, by_log_density / density);
+    V_STORE(by_u0 * half_width, out + (size_t)ROW_STATISTIC * stride);
+    V_STORE(by_v0 * half_lines, out + (size_t)(ROW_STATISTIC + 1) * stride);
+}

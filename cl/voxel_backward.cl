@@ -1,0 +1,101 @@
+/* Adjoint of the voxeliser: each Gaussian gathers the moments of dL/dvolume under it, then chains them to
+   its parameters. */
+#include "common/gradient.h"
+#include "common/voxel.h"
+
+#define SUMS 16
+
+__kernel void voxel_backward(
+    __global const float *records, __global const float *by_volume, /* guard, then (z, y, pitch) */
+    const int4 shape, const int pitch, const int count, const float cutoff2,
+    __global float *sums)            /* (stride, SUMS): w, w x y z, w xx xy xz yy yz zz in voxels */
+{
+    const int g = (int)get_global_id(0);
+    if (g >= count)
+        return;
+    const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
+    __global const float *rec = records + (size_t)g * VOXEL_RECORD;
+    __global const int *whole = (__global const int *)rec;
+    __global float *out = sums + (size_t)g * SUMS;
+    vf w_ = (vf)(0.0f), x_ = w_, y_ = w_, z_ = w_, xx = w_, xy = w_, xz = w_, yy = w_, yz = w_, zz = w_;
+    for (int z = whole[VOX_LO + 2]; z <= whole[VOX_HI + 2]; ++z)
+        for (int y = whole[VOX_LO + 1]; y <= whole[VOX_HI + 1]; ++y) {
+            const float dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
+            const float dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];
+            const float a0 = rec[VOX_U12] * dy + rec[VOX_U13] * dz;
+            const float b = rec[VOX_U22] * dy + rec[VOX_U23] * dz, c = rec[VOX_U33] * dz;
+            const float k = b * b + c * c;
+            __global const float *row = by_volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
+            for (int x = whole[VOX_LO]; x <= whole[VOX_HI]; x += LANES) {
+                const vf dx = ((float)(x - whole[VOX_WHOLE]) - rec[VOX_REST]) + V_IOTA;
+                const vf a = rec[VOX_U11] * dx + a0;
+                const vf q = a * a + k;
+                const vf value = rec[VOX_DENSITY] * exp2(MINUS_HALF_LOG2E * q);
+                const vf w = V_PICK(0.0f, V_LOAD(row + x) * value, q <= limit);
+                const vf wx = w * dx;
+                w_ += w;
+                x_ += wx;
+                y_ += w * dy;
+                z_ += w * dz;
+                xx += wx * dx;
+                xy += wx * dy;
+                xz += wx * dz;
+                yy += w * (dy * dy);
+                yz += w * (dy * dz);
+                zz += w * (dz * dz);
+            }
+        }
+    out[0] = v_sum(w_);
+    out[1] = v_sum(x_);
+    out[2] = v_sum(y_);
+    out[3] = v_sum(z_);
+    out[4] = v_sum(xx);
+    out[5] = v_sum(xy);
+    out[6] = v_sum(xz);
+    out[7] = v_sum(yy);
+    out[8] = v_sum(yz);
+    out[9] = v_sum(zz);
+}
+
+__kernel void voxel_chain(
+    __global const float *gaussians, __global const float *sums, const float4 pitch, const int stride,
+    const int add, const float weight,
+    __global float *gradients)       /* (13, stride) */
+{
+    const int first = (int)get_global_id(0) * LANES;
+    if (first >= stride)
+        return;
+    float fields[10 * LANES];
+    gather_sums(sums + (size_t)first * SUMS, SUMS, 10, fields);
+    __global const float *g = gaussians + first;
+    const v3 scale = v3_make(V_LOAD(g + 3 * stride), V_LOAD(g + 4 * stride), V_LOAD(g + 5 * stride));
+    const vf qw = V_LOAD(g + 6 * stride), qx = V_LOAD(g + 7 * stride);
+    const vf qy = V_LOAD(g + 8 * stride), qz = V_LOAD(g + 9 * stride);
+    const frame3 axes = quaternion_frame(qw, qx, qy, qz);
+    const v3 inv = v3_make(1.0f / scale.x, 1.0f / scale.y, 1.0f / scale.z);
+    const v3 inv2 = v3_mul(inv, inv);
+    const vf w = weight * V_LOAD(fields);
+    const v3 n = to_local(axes, v3_make(weight * pitch.x * V_LOAD(fields + LANES),
+                                        weight * pitch.y * V_LOAD(fields + 2 * LANES),
+                                        weight * pitch.z * V_LOAD(fields + 3 * LANES)));
+    /* second moments in the world, then in the Gaussian's own frame */
+    const vf xx = weight * pitch.x * pitch.x * V_LOAD(fields + 4 * LANES);
+    const vf xy = weight * pitch.x * pitch.y * V_LOAD(fields + 5 * LANES);
+    const vf xz = weight * pitch.x * pitch.z * V_LOAD(fields + 6 * LANES);
+    const vf yy = weight * pitch.y * pitch.y * V_LOAD(fields + 7 * LANES);
+    const vf yz = weight * pitch.y * pitch.z * V_LOAD(fields + 8 * LANES);
+    const vf zz = weight * pitch.z * pitch.z * V_LOAD(fields + 9 * LANES);
+    const v3 na = v3_make(xx * axes.a.x + xy * axes.a.y + xz * axes.a.z, xy * axes.a.x + yy * axes.a.y + yz * axes.a.z,
+                          xz * axes.a.x + yz * axes.a.y + zz * axes.a.z);
+    const v3 nb = v3_make(xx * axes.b.x + xy * axes.b.y + xz * axes.b.z, xy * axes.b.x + yy * axes.b.y + yz * axes.b.z,
+                          xz * axes.b.x + yz * axes.b.y + zz * axes.b.z);
+    const v3 nc = v3_make(xx * axes.c.x + xy * axes.c.y + xz * axes.c.z, xy * axes.c.x + yy * axes.c.y + yz * axes.c.z,
+                          xz * axes.c.x + yz * axes.c.y + zz * axes.c.z);
+    const vf ab = v3_dot(axes.a, nb), ac = v3_dot(axes.a, nc), bc = v3_dot(axes.b, nc);
+    const v3 diagonal = v3_make(v3_dot(axes.a, na), v3_dot(axes.b, nb), v3_dot(axes.c, nc));
+    const v3 by_mean = to_world(axes, v3_mul(n, inv2));
+    const v3 by_scale = v3_mul(v3_mul(diagonal, inv2), inv);
+    const v3 torque = v3_make(-bc * (inv2.y - inv2.z), -ac * (inv2.z - inv2.x), -ab * (inv2.x - inv2.y));
+    gradient_store(gradients + first, stride, add, by_mean, by_scale, torque, qw, qx, qy, qz,
+                   w / V_LOAD(g + 10 * stride));
+}

@@ -1,0 +1,36 @@
+"""How the scan was taken: geometry, trajectory, shutter, time cells, and the scan that holds them."""
+
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.geometry import ConeGeometry, pixel_centres, transpose_pose
+from phyradgs_cl.acquisition.motion import MOTIONS, Motion
+from phyradgs_cl.acquisition.protocol import PROTOCOLS, Protocol, make_protocol
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.trajectory import (
+    CircularOrbit,
+    ConstantSpeed,
+    EncoderTable,
+    FrameSweeps,
+    PoseTable,
+    SpeedRamp,
+)
+
+__all__ = [
+    "MOTIONS",
+    "PROTOCOLS",
+    "CircularOrbit",
+    "ConeGeometry",
+    "ConstantSpeed",
+    "EncoderTable",
+    "FrameSweeps",
+    "Motion",
+    "PoseTable",
+    "Protocol",
+    "Scan",
+    "Shutter",
+    "SpeedRamp",
+    "TimeCells",
+    "make_protocol",
+    "pixel_centres",
+    "transpose_pose",
+]

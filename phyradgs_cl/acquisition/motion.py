@@ -1,0 +1,42 @@
+"""Motion models: how a reconstruction turns a frame of a scan into time cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from phyradgs_cl.acquisition import cells
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.errors import InputError
+
+MOTIONS = ("static", "static-start", "micro-views", "per-line")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A named motion model; ``strips`` (M) and ``sub_intervals`` (N) matter to micro-views only.
+
+    ``per-line`` takes every line at its own N exact times; it is what the simulator uses.
+    """
+
+    name: str = "micro-views"
+    strips: int = 8
+    sub_intervals: int = 5
+
+    def __post_init__(self) -> None:
+        if self.name not in MOTIONS:
+            raise InputError("motion", repr(self.name), f"one of {', '.join(MOTIONS)}")
+        if self.strips < 1 or self.sub_intervals < 1:
+            found = f"{self.strips} × {self.sub_intervals}"
+            raise InputError("strips × sub-intervals", found, "two counts of at least 1")
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The time cells of one frame. A scan that is not a fly-scan has one pose a frame, whatever the model."""
+        where = (scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines)
+        if self.name == "static-start":
+            return cells.static_start_cells(*where)
+        if self.name == "static" or not scan.is_fly:
+            return cells.static_cells(*where)
+        if self.name == "micro-views":
+            return cells.micro_view_cells(*where, self.strips, self.sub_intervals)
+        return cells.per_line_cells(*where, self.sub_intervals)

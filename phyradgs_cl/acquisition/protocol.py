@@ -1,0 +1,94 @@
+"""Scan protocols: how many frames, how long an arc each exposes, how the panel reads out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
+from phyradgs_cl.errors import InputError
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A full turn of ``views`` frames, each exposing ``exposure_deg`` (paper, section 3.1).
+
+    The gantry turns at constant speed, so an exposure of 1 s fixes it; ``readout_ratio`` is T_ro/T_exp.
+    """
+
+    views: int = 25
+    exposure_deg: float = 14.4
+    readout_ratio: float = 0.86
+    start_deg: float = 0.0
+    exposure_s: float = 1.0
+    is_fly: bool = True
+
+    def __post_init__(self) -> None:
+        if self.views < 1:
+            raise InputError("views", str(self.views), "at least 1 frame")
+        if not (np.isfinite(self.exposure_deg) and self.exposure_deg >= 0):
+            raise InputError("exposure arc", f"{self.exposure_deg}°", "an angle of at least 0°")
+        if not (np.isfinite(self.readout_ratio) and self.readout_ratio >= 0):
+            raise InputError("readout ratio", str(self.readout_ratio), "T_ro/T_exp of at least 0")
+
+    @property
+    def step_deg(self) -> float:
+        return 360.0 / self.views
+
+    def shutter(self, axis: str = "rows", direction: int = 1) -> Shutter:
+        return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction)
+
+    def frame_start_s(self) -> np.ndarray:
+        """Opening times (F,): the gantry needs step/arc exposures from frame to frame."""
+        if self.exposure_deg == 0:
+            return np.arange(self.views) * self.shutter().span_s
+        return np.arange(self.views) * self.step_deg / self.exposure_deg * self.exposure_s
+
+    def angle_start_rad(self) -> np.ndarray:
+        return np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
+
+    def orbit(self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None) -> CircularOrbit:
+        """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan.
+
+        Jitter is a smooth wander of the true gantry about constant speed, recorded by the encoder
+        (standard deviation ``jitter_deg``, one knot a frame).
+        """
+        first = self.angle_start_rad()
+        arc_rad = np.deg2rad(self.exposure_deg)
+        if not self.is_fly:
+            middle = first + arc_rad * (1 + self.readout_ratio) / 2
+            return CircularOrbit(geometry, FrameSweeps(self.frame_start_s(), self.exposure_s, middle, middle))
+        if jitter_deg > 0:
+            if arc_rad == 0:
+                raise InputError("jitter", "an exposure arc of 0°", "a gantry that turns", "leave jitter out")
+            if rng is None:
+                raise InputError("jitter", "no random generator", "a seeded generator")
+            return CircularOrbit(geometry, self._wandering_encoder(np.deg2rad(jitter_deg), rng))
+        sweeps = FrameSweeps(self.frame_start_s(), self.exposure_s, first, first + arc_rad)
+        return CircularOrbit(geometry, sweeps)
+
+    def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:
+        start_s = self.frame_start_s()
+        end_s = start_s[-1] + self.shutter().span_s
+        speed_rad_per_s = np.deg2rad(self.exposure_deg) / self.exposure_s
+        knot_s = np.linspace(0.0, end_s, self.views + 1)
+        wander = np.interp(np.linspace(0, end_s, 16 * self.views + 1), knot_s, rng.normal(0, jitter_rad, knot_s.size))
+        time_s = np.linspace(0.0, end_s, wander.size)
+        return EncoderTable(time_s, np.deg2rad(self.start_deg) + speed_rad_per_s * time_s + wander)
+
+
+PROTOCOLS = {
+    "rapid": Protocol(views=25, exposure_deg=14.4),
+    "standard": Protocol(views=50, exposure_deg=7.2),
+    "static": Protocol(views=25, exposure_deg=14.4, is_fly=False),
+}
+
+
+def make_protocol(name: str, **changes: float | int | bool | None) -> Protocol:
+    """A named protocol with the options that are not None replaced."""
+    if name not in PROTOCOLS:
+        raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
+    return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

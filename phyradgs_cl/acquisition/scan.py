@@ -1,0 +1,67 @@
+"""A scan: what was measured, where the gantry was, and the grid that is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+
+DETECTOR_MODELS = ("log", "intensity")
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One cone-beam scan in line integrals.
+
+    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read
+    line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
+    ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
+    """
+
+    projections: np.ndarray
+    geometry: ConeGeometry
+    trajectory: CircularOrbit | PoseTable
+    shutter: Shutter
+    frame_start_s: np.ndarray
+    grid: Grid
+    is_fly: bool = True
+    detector_model: str = "log"
+    pixel_mask: np.ndarray | None = None
+    reference: np.ndarray | None = None
+    title: str = "cone-beam scan"
+    provenance: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        frames = len(self.projections)
+        expected = (frames, *self.geometry.detector_shape)
+        if self.projections.shape != expected:
+            raise InputError("projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}")
+        if frames == 0:
+            raise InputError("projections", "no frame", "at least one projection")
+        if np.shape(self.frame_start_s) != (frames,):
+            raise InputError("frame_start_s", f"shape {np.shape(self.frame_start_s)}", f"({frames},)")
+        if self.detector_model not in DETECTOR_MODELS:
+            raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
+        if self.reference is not None and self.reference.shape != self.grid.shape:
+            raise InputError("reference", f"shape {self.reference.shape}", f"the grid's {self.grid.shape}")
+
+    @property
+    def frames(self) -> int:
+        return len(self.projections)
+
+    @property
+    def lines(self) -> int:
+        """Lines along the readout axis."""
+        return self.shutter.lines(self.geometry.detector_shape)
+
+    def check_timing(self) -> None:
+        """Asks the trajectory for the ends of every frame's window, so that a short table is named early."""
+        last_s = self.shutter.span_s * (1.0 if self.is_fly else 0.5)  # a standing gantry is asked mid-window
+        for frame, start_s in enumerate(self.frame_start_s):
+            self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))

@@ -1,0 +1,164 @@
+"""Kinematics: the gantry angle θ(t), or whole poses, at any time of a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
+from phyradgs_cl.errors import InputError
+
+
+class Trajectory(Protocol):
+    """Anything that knows where the gantry is: poses (..., 12) of a frame at times (...) in seconds."""
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class ConstantSpeed:
+    """θ(t) = θ0 + ω t."""
+
+    angle_start_rad: float
+    speed_rad_per_s: float
+
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        return self.angle_start_rad + self.speed_rad_per_s * np.asarray(time_s, np.float64)
+
+
+@dataclass(frozen=True)
+class SpeedRamp:
+    """θ(t) = θ0 + ω t + ½ a t²: a gantry that is still speeding up or braking."""
+
+    angle_start_rad: float
+    speed_rad_per_s: float
+    acceleration_rad_per_s2: float
+
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        t = np.asarray(time_s, np.float64)
+        return self.angle_start_rad + self.speed_rad_per_s * t + 0.5 * self.acceleration_rad_per_s2 * t * t
+
+
+@dataclass(frozen=True, eq=False)
+class EncoderTable:
+    """Measured θ(t): linear between the samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
+
+    time_s: np.ndarray
+    angle_rad_table: np.ndarray
+    culprit: str = "encoder table"
+
+    def __post_init__(self) -> None:
+        time_s = np.asarray(self.time_s, np.float64)
+        table = np.asarray(self.angle_rad_table, np.float64)
+        if time_s.ndim != 1 or time_s.size < 2 or table.shape != time_s.shape:
+            found = f"shapes {time_s.shape} and {table.shape}"
+            raise InputError(self.culprit, found, "two equal 1D arrays of at least 2 samples")
+        if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
+            raise InputError(self.culprit, "NaN or infinity", "finite times and angles")
+        if np.any(np.diff(time_s) <= 0):
+            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        object.__setattr__(self, "time_s", time_s)
+        object.__setattr__(self, "angle_rad_table", table)
+
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        t = np.asarray(time_s, np.float64)
+        _check_covered(self.culprit, frame, t, self.time_s)
+        return np.interp(t, self.time_s, self.angle_rad_table)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSweeps:
+    """Each frame's own constant speed, from its angle when the exposure starts to that when it ends.
+
+    Continued past the exposure through the readout; equal angles are a gantry at rest (stop-and-shoot).
+    All arrays are (F,).
+    """
+
+    start_s: np.ndarray
+    exposure_s: float
+    angle_start_rad: np.ndarray
+    angle_end_rad: np.ndarray
+
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        t = np.asarray(time_s, np.float64)
+        first, last = float(self.angle_start_rad[frame]), float(self.angle_end_rad[frame])
+        if self.exposure_s <= 0:
+            return np.full(t.shape, first)
+        return first + (last - first) * (t - self.start_s[frame]) / self.exposure_s
+
+
+@dataclass(frozen=True, eq=False)
+class CircularOrbit:
+    """A circular geometry driven by a kinematics object (anything with ``angle_rad(frame, time_s)``)."""
+
+    geometry: ConeGeometry
+    kinematics: ConstantSpeed | SpeedRamp | EncoderTable | FrameSweeps
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        return self.geometry.pose(self.kinematics.angle_rad(frame, time_s))
+
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        return self.kinematics.angle_rad(frame, time_s)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable:
+    """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them.
+
+    Rotations go by slerp and everything else is linear in the body's own frame: interpolating the 12
+    numbers in the world would shrink an orbit (by 1 mm at 1 m over 5°).
+    """
+
+    time_s: np.ndarray
+    table: np.ndarray
+    culprit: str = "pose table"
+
+    def __post_init__(self) -> None:
+        time_s = np.asarray(self.time_s, np.float64)
+        table = np.asarray(self.table, np.float64)
+        if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, POSE_LENGTH):
+            found = f"shapes {time_s.shape} and {table.shape}"
+            raise InputError(self.culprit, found, "times (T,) and poses (T, 12), T at least 2")
+        if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
+            raise InputError(self.culprit, "NaN or infinity", "finite times and poses")
+        if np.any(np.diff(time_s) <= 0):
+            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        normal = np.cross(table[:, 6:9], table[:, 9:12])
+        if np.any(np.linalg.norm(normal, axis=1) <= 0):
+            raise InputError(self.culprit, "parallel pixel steps", "û·du and v̂·dv that span a plane")
+        object.__setattr__(self, "time_s", time_s)
+        object.__setattr__(self, "table", table)
+        object.__setattr__(self, "_frames", _body_frames(table))
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        t = np.asarray(time_s, np.float64)
+        _check_covered(self.culprit, frame, t, self.time_s)
+        frames: np.ndarray = self._frames  # type: ignore[attr-defined]
+        in_body = np.einsum("tji,tkj->tki", frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
+        flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp knows no slack
+        body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
+        turn = Slerp(self.time_s, Rotation.from_matrix(frames))(flat).as_matrix()
+        return np.einsum("tij,tkj->tki", turn, body).reshape(*t.shape, POSE_LENGTH)
+
+
+def _body_frames(table: np.ndarray) -> np.ndarray:
+    """Right-handed orthonormal frames (T, 3, 3), columns û, v̂ and normal, of poses (T, 12)."""
+    u_hat = table[:, 6:9] / np.linalg.norm(table[:, 6:9], axis=1, keepdims=True)
+    normal = np.cross(u_hat, table[:, 9:12])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.stack([u_hat, np.cross(normal, u_hat), normal], -1)
+
+
+def _check_covered(culprit: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
+    """A measured table is never extrapolated; a nanosecond of slack absorbs rounding of stored times."""
+    slack = 1e-9 * max(1.0, abs(table_s[-1]))
+    if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
+        raise InputError(
+            culprit,
+            f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s",
+            f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)",
+            "extend the table or drop the frame",
+        )

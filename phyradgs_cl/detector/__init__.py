@@ -1,0 +1,22 @@
+"""The detector: counts and line integrals, noise, and averaging over the exposure."""
+
+from phyradgs_cl.detector.attenuation import attenuation_to_counts, counts_to_attenuation
+from phyradgs_cl.detector.average import average
+from phyradgs_cl.detector.noise import (
+    beer_lambert_counts,
+    beer_lambert_noise,
+    sample_counts,
+    tigre_counts,
+    tigre_noise,
+)
+
+__all__ = [
+    "attenuation_to_counts",
+    "average",
+    "beer_lambert_counts",
+    "beer_lambert_noise",
+    "counts_to_attenuation",
+    "sample_counts",
+    "tigre_counts",
+    "tigre_noise",
+]

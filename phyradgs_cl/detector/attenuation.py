@@ -1,0 +1,113 @@
+"""From what a detector records to line integrals, with its flat and dark frames, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phyradgs_cl.checks import at_least, finite, one_of, positive, shape
+from phyradgs_cl.errors import InputError
+
+PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # NXtomo's image_key
+QUANTITIES = ("attenuation", "transmission", "counts")
+# Transmission is kept at or above this before the logarithm (a line integral of 13.8): beyond what
+# 16-bit detectors resolve, and finite.
+TRANSMISSION_FLOOR = 1e-6
+
+
+def counts_to_attenuation(
+    data: ArrayLike, image_key: ArrayLike, quantity: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Line integrals of the projections of a scan.
+
+    "counts" become (I - dark) / (flat - dark) with the means of the flat and of the dark frames (dark 0
+    where there are none), "transmission" T becomes -ln T, "attenuation" stays. Frames whose key is
+    not 0 are left out.
+
+    Args:
+        data: (F, v, u), integers or floats.
+        image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid.
+        quantity: what `data` holds.
+
+    Returns:
+        (P, v, u) float32 line integrals of the P projections, in order and always finite; and a bool
+        mask of the same shape, True where a value must not be used: not finite, a flat that is not
+        brighter than the dark, or a transmission at or below `TRANSMISSION_FLOOR`.
+
+    Raises:
+        InputError: shapes, keys or quantity wrong, no projection, or counts without a flat frame.
+    """
+    one_of("quantity", quantity, QUANTITIES)
+    frames, key = np.asarray(data), np.asarray(image_key)
+    shape("data", frames, (None, None, None))
+    shape("image_key", key, (frames.shape[0],))
+    _check_keys(key)
+    chosen = np.flatnonzero(key == PROJECTION)
+    result = np.empty((chosen.size, *frames.shape[1:]), dtype=np.float32)
+    unusable = np.empty(result.shape, dtype=bool)
+    dark, gain = _calibration(frames, key) if quantity == "counts" else (0.0, np.ones(frames.shape[1:]))
+    for i, frame in enumerate(chosen):  # a frame at a time: float64 copies of a whole scan are large
+        values = frames[frame].astype(np.float64)
+        if quantity == "attenuation":
+            unusable[i] = ~(np.abs(values) <= np.finfo(np.float32).max)  # NaN compares false
+            result[i] = np.where(unusable[i], 0.0, values)
+        else:
+            result[i], unusable[i] = _minus_log(values - dark, gain)
+    return result, unusable
+
+
+def attenuation_to_counts(
+    line_integrals: ArrayLike, flat: ArrayLike, dark: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Expected counts dark + (flat - dark) · exp(-p): the inverse, for simulations; no noise, no rounding.
+
+    Args:
+        line_integrals: (P, v, u).
+        flat: counts without an object, scalar or (v, u), above `dark`.
+        dark: counts without beam, scalar or (v, u).
+
+    Returns:
+        (P, v, u) float64.
+
+    Raises:
+        InputError: flat not above dark, values not finite.
+    """
+    for culprit, value in (("line integrals", line_integrals), ("flat", flat), ("dark", dark)):
+        finite(culprit, value)
+    offset = np.asarray(dark, dtype=np.float64)
+    gain = np.asarray(flat, dtype=np.float64) - offset
+    at_least("dark", float(offset.min()), 0.0)
+    positive("flat minus dark", float(gain.min()))
+    return offset + gain * np.exp(-np.asarray(line_integrals, dtype=np.float64))
+
+
+def _check_keys(key: NDArray[np.generic]) -> None:
+    unknown = sorted({int(k) for k in key} - {PROJECTION, FLAT, DARK, INVALID})
+    if unknown:
+        raise InputError("image_key", str(unknown), "0 projection, 1 flat, 2 dark, 3 invalid")
+    if not (key == PROJECTION).any():
+        raise InputError("image_key", "no projection (key 0)", "at least one projection")
+
+
+def _calibration(
+    frames: NDArray[np.generic], key: NDArray[np.generic]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean dark and mean flat minus dark, each (v, u); frames with NaN spoil their pixel only."""
+    if not (key == FLAT).any():
+        remedy = "add flat frames, or store transmission or attenuation"
+        raise InputError("image_key", "no flat (key 1) among counts", "at least one flat frame", remedy)
+    flat = frames[key == FLAT].mean(axis=0, dtype=np.float64)
+    has_dark = (key == DARK).any()
+    dark = frames[key == DARK].mean(axis=0, dtype=np.float64) if has_dark else np.zeros(flat.shape)
+    return dark, flat - dark
+
+
+def _minus_log(
+    signal: NDArray[np.float64], gain: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
+    transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
+    p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
+    unusable = ~live | (transmission <= TRANSMISSION_FLOOR) | ~np.isfinite(transmission)
+    # A pixel without gain knows nothing: 0, not a wall. One that is merely dark keeps the floor's value.
+    return np.where(live & np.isfinite(p), p, 0.0), unusable

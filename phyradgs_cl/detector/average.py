@@ -1,0 +1,47 @@
+"""How a detector averages what it sees while the beam or the object moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phyradgs_cl.checks import finite, one_of, shape
+from phyradgs_cl.errors import InputError
+
+MODELS = ("log", "intensity")
+_WEIGHT_TOLERANCE = 1e-6  # what weights summed in float32 may miss 1 by
+
+
+def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
+    """Line integrals of one exposure from those at several times.
+
+    "log" is the mean of line integrals (PhyRadGS, Eq. 1), "intensity" is what a detector does:
+    it adds photons, so that P = -ln(sum of w · exp(-p)), evaluated without overflow at any p.
+
+    Args:
+        p: (S, ...) line integrals at S times.
+        weight: (S,) share of the exposure, not negative, sum 1.
+        model: "log" or "intensity".
+
+    Returns:
+        (...) float64.
+
+    Raises:
+        InputError: unknown model, shapes that do not fit, weights negative or not adding to 1, NaN.
+    """
+    one_of("detector model", model, MODELS)
+    values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
+    if values.ndim == 0 or values.shape[0] == 0:
+        raise InputError("line integrals", f"shape {values.shape}", "shape (S, ...) with at least one time")
+    shape("weight", weights, (values.shape[0],))
+    finite("weight", weights)
+    finite("line integrals", values)
+    if (weights < 0).any() or abs(weights.sum() - 1) > _WEIGHT_TOLERANCE:
+        raise InputError("weight", f"sum {weights.sum():g}, least {weights.min():g}", "not negative, sum 1")
+    return np.tensordot(weights, values, axes=1) if model == "log" else _intensity(values, weights)
+
+
+def _intensity(p: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    used = weight > 0
+    least = p[used].min(axis=0)  # the brightest time: its exponential becomes 1, the others smaller
+    return least - np.log(np.tensordot(weight[used], np.exp(least - p[used]), axes=1))

@@ -1,0 +1,82 @@
+"""Radiative Gaussians: parameters with units, and the unconstrained ("raw") numbers that are optimised.
+
+Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, logit
+
+from phyradgs_cl.errors import InputError
+
+ROWS = 11  # mean 3, scale 3, quaternion 4, density 1
+MEAN, SCALE, QUATERNION, DENSITY = slice(0, 3), slice(3, 6), slice(6, 10), 10
+_DENSITY_FLOOR = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """A cloud of G Gaussians.
+
+    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z;
+    quaternion (G, 4) w x y z, unit; density (G,) attenuation per that length.
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    quaternion: np.ndarray
+    density: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(self.mean)
+        shapes = {"mean": (count, 3), "scale": (count, 3), "quaternion": (count, 4), "density": (count,)}
+        for name, shape in shapes.items():
+            found = np.shape(getattr(self, name))
+            if found != shape:
+                raise InputError(f"Gaussians' {name}", f"shape {found}", f"shape {shape}")
+
+    @property
+    def count(self) -> int:
+        return len(self.mean)
+
+    def rows(self) -> np.ndarray:
+        """The parameters as (11, G) float64, the order that kernels use."""
+        q = self.quaternion / np.linalg.norm(self.quaternion, axis=1, keepdims=True) if self.count else self.quaternion
+        return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
+
+    @classmethod
+    def from_rows(cls, rows: np.ndarray) -> Gaussians:
+        """From (11, G) rows."""
+        return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
+
+    def scaled(self, length: float, density: float) -> Gaussians:
+        """The same cloud with lengths multiplied by ``length`` and densities by ``density``."""
+        return Gaussians(self.mean * length, self.scale * length, self.quaternion, self.density * density)
+
+
+@dataclass(frozen=True)
+class Activation:
+    """Raw numbers to parameters: scale = min + (max − min)·sigmoid, density = softplus, quaternion normalised."""
+
+    scale_min: float
+    scale_max: float
+
+    def apply(self, raw: np.ndarray) -> np.ndarray:
+        """Raw (11, G) to parameter rows (11, G); the float64 twin of ``activate`` in cl/adam.cl."""
+        rows = np.array(raw, dtype=np.float64)
+        rows[SCALE] = self.scale_min + (self.scale_max - self.scale_min) * expit(raw[SCALE])
+        rows[QUATERNION] = raw[QUATERNION] / np.linalg.norm(raw[QUATERNION], axis=0)
+        rows[DENSITY] = np.maximum(np.logaddexp(0.0, raw[DENSITY]), _DENSITY_FLOOR)
+        return rows
+
+    def invert(self, rows: np.ndarray) -> np.ndarray:
+        """Parameter rows (11, G) to raw ones; scales are kept a little inside their bounds."""
+        raw = np.array(rows, dtype=np.float64)
+        span = self.scale_max - self.scale_min
+        raw[SCALE] = logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))
+        density = np.maximum(rows[DENSITY], _DENSITY_FLOOR)
+        raw[DENSITY] = density + np.log(-np.expm1(-density))
+        return raw

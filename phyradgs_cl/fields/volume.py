@@ -1,0 +1,68 @@
+"""A regular voxel grid in world coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays."""
+
+    shape: tuple[int, int, int]
+    voxel_size_mm: tuple[float, float, float]
+    offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or any(int(n) < 1 for n in self.shape):
+            raise InputError("grid shape", str(self.shape), "three counts of at least 1 (z, y, x)")
+        if len(self.voxel_size_mm) != 3 or not all(np.isfinite(d) and d > 0 for d in self.voxel_size_mm):
+            raise InputError("grid voxel_size", str(self.voxel_size_mm), "three positive lengths in mm (z, y, x)")
+        if len(self.offset_mm) != 3 or not np.all(np.isfinite(self.offset_mm)):
+            raise InputError("grid offset", str(self.offset_mm), "three finite lengths in mm (z, y, x)")
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        object.__setattr__(self, "voxel_size_mm", tuple(float(d) for d in self.voxel_size_mm))
+        object.__setattr__(self, "offset_mm", tuple(float(d) for d in self.offset_mm))
+
+    @classmethod
+    def cube(cls, count: int, side_mm: float) -> Grid:
+        """A centred cube of ``count``³ voxels with a side of ``side_mm``."""
+        return cls((count,) * 3, (side_mm / count,) * 3)
+
+    @property
+    def size_mm(self) -> tuple[float, float, float]:
+        """Side lengths (z, y, x)."""
+        z, y, x = (n * d for n, d in zip(self.shape, self.voxel_size_mm, strict=True))
+        return (z, y, x)
+
+    @property
+    def half_longest_mm(self) -> float:
+        """Half the longest side: the unit of length inside the reconstruction."""
+        return max(self.size_mm) / 2
+
+    @property
+    def first_centre_mm(self) -> tuple[float, float, float]:
+        """Centre (z, y, x) of voxel (0, 0, 0)."""
+        z, y, x = (
+            o - (n - 1) / 2 * d
+            for n, d, o in zip(self.shape, self.voxel_size_mm, self.offset_mm, strict=True)
+        )
+        return (z, y, x)
+
+    def axes_mm(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Voxel-centre coordinates: z (nz,), y (ny,), x (nx,), float64."""
+        z, y, x = (
+            first + np.arange(n) * d
+            for first, n, d in zip(self.first_centre_mm, self.shape, self.voxel_size_mm, strict=True)
+        )
+        return z, y, x
+
+    def scaled(self, factor: float) -> Grid:
+        """The same voxels with every length multiplied by ``factor``."""
+        dz, dy, dx = (d * factor for d in self.voxel_size_mm)
+        oz, oy, ox = (o * factor for o in self.offset_mm)
+        return Grid(self.shape, (dz, dy, dx), (oz, oy, ox))

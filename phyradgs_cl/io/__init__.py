@@ -1,0 +1,29 @@
+"""Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
+
+from phyradgs_cl.io.atomic import check_writable, written_beside
+from phyradgs_cl.io.grid_io import default_grid, with_grid_count
+from phyradgs_cl.io.hashing import sha256_of
+from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
+from phyradgs_cl.io.scan_writer import write_scan
+from phyradgs_cl.io.scanner_file import Scanner, load_scanner, with_detector_count
+from phyradgs_cl.io.volume_file import StoredVolume, file_kind, read_volume, volume_summary, write_volume
+
+__all__ = [
+    "Scanner",
+    "StoredVolume",
+    "ToAttenuation",
+    "check_writable",
+    "default_grid",
+    "file_kind",
+    "load_scanner",
+    "read_scan",
+    "read_volume",
+    "scan_summary",
+    "sha256_of",
+    "volume_summary",
+    "with_detector_count",
+    "with_grid_count",
+    "write_scan",
+    "write_volume",
+    "written_beside",
+]

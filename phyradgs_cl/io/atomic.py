@@ -1,0 +1,119 @@
+"""Outputs that are there whole or not at all: written beside the target, then moved over it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from phyradgs_cl.errors import OutputError
+
+_NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+_SUFFIX = ".part"
+
+
+def check_writable(path: str | Path) -> None:
+    """Raise OutputError now if ``path`` could not be written later; leaves nothing behind.
+
+    Meant for the start of long work: it makes, and removes, an empty file in the target's folder.
+    """
+    temporary = _create_beside(_target(path))
+    temporary.unlink()
+
+
+@contextmanager
+def written_beside(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path in the target's folder; on success it replaces the target in one step.
+
+    The body only writes: its operating system errors are reported as OutputError about ``path``. Whatever
+    goes wrong, an existing target keeps its content and the temporary file is removed.
+    """
+    target = _target(path)
+    temporary = _create_beside(target)
+    try:
+        yield temporary
+        _flush_to_disk(temporary)
+        if target.exists():
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
+        _flush_folder(target.parent)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError) or (isinstance(error, RuntimeError) and "errno = " in str(error)):
+            raise _output_error(target, error) from error
+        raise
+
+
+def _target(path: str | Path) -> Path:
+    """The file to write, behind any symbolic link; OutputError if it, or its folder, will not do."""
+    shown = str(path)
+    if not shown or shown.endswith(("/", os.sep)) or os.path.isdir(shown):
+        raise OutputError(shown or "output path", "a folder", "a file name", "add a file name to the path")
+    target = Path(os.path.realpath(shown))
+    try:
+        mode = target.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        mode = None
+    except OSError as error:
+        raise _output_error(target, error) from error
+    if mode is not None and not stat.S_ISREG(mode):
+        raise OutputError(shown, "something that is not a regular file", "a file name")
+    if mode is not None and not os.access(target, os.W_OK):
+        raise OutputError(
+            shown, "a write-protected file", "a file that may be replaced", "choose another name"
+        )
+    if not target.parent.is_dir():
+        raise OutputError(
+            shown, f"no folder {target.parent}", "an existing folder", "create the folder first"
+        )
+    return target
+
+
+def _create_beside(target: Path) -> Path:
+    """A new empty file in the target's folder, with the permissions that the user's umask gives."""
+    temporary = target.with_name(f".{target.name[:60]}.{secrets.token_hex(4)}{_SUFFIX}")
+    try:
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        raise OutputError(
+            str(target),
+            f"{error.strerror or error} in folder {target.parent}",
+            "a folder that can be written",
+            "choose another folder or change its permissions",
+        ) from error
+    return temporary
+
+
+def _flush_to_disk(path: Path) -> None:
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make the renaming itself durable where folders can be opened; elsewhere there is nothing to do."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _output_error(target: Path, error: BaseException) -> OutputError:
+    code = getattr(error, "errno", None)
+    full = code in _NO_SPACE or any(f"errno = {number}," in str(error) for number in _NO_SPACE)
+    if full:
+        found = f"no room left in folder {target.parent}"
+        return OutputError(
+            str(target), found, "enough space on the disk", "free some space or choose another folder"
+        )
+    if code == errno.ENAMETOOLONG:
+        return OutputError(str(target), "a file name that is too long", "a shorter name", "shorten the name")
+    found = getattr(error, "strerror", None) or str(error)
+    return OutputError(str(target), found, "a file that can be written", "choose another folder")

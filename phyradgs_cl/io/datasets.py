@@ -1,0 +1,151 @@
+"""Typed reads from an Hdf5Source: numbers with units, words and whole numbers, each checked at once."""
+
+from __future__ import annotations
+
+import logging
+import posixpath
+from collections.abc import Collection, Sequence
+
+import h5py
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hdf5 import Hdf5Source
+from phyradgs_cl.io.units import Quantity
+
+_log = logging.getLogger(__name__)
+
+
+def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf") -> np.ndarray:
+    """All values of a dataset in their own type; InputError unless NumPy's kind of it is in ``kinds``."""
+    culprit = source.name(address)
+    try:
+        kind = dataset.dtype.kind
+        if kind not in kinds:
+            wanted = "numbers" if "f" in kinds else "whole numbers"
+            raise InputError(culprit, f"type {dataset.dtype}", wanted, "store them as plain HDF5 numbers")
+        return np.asarray(dataset[()])
+    except MemoryError as error:
+        found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
+        raise InputError(culprit, found, "data that this machine's memory can hold") from error
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(culprit, f"data that HDF5 cannot read ({error})", "readable data") from error
+
+
+def read_array(
+    source: Hdf5Source,
+    address: str,
+    shape: Sequence[int | None],
+    quantity: Quantity | None = None,
+    known: Collection[str] = (),
+) -> np.ndarray:
+    """A required numeric dataset as float64 in the package's unit; every value finite."""
+    dataset = source.dataset(address, known)
+    checks.shape(source.name(address), dataset, shape)
+    values = read_values(source, address, dataset).astype(np.float64)
+    checks.finite(source.name(address), values)
+    return values * unit_factor(source, address, quantity) if quantity else values
+
+
+def read_length(source: Hdf5Source, address: str, quantity: Quantity, known: Collection[str] = ()) -> float:
+    """A required number above zero; a dataset of one element will do."""
+    value = read_number(source, address, quantity, known)
+    if value <= 0:
+        raise InputError(source.name(address), str(value), f"a {quantity.name} above 0", "correct the value")
+    return value
+
+
+def read_number(
+    source: Hdf5Source, address: str, quantity: Quantity | None = None, known: Collection[str] = ()
+) -> float:
+    """A required finite number in the package's unit; a dataset of one element will do."""
+    dataset = source.dataset(address, known)
+    if dataset.size != 1:
+        raise InputError(source.name(address), f"shape {dataset.shape}", "one number")
+    values = read_values(source, address, dataset).astype(np.float64)
+    checks.finite(source.name(address), values)
+    return float(values.reshape(())) * (unit_factor(source, address, quantity) if quantity else 1.0)
+
+
+def read_integers(
+    source: Hdf5Source, address: str, shape: Sequence[int | None], known: Collection[str] = ()
+) -> np.ndarray:
+    """A required dataset of whole numbers as int64."""
+    dataset = source.dataset(address, known)
+    checks.shape(source.name(address), dataset, shape)
+    return read_values(source, address, dataset, kinds="iu").astype(np.int64)
+
+
+def read_word(
+    source: Hdf5Source, address: str, allowed: Collection[str] | None = None, known: Collection[str] = ()
+) -> str:
+    """A required string, one of ``allowed`` where they are given."""
+    dataset = source.dataset(address, known)
+    try:
+        word = as_text(dataset[()])
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(source.name(address), f"data that HDF5 cannot read ({error})", "a string") from error
+    if word is None:
+        raise InputError(source.name(address), f"type {dataset.dtype}, shape {dataset.shape}", "a string")
+    if allowed is not None:
+        checks.one_of(source.name(address), word, allowed)
+    return word
+
+
+def unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
+    """Factor from the dataset's units to the package's; a missing attribute is assumed, and logged."""
+    unit = read_attribute(source, address, "units")
+    if unit is None:
+        unit = quantity.assumed
+        # A name that ends in the unit (time_s, angle_deg) says it well enough.
+        if not posixpath.basename(address).endswith(f"_{unit}"):
+            _log.warning("%s: no units attribute; %s assumed", source.name(address), unit)
+    factor = quantity.factor(unit)
+    if factor is None:
+        raise InputError(f"{source.name(address)} @units", repr(unit), f"one of {quantity.accepted}")
+    return factor
+
+
+def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
+    """A text attribute of an object that exists, or None."""
+    found = source.find(address)
+    if found is None:
+        return None
+    culprit = f"{source.name(address)} @{name}"
+    try:
+        if name not in found.attrs:
+            return None
+        text = as_text(found.attrs[name])
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(culprit, f"an attribute that HDF5 cannot read ({error})", "a string") from error
+    if text is None:
+        raise InputError(culprit, repr(found.attrs[name]), "a string")
+    return text
+
+
+def as_text(value: object) -> str | None:
+    """A string from what h5py gives for one (str, bytes, an array of one), else None."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return str(value) if isinstance(value, str) else None
+
+
+def write_number(
+    group: h5py.Group, name: str, values: object, units: str | None = None, **attributes: str
+) -> h5py.Dataset:
+    """A small dataset with its units attribute."""
+    dataset = group.create_dataset(name, data=values)
+    if units is not None:
+        dataset.attrs["units"] = units
+    dataset.attrs.update(attributes)
+    return dataset
+
+
+def new_group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
+    """A group with its NeXus class."""
+    group = parent.create_group(name)
+    group.attrs["NX_class"] = nx_class
+    return group

@@ -1,0 +1,67 @@
+"""The voxel grid in files, and the one that a scan without a grid gets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import h5py
+
+from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io.datasets import new_group, read_array, read_integers, write_number
+from phyradgs_cl.io.hdf5 import Hdf5Source
+from phyradgs_cl.io.units import LENGTH
+
+_NAMES = ("shape", "voxel_size", "offset")
+
+
+def read_grid(source: Hdf5Source, address: str) -> Grid:
+    """The grid stored in the group at ``address``: shape, voxel_size and offset, each (z, y, x)."""
+    shape = read_integers(source, f"{address}/shape", (3,), _NAMES)
+    voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH, _NAMES)
+    offset_mm = (0.0, 0.0, 0.0)
+    if source.optional(f"{address}/offset", _NAMES) is not None:
+        offset_mm = tuple(read_array(source, f"{address}/offset", (3,), LENGTH, _NAMES).tolist())
+    if shape.min() < 1:
+        raise InputError(source.name(f"{address}/shape"), str(shape.tolist()), "three counts of at least 1")
+    if voxel_size_mm.min() <= 0:
+        found = str(voxel_size_mm.tolist())
+        raise InputError(source.name(f"{address}/voxel_size"), found, "three lengths above 0")
+    return Grid(tuple(shape.tolist()), tuple(voxel_size_mm.tolist()), offset_mm)
+
+
+def write_grid(parent: h5py.Group, grid: Grid) -> None:
+    """Add the group ``grid`` to ``parent``."""
+    group = new_group(parent, "grid", "NXcollection")
+    write_number(group, "shape", grid.shape)
+    write_number(group, "voxel_size", grid.voxel_size_mm, "mm")
+    write_number(group, "offset", grid.offset_mm, "mm")
+
+
+def default_grid(geometry: ConeGeometry) -> Grid:
+    """The cube that a full turn of the cone covers, in voxels of one pixel pitch at the axis.
+
+    Its half side is the distance from the axis to the cone's edge ray, DSO·sin(atan(half width/DSD));
+    a panel that is shifted sideways counts with its far edge.
+    """
+    (_, columns), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
+    half_width_mm = columns * pitch_u / 2 + abs(geometry.detector_offset_mm[1])
+    half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
+    side_mm = 2 * geometry.source_to_axis_mm * math.sin(half_fan_rad)
+    voxel_mm = min(pitch_v, pitch_u) / geometry.magnification
+    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)
+
+
+def with_grid_count(grid: Grid, count: int) -> Grid:
+    """The same box with ``count`` voxels along its longest side, and as cubic as they were.
+
+    Shorter sides get the nearest whole count; every side keeps its length.
+    """
+    if count < 1:
+        raise InputError("grid count", str(count), "at least 1 voxel")
+    longest = max(grid.shape)
+    z, y, x = (max(1, round(n * count / longest)) for n in grid.shape)
+    dz, dy, dx = (side / n for side, n in zip(grid.size_mm, (z, y, x), strict=True))
+    return replace(grid, shape=(z, y, x), voxel_size_mm=(dz, dy, dx))

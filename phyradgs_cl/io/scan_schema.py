@@ -1,0 +1,63 @@
+"""Where things stand in a scan file (a NeXus NXtomo entry; see docs on file formats)."""
+
+from __future__ import annotations
+
+DETECTOR = "instrument/detector"
+SOURCE = "instrument/source"
+SAMPLE = "sample"
+EXTRA = "phyradgs"
+KINEMATICS = f"{EXTRA}/kinematics"
+POSES = f"{EXTRA}/poses"
+GRID = f"{EXTRA}/grid"
+REFERENCE = f"{EXTRA}/reference"
+
+PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
+QUANTITIES = ("attenuation", "transmission", "counts")
+ROTATES = ("gantry", "sample")
+
+# What the reader looks for: a name outside this set that nearly is one of them is a misspelling.
+KNOWN_NAMES = frozenset(
+    {
+        "data",
+        "image_key",
+        "image_key_control",
+        "x_pixel_size",
+        "y_pixel_size",
+        "distance",
+        "count_time",
+        "detector_readout_time",
+        "frame_start_time",
+        "pixel_mask",
+        "rotation_angle",
+        "rotation_angle_end",
+        "name",
+        "title",
+        "readout_axis",
+        "readout_direction",
+        "detector_offset",
+        "detector_model",
+        "kinematics",
+        "poses",
+        "grid",
+        "reference",
+        "provenance",
+        "time_s",
+        "angle_deg",
+        "pose",
+        "volume",
+    }
+)
+
+# Standard fields that would move the geometry and that this package does not read.
+IGNORED = (
+    f"{DETECTOR}/transformations",
+    f"{DETECTOR}/x_rotation_axis_pixel_position",
+    f"{DETECTOR}/y_rotation_axis_pixel_position",
+    f"{DETECTOR}/estimated_cor_from_motor",
+    f"{DETECTOR}/x_flipped",
+    f"{DETECTOR}/y_flipped",
+    f"{SAMPLE}/transformations",
+    f"{SAMPLE}/x_translation",
+    f"{SAMPLE}/y_translation",
+    f"{SAMPLE}/z_translation",
+)

@@ -1,0 +1,7 @@
+"""How close a reconstruction is to the truth."""
+
+from phyradgs_cl.metrics.psnr import psnr
+from phyradgs_cl.metrics.slices import slices_png
+from phyradgs_cl.metrics.ssim import ssim, ssim_map
+
+__all__ = ["psnr", "slices_png", "ssim", "ssim_map"]

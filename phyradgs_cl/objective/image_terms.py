@@ -1,0 +1,99 @@
+"""Image terms of the objective (paper, Eq. 4): L1 + λ (1 − SSIM) of one frame, with their gradient.
+
+Eq. 4 prints "+ SSIM"; what is minimised, there and here, is 1 − SSIM. SSIM is Wang et al. 2004 (IEEE Trans.
+Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01², C2 = 0.03².
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+WINDOW /= WINDOW.sum()
+C1, C2 = 0.01**2, 0.03**2
+_GUARD = 16
+
+
+class ImageLoss:
+    """Loss and gradient of a frame of ``lines`` lines by ``width`` pixels, in the padded image layout."""
+
+    def __init__(self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float) -> None:
+        self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
+        self.ssim_weight = ssim_weight
+        image = _GUARD + lines * pitch
+        self._moments = rt.zeros(5 * image + _GUARD)
+        self._partials = rt.zeros(3 * image + _GUARD)
+        self._spread = rt.zeros(3 * image + _GUARD)
+        self._window = rt.upload(WINDOW, np.float32)
+        self._line_sums = rt.zeros((lines, 4))
+        self.gradient = rt.zeros(image + _GUARD)
+
+    def evaluate(self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float) -> DeviceArray:
+        """dL/drendered, until the next call; ``mask`` is 1 where a pixel counts and ``pixels`` its sum."""
+        rt = self.rt
+        vectors = -(-self.width // rt.lanes)
+        size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
+        group = rt.group()
+
+        def kernel(name: str) -> object:
+            return rt.kernel("loss", name, IMAGE_GUARD=_GUARD)
+
+        images = (rendered, measured, mask, self._window)
+        rt.launch(kernel("ssim_moments"), (vectors, self.lines), *images, *size, self._moments, group=group)
+        rt.launch(
+            kernel("ssim_map"),
+            self.lines,
+            self._moments,
+            *images,
+            *size,
+            np.float32(C1),
+            np.float32(C2),
+            self._partials,
+            self._line_sums,
+            group=group,
+        )
+        rt.launch(
+            kernel("ssim_spread"), (vectors, self.lines), self._partials, self._window, *size, self._spread, group=group
+        )
+        rt.launch(
+            kernel("image_gradient"),
+            self.lines,
+            self._spread,
+            *images,
+            *size,
+            np.float32(1.0 / max(pixels, 1.0)),
+            np.float32(self.ssim_weight / (self.lines * self.width)),
+            self.gradient,
+            group=group,
+        )
+        return self.gradient
+
+    def value(self) -> float:
+        """The loss at the last ``evaluate``; waits for the device."""
+        ssim, l1, pixels, _ = self.rt.download(self._line_sums).astype(np.float64).sum(axis=0)
+        return float(l1 / max(pixels, 1.0) + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
+
+
+def image_loss(
+    rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float
+) -> tuple[float, np.ndarray]:
+    """Float64 twin: the loss and dL/drendered, images (lines, width)."""
+    x, y = rendered * mask, measured * mask
+    mx, my = _blur(x), _blur(y)
+    xx, yy, xy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my
+    n1, n2, d1, d2 = 2 * mx * my + C1, 2 * xy + C2, mx * mx + my * my + C1, xx + yy + C2
+    ssim = n1 * n2 / (d1 * d2)
+    by_xx, by_xy = -ssim / d2, 2 * n1 / (d1 * d2)
+    by_mean = 2 * my * n2 / (d1 * d2) - 2 * mx * ssim / d1 - 2 * mx * by_xx - my * by_xy
+    by_ssim = _blur(by_mean) + 2 * x * _blur(by_xx) + y * _blur(by_xy)
+    pixels = max(mask.sum(), 1.0)
+    loss = np.abs(x - y).sum() / pixels + ssim_weight * (1 - ssim.mean())
+    return float(loss), mask * (np.sign(x - y) / pixels - ssim_weight * by_ssim / x.size)
+
+
+def _blur(image: np.ndarray) -> np.ndarray:
+    rows = correlate1d(image, WINDOW, axis=1, mode="constant")
+    return correlate1d(rows, WINDOW, axis=0, mode="constant")

@@ -1,0 +1,22 @@
+"""Operators between fields and frames: splat, voxelise, rays, and FDK's backprojection.
+
+Each knows its domain, its range and its transpose, and no algorithm.
+"""
+
+from phyradgs_cl.operators.backproject import backproject
+from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
+from phyradgs_cl.operators.rays import RayProjector
+from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA, SplatProjector
+from phyradgs_cl.operators.voxelise import Voxeliser, sub_grid, voxelise
+
+__all__ = [
+    "DEFAULT_CUTOFF_SIGMA",
+    "DeviceCells",
+    "DeviceGaussians",
+    "RayProjector",
+    "SplatProjector",
+    "Voxeliser",
+    "backproject",
+    "sub_grid",
+    "voxelise",
+]

@@ -1,0 +1,64 @@
+"""Lists of splats a tile, by a stable counting sort on the device."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+_CHUNK = 512
+_SLACK = 1.25
+
+
+class TileLists:
+    """Builds, for tiles of a 2D or 3D domain, the list of splats whose extent touches each tile.
+
+    ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats,
+    so everything summed over them repeats bit for bit.
+    """
+
+    def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
+        self.rt = rt
+        self.total = int(np.prod(tiles))
+        self.tile = np.array([*tile, 0], np.int32)
+        self.tiles = np.array([*tiles, 0], np.int32)
+        self.starts = rt.zeros(self.total + 1, np.int32)
+        self.entries = rt.empty(1, np.int32)
+        self._counts: DeviceArray = rt.empty(1, np.int32)
+
+    def build(self, extents: DeviceArray, count: int, stride: int) -> None:
+        """Fills ``starts`` (tiles + 1,) and ``entries`` from extents (6, stride)."""
+        rt = self.rt
+        chunks = max(-(-count // _CHUNK), 1)
+        if self._counts.size < self.total * chunks:
+            self._counts = rt.empty(self.total * chunks, np.int32)
+        domain = (np.int32(stride), np.int32(count), np.int32(_CHUNK), np.int32(chunks), self.tile, self.tiles)
+        group = rt.group()
+        rt.launch(rt.kernel("binning", "bin_count"), chunks, extents, *domain, self._counts, group=group)
+        rt.launch(
+            rt.kernel("binning", "bin_within"),
+            self.total,
+            np.int32(self.total),
+            np.int32(chunks),
+            self._counts,
+            self.starts,
+            group=group,
+        )
+        rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(self.total), self.starts)
+        needed = self._total_entries()
+        if needed > self.entries.size:
+            self.entries = rt.empty(int(needed * _SLACK) + 16, np.int32)
+        rt.launch(
+            rt.kernel("binning", "bin_fill"),
+            chunks,
+            extents,
+            *domain,
+            self._counts,
+            self.starts,
+            self.entries,
+            np.int32(self.entries.size),
+            group=group,
+        )
+
+    def _total_entries(self) -> int:
+        return int(self.rt.read_item(self.starts, self.total))

@@ -1,0 +1,150 @@
+"""How images, volumes, Gaussians and time cells lie in device memory.
+
+Images and volumes are rows with a pitch: GUARD floats, then (rows, pitch), where every row ends in at
+least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+GUARD = 16
+STRIDE_OF = 16  # Gaussians are padded to a multiple of the widest vector
+CELL_FLOATS = 24
+
+
+def pitch_of(width: int) -> int:
+    return -(-width // GUARD) * GUARD + GUARD
+
+
+def padded_zeros(rt: Runtime, rows: int, width: int, images: int = 1) -> DeviceArray:
+    """Zeroed memory for ``images`` images or volumes of ``rows`` rows."""
+    return rt.zeros(images * (GUARD + rows * pitch_of(width)) + GUARD)
+
+
+def pad_rows(values: np.ndarray) -> np.ndarray:
+    """(..., rows, width) float to the flat padded layout, float32."""
+    width = values.shape[-1]
+    rows = int(np.prod(values.shape[:-1], dtype=np.int64))
+    flat = np.zeros(2 * GUARD + rows * pitch_of(width), np.float32)
+    flat[GUARD : GUARD + rows * pitch_of(width)].reshape(rows, -1)[:, :width] = values.reshape(rows, width)
+    return flat
+
+
+def unpad_rows(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The inverse of ``pad_rows`` for an image or volume of the given shape."""
+    width, rows = shape[-1], int(np.prod(shape[:-1], dtype=np.int64))
+    body = flat[GUARD : GUARD + rows * pitch_of(width)].reshape(rows, -1)
+    return np.ascontiguousarray(body[:, :width]).reshape(shape)
+
+
+@dataclass(eq=False)
+class DeviceGaussians:
+    """Parameter rows (11, stride) float32 on the device, of which the first ``count`` columns are real."""
+
+    rows: DeviceArray
+    count: int
+    stride: int
+
+    @classmethod
+    def upload(cls, rt: Runtime, rows: np.ndarray) -> DeviceGaussians:
+        """From parameter rows (11, G); padding is a harmless unit Gaussian."""
+        return cls(rt.upload(pad_columns(rows)), rows.shape[1], stride_of(rows.shape[1]))
+
+
+def stride_of(count: int) -> int:
+    return max(-(-count // STRIDE_OF), 1) * STRIDE_OF
+
+
+def pad_columns(rows: np.ndarray) -> np.ndarray:
+    """(11, G) rows to (11, stride) float32."""
+    padded = np.zeros((rows.shape[0], stride_of(rows.shape[1])), np.float32)
+    padded[3:7] = 1.0
+    padded[10] = 1.0
+    padded[:, : rows.shape[1]] = rows
+    return padded
+
+
+def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
+    """Uploads float64 coefficients as they are, or as (high, low) float pairs where the device has no fp64."""
+    matrix = np.ascontiguousarray(matrix, np.float64)
+    if rt.fp64:
+        return rt.upload(matrix)
+    high = matrix.astype(np.float32)
+    return rt.upload(np.stack([high, (matrix - high).astype(np.float32)], -1))
+
+
+@dataclass(eq=False)
+class DeviceCells:
+    """The time cells of one frame on the device; lines are always the slow axis of the image.
+
+    A frame read out along columns is handled as its transpose: only the poses' pixel steps change places.
+    """
+
+    cells: DeviceArray
+    matrices: DeviceArray
+    cell_lines: DeviceArray
+    line_cells: DeviceArray
+    count: int
+    lines: int
+
+    @classmethod
+    def upload(cls, rt: Runtime, table: TimeCells) -> DeviceCells:
+        pose = transpose_pose(table.pose) if table.axis == "columns" else table.pose
+        ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
+        return cls(
+            cells=rt.upload(cell_constants(pose, table.weight)),
+            matrices=split_coefficients(rt, projection_matrices(pose)),
+            cell_lines=rt.upload(ranges),
+            line_cells=rt.upload(cells_of_lines(ranges, table.lines)),
+            count=table.count,
+            lines=table.lines,
+        )
+
+
+def projection_matrices(pose: np.ndarray) -> np.ndarray:
+    """Rows (C, 12) that turn a world point x into (u·z, v·z, z): pixel column, line and depth of its ray.
+
+    x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0).
+    """
+    source, first = pose[:, 0:3], pose[:, 3:6]
+    basis = np.stack([pose[:, 6:9], pose[:, 9:12], first - source], -1)  # columns eu, ev, d00
+    inverse = np.linalg.inv(basis)
+    shift = -np.einsum("cij,cj->ci", inverse, source)
+    return np.concatenate([inverse, shift[:, :, None]], -1).reshape(len(pose), 12)
+
+
+def cell_constants(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The (C, 24) float32 table that cl/common/splat.h describes."""
+    source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
+    eu, ev = pose[:, 6:9], pose[:, 9:12]
+    table = np.zeros((len(pose), CELL_FLOATS))
+    table[:, 0:3], table[:, 3:6], table[:, 6:9] = source, eu, ev
+    table[:, 9] = np.einsum("ci,ci->c", np.cross(eu, ev), d00)
+    table[:, 10] = weight
+    for column, (a, b, factor) in enumerate(
+        [(d00, d00, 1), (d00, eu, 2), (d00, ev, 2), (eu, eu, 1), (eu, ev, 2), (ev, ev, 1)], start=11
+    ):
+        table[:, column] = factor * np.einsum("ci,ci->c", a, b)
+    return table.astype(np.float32)
+
+
+def cells_of_lines(ranges: np.ndarray, lines: int) -> np.ndarray:
+    """For every line the range [first, stop) of cells that may serve it; cells are sorted by their first line."""
+    found = np.zeros((lines, 2), np.int32)
+    first = np.full(lines, len(ranges), np.int64)
+    stop = np.zeros(lines, np.int64)
+    for cell, (line_start, line_stop) in enumerate(ranges):
+        first[line_start:line_stop] = np.minimum(first[line_start:line_stop], cell)
+        stop[line_start:line_stop] = np.maximum(stop[line_start:line_stop], cell + 1)
+    reached = np.maximum.accumulate(stop)
+    empty = stop == 0
+    found[:, 0] = np.where(empty, reached, first)
+    found[:, 1] = np.where(empty, reached, stop)
+    return found

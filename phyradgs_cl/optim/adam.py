@@ -1,0 +1,104 @@
+"""Adam (Kingma and Ba 2015) on the raw parameters of all Gaussians at once, with a rate a parameter row."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phyradgs_cl.fields import Activation
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+BETA1, BETA2 = 0.9, 0.999
+EPSILON = 1e-15
+
+
+def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
+    """Learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
+
+    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t); ε is scaled along, which at 1e-15 is without effect.
+    """
+    return rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step)
+
+
+def adam_step(
+    raw: np.ndarray, gradients: np.ndarray, moments: np.ndarray, rates: np.ndarray, step: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Float64 twin of one step: raw (11, G), moments (2, 11, G) → the new ones."""
+    first = BETA1 * moments[0] + (1 - BETA1) * gradients
+    second = BETA2 * moments[1] + (1 - BETA2) * gradients**2
+    stepped = raw - folded_rates(rates, step)[:, None] * first / (np.sqrt(second) + EPSILON)
+    return stepped, np.stack([first, second])
+
+
+class DeviceAdam:
+    """The raw parameters (11, stride) on the device with their moments, and the kernels that move them."""
+
+    def __init__(self, rt: Runtime, activation: Activation) -> None:
+        self.rt, self.activation = rt, activation
+        self._rates = rt.zeros(11)
+
+    def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
+        """Parameter rows from raw rows."""
+        self.rt.launch(
+            self.rt.kernel("adam", "activate"),
+            stride // self.rt.lanes,
+            raw,
+            np.int32(count),
+            np.int32(stride),
+            np.float32(self.activation.scale_min),
+            np.float32(self.activation.scale_max),
+            parameters,
+            group=self.rt.group(),
+        )
+
+    def chain(
+        self,
+        raw: DeviceArray,
+        parameters: DeviceArray,
+        gradients: DeviceArray,
+        statistics: DeviceArray,
+        count: int,
+        stride: int,
+        *,
+        density_weight: float,
+        shape_weight: float,
+        shape_ratio: float,
+        shape_floor: float,
+    ) -> None:
+        """dL/dparameters to dL/draw in place, with the parameter terms added and the statistics gathered."""
+        share = 1.0 / max(count, 1)
+        self.rt.launch(
+            self.rt.kernel("adam", "chain_activations"),
+            stride // self.rt.lanes,
+            raw,
+            parameters,
+            np.int32(count),
+            np.int32(stride),
+            np.float32(self.activation.scale_min),
+            np.float32(self.activation.scale_max),
+            np.float32(density_weight * share),
+            np.float32(shape_weight * share),
+            np.float32(shape_ratio),
+            np.float32(shape_floor),
+            gradients,
+            statistics,
+            group=self.rt.group(),
+        )
+
+    def step(
+        self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray, step: int
+    ) -> None:
+        """One step of Adam; ``rates`` (11,), ``step`` counts from 1."""
+        self.rt.write(self._rates, folded_rates(rates, step))
+        self.rt.launch(
+            self.rt.kernel("adam", "adam_step"),
+            (stride // self.rt.lanes, 11),
+            raw,
+            gradients,
+            moments,
+            np.int32(stride),
+            self._rates,
+            np.float32(BETA1),
+            np.float32(BETA2),
+            np.float32(EPSILON),
+            group=self.rt.group(),
+        )

@@ -1,0 +1,24 @@
+"""Learning rates that decay exponentially from a first to a last value over the run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Rates:
+    """(first, last) rate of each kind of parameter, in internal units (half-sides of the volume)."""
+
+    position: tuple[float, float] = (2e-4, 2e-5)
+    scale: tuple[float, float] = (5e-3, 5e-4)
+    rotation: tuple[float, float] = (1e-3, 1e-4)
+    density: tuple[float, float] = (1e-2, 1e-3)
+
+    def at(self, progress: float) -> np.ndarray:
+        """Rates (11,) a parameter row at ``progress`` (0 to 1) through the run."""
+        position, scale, rotation, density = (
+            first * (last / first) ** progress for first, last in (self.position, self.scale, self.rotation, self.density)
+        )
+        return np.array([position] * 3 + [scale] * 3 + [rotation] * 4 + [density])

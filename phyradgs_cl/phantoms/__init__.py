@@ -1,0 +1,96 @@
+"""Phantoms: objects whose attenuation is known, for simulations and for truth to compare with.
+
+`make_phantom` is the door. What comes out has `name`, `kind` and `voxelise(grid)`; an "analytic"
+phantom also has `line_integrals(source, target)` in closed form, a "voxel" phantom its `volume` and
+`grid`. Attenuation scales with 1 / half-size in all of them, so that line integrals do not depend on
+the size chosen; in units of the half-size the procedural volumes are in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl.checks import one_of, positive
+from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.phantoms.ellipsoids import Ellipsoid, EllipsoidPhantom, rotation_about_z
+from phyradgs_cl.phantoms.from_file import LoadedVolume, load_volume
+from phyradgs_cl.phantoms.procedural_foot import foot
+from phyradgs_cl.phantoms.procedural_jaw import jaw
+from phyradgs_cl.phantoms.shepp_logan import shepp_logan
+from phyradgs_cl.phantoms.spheres import sphere_phantom
+from phyradgs_cl.phantoms.voxels import VoxelPhantom
+
+__all__ = [
+    "PHANTOMS",
+    "Ellipsoid",
+    "EllipsoidPhantom",
+    "LoadedVolume",
+    "Phantom",
+    "VoxelPhantom",
+    "foot",
+    "jaw",
+    "load_volume",
+    "make_phantom",
+    "rotation_about_z",
+    "shepp_logan",
+    "sphere_phantom",
+]
+
+
+class Phantom(Protocol):
+    """What every phantom offers."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def kind(self) -> str:
+        """ "analytic" or "voxel"."""
+        ...
+
+    def voxelise(self, grid: Grid, supersampling: int = ...) -> NDArray[np.float32]:
+        """(nz, ny, nx) in 1/mm."""
+        ...
+
+
+# (half_size_mm, resolution, seed) -> phantom; closed forms have no use for the last two.
+Factory = Callable[[float, int, int], Phantom]
+
+
+def _from_voxels(name: str, draw: Callable[[int, int], NDArray[np.float32]]) -> Factory:
+    def make(half_size_mm: float, resolution: int, seed: int) -> Phantom:
+        volume = draw(resolution, seed) / np.float32(half_size_mm)
+        return VoxelPhantom(volume, Grid.cube(resolution, 2 * half_size_mm), name)
+
+    return make
+
+
+PHANTOMS: dict[str, Factory] = {
+    "shepp-logan": lambda half_size_mm, resolution, seed: shepp_logan(half_size_mm),
+    "spheres": lambda half_size_mm, resolution, seed: sphere_phantom(half_size_mm),
+    "foot": _from_voxels("foot", foot),
+    "jaw": _from_voxels("jaw", jaw),
+}
+
+
+def make_phantom(name: str, half_size_mm: float, resolution: int = 128, seed: int = 0) -> Phantom:
+    """A phantom by its name, in a cube of side 2 · `half_size_mm` about the origin.
+
+    Args:
+        name: a key of `PHANTOMS`.
+        half_size_mm: half the cube's side.
+        resolution: voxels a side, for voxel phantoms.
+        seed: of the procedural phantoms' shape and texture.
+
+    Raises:
+        InputError: an unknown name (the message lists the known ones), or a size or count that is
+            not positive.
+    """
+    one_of("phantom", name, PHANTOMS)
+    positive("half_size_mm", half_size_mm)
+    positive("resolution", resolution)
+    return PHANTOMS[name](half_size_mm, int(resolution), seed)

@@ -1,0 +1,116 @@
+"""A voxel phantom from an HDF5 file: a bare `volume`, or one of this package's volume files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+
+_BARE = "/volume"
+_ENTRY = "/entry/reconstruction"
+_AXIS_TOLERANCE = 1e-3  # of a voxel: what float32 axes of a thousand voxels need
+
+
+class LoadedVolume(NamedTuple):
+    """Volume (nz, ny, nx) float32, and its grid where the file has axes in mm."""
+
+    volume: NDArray[np.float32]
+    grid: Grid | None
+
+
+def load_volume(path: str | Path) -> LoadedVolume:
+    """Read a 3D volume.
+
+    Either a dataset `/volume` (z, y, x) at the root (integers are divided by their type's maximum,
+    floats stay as they are; no grid), or `/entry/reconstruction/volume` in 1/mm with axes `z`, `y`,
+    `x` in mm beside it. Negative values are allowed: real reconstructions have them.
+
+    Raises:
+        InputError: no such file, not HDF5, no such dataset, not 3D, empty, not numbers, NaN or
+            infinity, axes that do not fit; names the file and the dataset.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(str(file), "no such file", "an HDF5 file", "check the path")
+    try:
+        handle = h5py.File(file, "r")
+    except OSError as error:
+        raise InputError(str(file), f"not readable as HDF5 ({error})", "an HDF5 file") from error
+    with handle:
+        name = _dataset_name(handle, file)
+        volume = _read(handle, name, f"{file}:{name}")
+        grid = _read_grid(handle, file, volume.shape) if name != _BARE else None
+    return LoadedVolume(volume, grid)
+
+
+def _dataset_name(handle: h5py.File, file: Path) -> str:
+    for name in (_BARE, f"{_ENTRY}/volume"):
+        if isinstance(handle.get(name), h5py.Dataset):
+            return name
+    found = "root members " + (", ".join(sorted(handle)) or "none")
+    raise InputError(str(file), found, f"a 3D dataset {_BARE} or {_ENTRY}/volume")
+
+
+def _read(handle: h5py.File, name: str, culprit: str) -> NDArray[np.float32]:
+    dataset = handle[name]
+    if dataset.ndim != 3 or 0 in dataset.shape:
+        raise InputError(culprit, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
+    if dataset.dtype.kind not in "iuf":
+        raise InputError(culprit, f"type {dataset.dtype}", "integers or real floating-point numbers")
+    raw = _values(dataset, culprit)
+    if raw.dtype.kind in "iu":
+        return (raw / np.float32(np.iinfo(raw.dtype).max)).astype(np.float32)
+    with np.errstate(over="ignore"):
+        volume = raw.astype(np.float32)  # float64 beyond float32's range becomes infinite: caught below
+    bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))
+    if bad:
+        raise InputError(
+            culprit, f"{bad} voxels that are NaN, infinite or too large", "finite float32 values"
+        )
+    return volume
+
+
+def _values(dataset: h5py.Dataset, culprit: str) -> NDArray[np.generic]:
+    try:
+        return np.asarray(dataset[()])
+    except OSError as error:  # a truncated file, or a compression filter that is not installed
+        raise InputError(culprit, f"data that cannot be read ({error})", "a complete dataset") from error
+
+
+def _read_grid(handle: h5py.File, file: Path, shape: tuple[int, ...]) -> Grid:
+    axes = [_read_axis(handle, file, f"{_ENTRY}/{axis}", n) for axis, n in zip("zyx", shape, strict=True)]
+    # One voxel along an axis has no spacing of its own: take that of the axis that has one.
+    known = [s for _, s in axes if s is not None]
+    sizes = tuple(s if s is not None else (known[0] if known else 1.0) for _, s in axes)
+    nz, ny, nx = shape
+    return Grid((nz, ny, nx), (sizes[0], sizes[1], sizes[2]), (axes[0][0], axes[1][0], axes[2][0]))
+
+
+def _read_axis(handle: h5py.File, file: Path, name: str, count: int) -> tuple[float, float | None]:
+    """Centre and spacing in mm of an axis of voxel centres; the spacing is None for a single voxel."""
+    culprit = f"{file}:{name}"
+    dataset = handle.get(name)
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape != (count,) or dataset.dtype.kind not in "iuf":
+        found = getattr(dataset, "shape", "nothing")
+        raise InputError(culprit, str(found), f"{count} voxel centres in mm")
+    axis = np.asarray(_values(dataset, culprit), dtype=np.float64)
+    unit = _text(dataset.attrs.get("units", "mm"))
+    if unit != "mm":
+        raise InputError(culprit, f"units {unit!r}", "units 'mm'")
+    if count == 1 and np.isfinite(axis[0]):
+        return float(axis[0]), None
+    spacing = (axis[-1] - axis[0]) / (count - 1) if count > 1 else np.nan
+    straight = np.abs(np.diff(axis) - spacing) <= _AXIS_TOLERANCE * abs(spacing)
+    if not (np.isfinite(spacing) and spacing > 0 and straight.all()):
+        raise InputError(culprit, "values that are not evenly rising", "voxel centres at even distances")
+    return float(axis[0] + axis[-1]) / 2, float(spacing)
+
+
+def _text(value: object) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)

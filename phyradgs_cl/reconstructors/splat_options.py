@@ -1,0 +1,86 @@
+"""Options of the splatting methods, and the named presets: ours, the paper's, the released code's."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Activation, Grid
+from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
+from phyradgs_cl.optim import DensityControl, Rates
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """Everything that a splatting run can be told; lengths in half-sides of the volume, densities relative.
+
+    gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ; ``tv_edge`` is the
+    edge of the random sub-volume in voxels. ``scale_min_voxels`` > 0 raises the smallest scale to that share
+    of a voxel.
+    """
+
+    motion: Motion = Motion("micro-views", 8, 5)
+    affine: bool = False
+    iterations: int = 3000
+    gaussians: int = 0
+    ssim_weight: float = 0.2
+    tv_weight: float = 0.01
+    tv_edge: int = 32
+    density_weight: float = 0.001
+    shape_weight: float = 0.0
+    shape_ratio: float = 10.0
+    shape_floor: float = 0.004
+    parameter_terms_from: int = 500
+    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA
+    initial_threshold: float = 0.05
+    initial_density: float = 0.15
+    initial_scale: float = 1.0
+    scale_min: float = 0.001
+    scale_min_voxels: float = 0.0
+    scale_max: float = 1.0
+    rates: Rates = Rates()
+    control: DensityControl = DensityControl()
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0:
+            raise InputError("--iterations", str(self.iterations), "at least 0")
+        if self.gaussians < 0:
+            raise InputError("--gaussians", str(self.gaussians), "at least 1, or 0 to choose from the grid")
+        if self.motion.name == "per-line":
+            raise InputError("--motion", "'per-line'", "static, static-start or micro-views")
+
+    def activation(self, grid: Grid) -> Activation:
+        """Bounds of the scales on ``grid`` (in internal units)."""
+        smallest = max(self.scale_min, self.scale_min_voxels * min(grid.voxel_size_mm))
+        return Activation(smallest, max(self.scale_max, 2 * smallest))
+
+    def gaussians_for(self, grid: Grid) -> int:
+        """Size of the first cloud: as asked, else a share of the voxels that grows with their number."""
+        if self.gaussians:
+            return self.gaussians
+        voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
+        return int(min(max(voxels / 16, 1000), 50_000))
+
+    def as_dict(self) -> dict[str, object]:
+        return asdict(self)
+
+
+_RELEASED = SplatOptions(
+    gaussians=50_000,
+    ssim_weight=0.25,
+    tv_weight=0.05,
+    density_weight=0.01,
+    shape_weight=0.02,
+    iterations=20_000,
+)
+_PAPER = SplatOptions(gaussians=50_000, iterations=20_000)
+PRESETS = {"default": SplatOptions(), "paper": _PAPER, "released": _RELEASED}
+
+
+def preset(name: str, **changes: object) -> SplatOptions:
+    """A named preset with the given options that are not None replaced."""
+    if name not in PRESETS:
+        raise InputError("--preset", repr(name), f"one of {', '.join(PRESETS)}")
+    given = {key: value for key, value in changes.items() if value is not None}
+    return replace(PRESETS[name], **given)  # type: ignore[arg-type]

@@ -1,0 +1,278 @@
+"""The engine under ``phyradgs`` and ``r2``: radiative Gaussians optimised against a scan's frames.
+
+The one place where scan, operators, objective and optimiser meet. Inside, lengths are divided by half the
+volume's longest side and densities by a reference (FDK's 99.9th percentile), so that rates, thresholds and SSIM's
+constants mean the same for every scan; both are undone on the way out.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.errors import NumericalError
+from phyradgs_cl.fields import Activation, Gaussians, Grid
+from phyradgs_cl.objective import ImageLoss, TotalVariation
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser, sub_grid, voxelise
+from phyradgs_cl.operators.layout import pad_columns, pad_rows, pitch_of, stride_of
+from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
+from phyradgs_cl.reconstructors.fdk import fdk_volume, fill_masked
+from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+REPORT_EVERY = 50
+_REFERENCE_PERCENTILE = 99.9
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What one internal unit is: of length in mm, of density in 1/mm."""
+
+    length_mm: float
+    density_per_mm: float
+
+    @property
+    def line_integral(self) -> float:
+        return self.length_mm * self.density_per_mm
+
+
+def reconstruct_splats(
+    scan: Scan, options: SplatOptions, rt: Runtime, seed: int, report: ProgressReport, method: str
+) -> Reconstruction:
+    """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``."""
+    started = time.perf_counter()
+    fdk = _static_fdk(rt, scan)
+    scale = internal_scale(fdk, scan.grid)
+    grid = scan.grid.scaled(1 / scale.length_mm)
+    rng = np.random.default_rng(seed)
+    population = _first_population(fdk / scale.density_per_mm, grid, options, rng)
+    run = SplatRun(rt, scan, options, scale, population, rng)
+    record = run.optimise(report, started)
+    cloud = Gaussians.from_rows(run.parameters())
+    volume = voxelise(rt, cloud.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(scale.density_per_mm)
+    facts = {
+        "method": method,
+        "options": options.as_dict(),
+        "seed": seed,
+        "unit_length_mm": scale.length_mm,
+        "unit_density_per_mm": scale.density_per_mm,
+        "gaussians": cloud.count,
+        "seconds": time.perf_counter() - started,
+        "interrupted_at": run.interrupted_at,
+    }
+    return Reconstruction(volume, scan.grid, cloud.scaled(scale.length_mm, scale.density_per_mm), record, facts)
+
+
+def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
+    """Half the longest side, and a high percentile of a first volume (1 where that is not positive)."""
+    reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
+    if not np.isfinite(reference):
+        raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
+    return Scale(grid.half_longest_mm, reference if reference > 0 else 1.0 / grid.half_longest_mm)
+
+
+class SplatRun:
+    """The state of one optimisation: everything that changes from iteration to iteration."""
+
+    def __init__(
+        self,
+        rt: Runtime,
+        scan: Scan,
+        options: SplatOptions,
+        scale: Scale,
+        population: Population,
+        rng: np.random.Generator,
+    ) -> None:
+        self.rt, self.options, self.rng = rt, options, rng
+        self.grid = scan.grid.scaled(1 / scale.length_mm)
+        self.activation = options.activation(self.grid)
+        self.frames = DeviceFrames(rt, scan, options, scale)
+        self.projector = SplatProjector(
+            rt, self.frames.lines, self.frames.width, affine=options.affine, cutoff_sigma=options.cutoff_sigma
+        )
+        self.loss = ImageLoss(rt, self.frames.lines, self.frames.width, self.projector.pitch, options.ssim_weight)
+        edge = [min(options.tv_edge, n) for n in self.grid.shape]
+        self.crop = Voxeliser(rt, (edge[0], edge[1], edge[2]), cutoff_sigma=options.cutoff_sigma)
+        self.tv = TotalVariation(rt, self.crop.shape, self.crop.pitch)
+        self.adam = DeviceAdam(rt, self.activation)
+        self.iteration = 0
+        self.interrupted_at: int | None = None
+        self._queue: list[int] = []
+        self._load(population)
+
+    # --- the loop ---------------------------------------------------------------------------------------
+
+    def optimise(self, report: ProgressReport, started: float) -> list[dict[str, float]]:
+        """All iterations; Ctrl-C ends the run after the one under way and keeps what it has."""
+        record: list[dict[str, float]] = []
+        total = self.options.iterations
+        try:
+            while self.iteration < total:
+                self.step()
+                if self.iteration % REPORT_EVERY == 0 or self.iteration == total:
+                    loss, seconds = self._checked_loss(), time.perf_counter() - started
+                    record.append(
+                        {"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count, "seconds": seconds}
+                    )
+                    report(Progress(self.iteration, total, loss, self.gaussians.count, seconds))
+        except KeyboardInterrupt:
+            self.rt.finish()
+            self.interrupted_at = self.iteration
+        return record
+
+    def step(self) -> None:
+        """One frame: render, compare, go back, regularise, move, and now and then control the density."""
+        options, gaussians = self.options, self.gaussians
+        frame = self._next_frame()
+        cells, measured, mask, pixels = self.frames.get(frame)
+        self.adam.activate(self.raw, gaussians.rows, gaussians.count, gaussians.stride)
+        rendered = self.projector.forward(gaussians, cells)
+        by_image = self.loss.evaluate(rendered, measured, mask, pixels)
+        self.projector.backward(gaussians, cells, by_image, self.gradients)
+        if options.tv_weight > 0:
+            self._add_total_variation()
+        late = self.iteration >= options.parameter_terms_from
+        self.adam.chain(
+            self.raw,
+            gaussians.rows,
+            self.gradients,
+            self.statistics,
+            gaussians.count,
+            gaussians.stride,
+            density_weight=options.density_weight if late else 0.0,
+            shape_weight=options.shape_weight if late else 0.0,
+            shape_ratio=options.shape_ratio,
+            shape_floor=options.shape_floor,
+        )
+        rates = options.rates.at(self.iteration / max(options.iterations, 1))
+        self.iteration += 1
+        self.adam.step(self.raw, self.gradients, self.moments, gaussians.stride, rates, self.iteration)
+        if options.control.is_due(self.iteration, options.iterations):
+            self._control_density()
+
+    def _next_frame(self) -> int:
+        if not self._queue:
+            self._queue = self.rng.permutation(self.frames.count).tolist()
+        return self._queue.pop()
+
+    def _add_total_variation(self) -> None:
+        start = [int(self.rng.integers(n - edge + 1)) for n, edge in zip(self.grid.shape, self.crop.shape, strict=True)]
+        part = sub_grid(self.grid, (start[0], start[1], start[2]), self.crop.shape)
+        by_volume = self.tv.evaluate(self.crop.forward(self.gaussians, part))
+        weight = self.options.tv_weight
+        self.crop.backward(self.gaussians, part, by_volume, self.gradients, add=True, weight=weight)
+
+    def _checked_loss(self) -> float:
+        loss = self.loss.value()
+        if not np.isfinite(loss):
+            raise NumericalError(
+                "loss", f"{loss} at iteration {self.iteration}", "a finite number", "check the scan for extreme values"
+            )
+        return loss
+
+    # --- the population -----------------------------------------------------------------------------------
+
+    def parameters(self) -> np.ndarray:
+        """Parameter rows (11, G) float64 in internal units."""
+        return self.activation.apply(self._population().raw.astype(np.float64))
+
+    def _population(self) -> Population:
+        count = self.gaussians.count
+        return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
+
+    def _control_density(self) -> None:
+        sums = self.rt.download(self.statistics)[:, : self.gaussians.count].astype(np.float64)
+        statistic = sums[0] / np.maximum(sums[1], 1)
+        half = np.array(self.grid.size_mm[::-1]) / 2
+        centre = np.array(self.grid.offset_mm[::-1])
+        box = np.stack([centre - half, centre + half])
+        population = self._population()
+        self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
+
+    def _load(self, population: Population) -> None:
+        count, stride = population.count, stride_of(population.count)
+        moments = np.zeros((2, 11, stride), np.float32)
+        moments[:, :, :count] = population.moments
+        self.raw = self.rt.upload(pad_columns(population.raw))
+        self.moments = self.rt.upload(moments)
+        self.gradients = self.rt.zeros((13, stride))
+        self.statistics = self.rt.zeros((2, stride))
+        self.gaussians = DeviceGaussians(self.rt.zeros((11, stride)), count, stride)
+
+
+class DeviceFrames:
+    """The scan on the device: time cells, measurement in internal units and mask of every frame."""
+
+    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
+        self.count = scan.frames
+        by_column = scan.shutter.axis == "columns"
+        rows, columns = scan.geometry.detector_shape
+        self.lines, self.width = (columns, rows) if by_column else (rows, columns)
+        tables = [scaled_cells(options.motion.cells(scan, f), 1 / scale.length_mm) for f in range(scan.frames)]
+        self._cells = [DeviceCells.upload(rt, table) for table in tables]
+        frames = scan.projections / np.float32(scale.line_integral)
+        self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
+        self._mask, self._pixels = _upload_masks(rt, scan, by_column)
+
+    def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
+        shared = frame if len(self._mask) > 1 else 0
+        return self._cells[frame], self._measured[frame], self._mask[shared], self._pixels[shared]
+
+
+def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:
+    """Masks that are 1 where a pixel counts: one for all frames, or one a frame."""
+    if scan.pixel_mask is None:
+        masks = [np.ones(scan.geometry.detector_shape, np.float32)]
+    else:
+        stack = scan.pixel_mask if scan.pixel_mask.ndim == 3 else scan.pixel_mask[None]
+        masks = [(m == 0).astype(np.float32) for m in stack]
+    arrays = [rt.upload(pad_rows(m.T if by_column else m)) for m in masks]
+    return arrays, [float(m.sum()) for m in masks]
+
+
+def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
+    """The same cells with all lengths multiplied by ``factor``."""
+    return TimeCells(
+        table.pose * factor,
+        table.time_s,
+        table.line_start,
+        table.line_stop,
+        table.weight,
+        table.lines,
+        table.axis,
+    )
+
+
+def _static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
+    """FDK at the mid-window poses, the start of every splatting method."""
+    pose = np.concatenate([Motion("static").cells(scan, f).pose for f in range(scan.frames)])
+    frames = scan.projections
+    if scan.pixel_mask is not None:
+        frames = fill_masked(frames, np.broadcast_to(scan.pixel_mask != 0, frames.shape))
+    return fdk_volume(rt, frames, pose, scan.grid)
+
+
+def _first_population(
+    volume: np.ndarray, grid: Grid, options: SplatOptions, rng: np.random.Generator
+) -> Population:
+    activation = options.activation(grid)
+    cloud = initial_cloud(
+        volume,
+        grid,
+        options.gaussians_for(grid),
+        threshold=options.initial_threshold,
+        density_share=options.initial_density,
+        scale_bounds=(activation.scale_min, activation.scale_max),
+        scale_factor=options.initial_scale,
+        rng=rng,
+    )
+    raw = activation.invert(cloud.rows())
+    half = np.array(grid.size_mm[::-1]) / 2
+    box = np.stack([np.array(grid.offset_mm[::-1]) - half, np.array(grid.offset_mm[::-1]) + half])
+    return prune(Population(raw, np.zeros((2, *raw.shape))), activation, options.control, box)

@@ -1,0 +1,6 @@
+"""The only room that knows OpenCL: devices, programs, buffers, launches."""
+
+from phyradgs_cl.runtime.context import DeviceArray, Runtime
+from phyradgs_cl.runtime.device import DEVICE_VARIABLE, DeviceInfo, choose_device, list_devices
+
+__all__ = ["DEVICE_VARIABLE", "DeviceArray", "DeviceInfo", "Runtime", "choose_device", "list_devices"]

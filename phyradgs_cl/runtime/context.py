@@ -1,0 +1,203 @@
+"""A runtime: one device, one in-order queue, the programs built for it, and its buffers."""
+
+from __future__ import annotations
+
+import logging
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+
+from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.runtime.device import DeviceInfo, choose_device
+from phyradgs_cl.runtime.source import kernel_source
+
+log = logging.getLogger(__name__)
+
+LANE_CHOICES = (1, 4, 8, 16)
+
+
+@dataclass(eq=False)
+class DeviceArray:
+    """A typed, shaped piece of device memory."""
+
+    buffer: cl.Buffer
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def nbytes(self) -> int:
+        return self.size * self.dtype.itemsize
+
+
+class Runtime:
+    """Owns everything OpenCL. Declare (``kernel``), allocate (``empty``, ``upload``), call (``launch``).
+
+    ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
+    the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
+    """
+
+    def __init__(
+        self,
+        device: str | None = None,
+        *,
+        lanes: int | None = None,
+        fp64: bool | None = None,
+        profile: bool = False,
+    ) -> None:
+        self.device: DeviceInfo
+        self.device, self.reason = choose_device(device)
+        self.context = cl.Context([self.device.handle])
+        properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
+        self.queue = cl.CommandQueue(self.context, properties=properties)
+        self.lanes = lanes or default_lanes(self.device)
+        if self.lanes not in LANE_CHOICES:
+            raise DeviceError("lanes", str(self.lanes), f"one of {LANE_CHOICES}")
+        self.fp64 = self.device.has_fp64 if fp64 is None else (fp64 and self.device.has_fp64)
+        self.is_cpu = self.device.kind == "cpu"
+        self.profile = profile
+        self.events: dict[str, list[cl.Event]] = defaultdict(list)
+        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        self._kernels: dict[tuple[str, str, tuple[str, ...]], cl.Kernel] = {}
+
+    # --- programs -----------------------------------------------------------------------------------
+
+    def kernel(self, program: str, name: str, **defines: int | float | bool) -> cl.Kernel:
+        """The kernel ``name`` of ``cl/<program>.cl``; programs are built once and kept, kernels too."""
+        options = self._options(defines)
+        key = (program, name, options)
+        if key not in self._kernels:
+            if (program, options) not in self._programs:
+                self._programs[program, options] = self._build(program, options)
+            self._kernels[key] = cl.Kernel(self._programs[program, options], name)
+        return self._kernels[key]
+
+    def _options(self, defines: dict[str, int | float | bool]) -> tuple[str, ...]:
+        merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
+        flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
+        return ("-cl-std=CL1.2", "-cl-mad-enable", *flags)
+
+    def _build(self, program: str, options: tuple[str, ...]) -> cl.Program:
+        started = time.perf_counter()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", cl.CompilerWarning)
+                built = cl.Program(self.context, kernel_source(program)).build(options=list(options))
+        except cl.RuntimeError as error:
+            message = " ".join(str(error).split())[-600:]
+            raise DeviceError(
+                f"kernel {program}.cl on {self.device.name}", message, "a program that builds", "try another --device"
+            ) from error
+        log.debug("built %s in %.2f s", program, time.perf_counter() - started)
+        return built
+
+    # --- memory -------------------------------------------------------------------------------------
+
+    def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
+        """Uninitialised memory. Raises DeviceError when the device has too little."""
+        shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
+        kind = np.dtype(dtype)
+        nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
+        if nbytes > self.device.largest_allocation_bytes:
+            limit = f"at most {self.device.largest_allocation_bytes / 2**20:.0f} MiB in one allocation"
+            raise DeviceError(f"memory of {self.device.name}", f"{nbytes / 2**20:.0f} MiB", limit, "use a smaller problem")
+        try:
+            buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes)
+        except cl.Error as error:
+            found = f"{nbytes / 2**20:.0f} MiB refused ({error})"
+            raise DeviceError(f"memory of {self.device.name}", found, "enough free memory") from error
+        return DeviceArray(buffer, shape, kind)
+
+    def zeros(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
+        array = self.empty(shape, dtype)
+        self.fill(array, 0)
+        return array
+
+    def fill(self, array: DeviceArray, value: float) -> None:
+        pattern = np.array(value, dtype=array.dtype)
+        event = cl.enqueue_fill_buffer(self.queue, array.buffer, pattern, 0, max(array.nbytes, array.dtype.itemsize))
+        self._record("fill", event)
+
+    def upload(self, values: np.ndarray, dtype: np.typing.DTypeLike | None = None) -> DeviceArray:
+        values = np.ascontiguousarray(values, dtype=dtype)
+        array = self.empty(values.shape, values.dtype)
+        self.write(array, values)
+        return array
+
+    def write(self, array: DeviceArray, values: np.ndarray) -> None:
+        """Copies host values (same size) into an existing array; the host array may be reused afterwards."""
+        values = np.ascontiguousarray(values, dtype=array.dtype)
+        if values.size:
+            cl.enqueue_copy(self.queue, array.buffer, values, is_blocking=True)
+
+    def download(self, array: DeviceArray) -> np.ndarray:
+        values = np.empty(array.shape, array.dtype)
+        if values.size:
+            cl.enqueue_copy(self.queue, values, array.buffer, is_blocking=True)
+        return values
+
+    def read_item(self, array: DeviceArray, index: int) -> np.generic:
+        """One element of a flat array; waits for the queue."""
+        value = np.empty(1, array.dtype)
+        offset = index * array.dtype.itemsize
+        cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
+        return value[0]
+
+    def copy(self, source: DeviceArray, target: DeviceArray) -> None:
+        self._record("copy", cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes))
+
+    # --- launches -----------------------------------------------------------------------------------
+
+    def launch(self, kernel: cl.Kernel, items: int | tuple[int, ...], *args: object, group: int = 1) -> None:
+        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``."""
+        shape = (items,) if isinstance(items, (int, np.integer)) else items
+        if min(shape) < 1:
+            return
+        rounded = (-(-int(shape[0]) // group) * group, *(int(n) for n in shape[1:]))
+        local = (group, *([1] * (len(rounded) - 1)))
+        kernel.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
+        self._record(kernel.function_name, cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, local))
+
+    def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
+        """The work-group size for this class of device."""
+        return on_cpu if self.is_cpu else on_gpu
+
+    def finish(self) -> None:
+        self.queue.finish()
+
+    # --- profile ------------------------------------------------------------------------------------
+
+    def _record(self, name: str, event: cl.Event) -> None:
+        if self.profile:
+            self.events[name].append(event)
+
+    def kernel_seconds(self) -> dict[str, float]:
+        """Device time by kernel since the last call, seconds; needs ``profile=True``."""
+        self.queue.finish()
+        seconds = {
+            name: sum(e.profile.end - e.profile.start for e in events) * 1e-9
+            for name, events in self.events.items()
+        }
+        self.events.clear()
+        return seconds
+
+
+def default_lanes(device: DeviceInfo) -> int:
+    """Vector width: a CPU's own; 1 where work-items are the lanes."""
+    if device.kind != "cpu":
+        return 1
+    return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
+
+
+def _literal(value: int | float | bool) -> str:
+    if isinstance(value, (bool, int, np.integer)):
+        return str(int(value))
+    return f"{float(value):.9e}f"

@@ -1,0 +1,125 @@
+"""Which OpenCL devices there are, and which one is taken and why."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.runtime import pocl
+
+pocl.prepare_environment()
+
+import pyopencl as cl  # noqa: E402  (PoCL reads its cache folder from the environment when it loads)
+
+DEVICE_VARIABLE = "PHYRADGS_DEVICE"
+_NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
+_repaired: dict[int, str | None] = {}
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device and what the choice between devices looks at."""
+
+    index: int
+    name: str
+    platform: str
+    version: str
+    kind: str  # "gpu", "cpu" or "accelerator"
+    compute_units: int
+    memory_bytes: int
+    largest_allocation_bytes: int
+    vector_width: int
+    has_fp64: bool
+    by_default: bool
+    handle: cl.Device
+
+    @property
+    def rank(self) -> tuple[int, int, int, int, int]:
+        """Larger is better: eligible, GPU before CPU, own memory, wider vectors, more units."""
+        kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
+        unified = bool(self.handle.host_unified_memory)
+        return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)
+
+
+def list_devices() -> list[DeviceInfo]:
+    """All devices of all platforms, in the order in which OpenCL names them."""
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader reports "no platform" as an error
+        return []
+    found: list[DeviceInfo] = []
+    for platform in platforms:
+        try:
+            devices = platform.get_devices()
+        except cl.Error:
+            continue
+        found.extend(_describe(len(found) + i, platform, d) for i, d in enumerate(devices))
+    return found
+
+
+def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
+    """The device to use and the reason in words.
+
+    ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a
+    device's or platform's name. Raises DeviceError when nothing fits.
+    """
+    source = "--device"
+    if not wish:
+        wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
+    devices = list_devices()
+    if not devices:
+        raise DeviceError(
+            "OpenCL", "no device", "at least one", "pip install 'phyradgs-cl[cpu]' brings PoCL, which runs on the CPU"
+        )
+    if wish:
+        return _wished(wish, source, devices)
+    eligible = [d for d in devices if d.by_default]
+    if not eligible:
+        names = ", ".join(d.name for d in devices)
+        raise DeviceError("OpenCL", f"only {names}", "a real device", "name one with --device to use it all the same")
+    best = max(eligible, key=lambda d: d.rank)
+    return best, f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
+
+
+def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
+    if wish.strip().isdigit():
+        matching = [d for d in devices if d.index == int(wish)]
+    elif wish.lower() in ("cpu", "gpu"):
+        matching = [d for d in devices if d.kind == wish.lower() and d.by_default]
+    else:
+        matching = [d for d in devices if wish.lower() in f"{d.platform} {d.name}".lower()]
+    if not matching:
+        known = "; ".join(f"{d.index}: {d.name} ({d.platform})" for d in devices)
+        raise DeviceError(source, repr(wish), f"an index, cpu, gpu or part of a name: {known}")
+    return max(matching, key=lambda d: d.rank), f"asked for by {source}={wish}"
+
+
+def _describe(index: int, platform: cl.Platform, device: cl.Device) -> DeviceInfo:
+    is_pocl = "portable computing language" in platform.name.lower()
+    kind = _kind(device)
+    if is_pocl and kind == "cpu" and device.int_ptr not in _repaired:
+        _repaired[device.int_ptr] = pocl.repair_unknown_target(device.int_ptr)
+    text = f"{platform.name} {platform.vendor} {device.name}".lower()
+    usable = bool(device.available and device.compiler_available)
+    return DeviceInfo(
+        index=index,
+        name=" ".join(device.name.split()),
+        platform=platform.name,
+        version=device.version.strip(),
+        kind=kind,
+        compute_units=device.max_compute_units,
+        memory_bytes=device.global_mem_size,
+        largest_allocation_bytes=device.max_mem_alloc_size,
+        vector_width=max(1, device.native_vector_width_float),
+        has_fp64=device.native_vector_width_double > 0 or "cl_khr_fp64" in device.extensions,
+        by_default=usable and not any(word in text for word in _NEVER_BY_DEFAULT),
+        handle=device,
+    )
+
+
+def _kind(device: cl.Device) -> str:
+    # device types are bit fields: PoCL answers ALL | CPU
+    if device.type & cl.device_type.CPU:
+        return "cpu"
+    return "gpu" if device.type & cl.device_type.GPU else "accelerator"

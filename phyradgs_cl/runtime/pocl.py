@@ -1,0 +1,99 @@
+"""Keeps PoCL's wheel usable on processors that are newer than the LLVM inside it.
+
+PoCL 3.0 asks LLVM 14 for the host's name. For a processor that LLVM does not know the answer is
+"generic", which LLVM's own front end then refuses ("unknown target CPU 'generic'"), so that no kernel
+builds (pocl/pocl issue 1049). PoCL has no setting for it. What it does have is a device record that
+holds a pointer to that name; here the pointer is turned to the name of an older processor with the same
+instruction sets. The record is only read until exactly the string "generic" has been found in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import os
+import platform
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+_RECORD_BYTES = 2048
+_USER_SPACE = 1 << 47
+_kept_alive: list[ctypes.Array] = []
+
+
+def prepare_environment() -> None:
+    """Gives PoCL a kernel cache of its own for this processor, unless the user has chosen one.
+
+    PoCL names its cache after the LLVM target, so two unknown processors would share binaries.
+    """
+    if "POCL_CACHE_DIR" in os.environ or platform.system() != "Linux":
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = home / "phyradgs-cl" / f"pocl-{equivalent_target() or platform.machine()}"
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ["POCL_CACHE_DIR"] = str(folder)
+
+
+def equivalent_target() -> str | None:
+    """An LLVM 14 processor name with this machine's vector instructions, or None where there is none."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return None
+    flags = _cpu_flags()
+    if {"avx512f", "avx512dq", "avx512bw", "avx512vl", "avx512cd"} <= flags:
+        return "skylake-avx512"
+    if {"avx2", "fma", "bmi1", "bmi2"} <= flags:
+        return "haswell"
+    if "avx" in flags:
+        return "sandybridge"
+    return "x86-64"
+
+
+def repair_unknown_target(device_address: int) -> str | None:
+    """Names the equivalent processor in the record of a PoCL CPU device, if LLVM did not know the real one.
+
+    Returns the name that was set, or None when nothing had to be done (or nothing could be).
+    """
+    target = equivalent_target()
+    if target is None or platform.system() != "Linux":
+        return None
+    with _own_memory() as read:
+        record = read(device_address, _RECORD_BYTES)
+        for offset in range(0, len(record) - 7, 8):
+            (pointer,) = struct.unpack_from("<Q", record, offset)
+            if 4096 < pointer < _USER_SPACE and read(pointer, 8) == b"generic\0":
+                name = ctypes.create_string_buffer(target.encode())
+                _kept_alive.append(name)
+                ctypes.c_uint64.from_address(device_address + offset).value = ctypes.addressof(name)
+                log.info("PoCL does not know this processor; its kernels are built for %s", target)
+                return target
+    return None
+
+
+@contextlib.contextmanager
+def _own_memory() -> Iterator[object]:
+    """A reader of this process's memory that answers b'' for an unmapped address instead of crashing."""
+    handle = os.open("/proc/self/mem", os.O_RDONLY)
+
+    def read(address: int, count: int) -> bytes:
+        try:
+            return os.pread(handle, count, address)
+        except (OSError, OverflowError):
+            return b""
+
+    try:
+        yield read
+    finally:
+        os.close(handle)
+
+
+def _cpu_flags() -> set[str]:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("flags"):
+                return set(line.split(":", 1)[1].split())
+    return set()

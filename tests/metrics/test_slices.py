@@ -1,0 +1,43 @@
+"""The figure of slices: a PNG comes out, and unwritable places are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.metrics import slices_png
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def _size(path: Path) -> tuple[int, int]:
+    head = path.read_bytes()[:24]
+    assert head.startswith(PNG)
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+
+
+def test_three_columns_with_a_truth_and_one_without(tmp_path: Path) -> None:
+    volume = np.random.default_rng(0).uniform(size=(6, 8, 10)).astype(np.float32)
+    slices_png(tmp_path / "with.png", volume + 0.1, volume, "title")
+    slices_png(tmp_path / "without.png", volume, None, "title")
+    assert _size(tmp_path / "with.png")[0] > 2 * _size(tmp_path / "without.png")[0] > 200
+
+
+def test_empty_volumes_are_drawn_too(tmp_path: Path) -> None:
+    slices_png(tmp_path / "empty.png", np.zeros((3, 3, 3)), np.zeros((3, 3, 3)), "nothing")
+    _size(tmp_path / "empty.png")
+
+
+def test_errors(tmp_path: Path) -> None:
+    good = np.ones((3, 3, 3))
+    with pytest.raises(OutputError, match="missing"):
+        slices_png(tmp_path / "missing" / "a.png", good, None, "title")
+    with pytest.raises(InputError, match="result: found shape"):
+        slices_png(tmp_path / "a.png", good[0], None, "title")
+    with pytest.raises(InputError, match=r"found shape \(3, 3, 3\); expected shape \(2, 3, 3\)"):
+        slices_png(tmp_path / "a.png", good, good[1:], "title")
+    with pytest.raises(InputError, match="NaN"):
+        slices_png(tmp_path / "a.png", good * np.nan, None, "title")

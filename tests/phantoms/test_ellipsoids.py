@@ -1,0 +1,147 @@
+"""Closed-form integrals against sums of samples, known volumes and chords."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.phantoms import ellipsoids as module
+from phyradgs_cl.phantoms.ellipsoids import Ellipsoid, EllipsoidPhantom, rotation_about_z
+
+
+def _random_rotation(rng: np.random.Generator) -> tuple:
+    q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return tuple(map(tuple, q.tolist()))
+
+
+def _random_phantom(seed: int) -> EllipsoidPhantom:
+    rng = np.random.default_rng(seed)
+    bodies = tuple(
+        Ellipsoid(
+            tuple(rng.uniform(-20, 20, 3)),
+            tuple(rng.uniform(5, 25, 3)),
+            rng.uniform(-0.02, 0.05),
+            _random_rotation(rng),
+        )
+        for _ in range(5)
+    )
+    return EllipsoidPhantom(bodies, "random")
+
+
+def _marched(phantom: EllipsoidPhantom, source: np.ndarray, target: np.ndarray, n: int = 40000) -> float:
+    """Midpoint sum along one segment, the surface tested by the quadratic form of the inverse covariance."""
+    t = (np.arange(n) + 0.5) / n
+    points = source + t[:, None] * (target - source)
+    total = np.zeros(n)
+    for e in phantom.ellipsoids:
+        r = np.array(e.rotation)
+        form = r @ np.diag(1 / np.array(e.semi_axes_mm) ** 2) @ r.T
+        d = points - np.array(e.centre_mm)
+        total += e.attenuation_per_mm * (np.sum((d @ form) * d, axis=1) < 1)
+    return float(total.mean() * np.linalg.norm(target - source))
+
+
+def test_line_integrals_equal_brute_force_sampling_also_from_inside() -> None:
+    phantom = _random_phantom(1)
+    rng = np.random.default_rng(2)
+    source = rng.uniform(-60, 60, (30, 3))  # some sources and targets lie inside ellipsoids
+    target = rng.uniform(-60, 60, (30, 3))
+    expected = [_marched(phantom, s, t) for s, t in zip(source, target, strict=True)]
+    # 40,000 samples of a step function along 200 mm: each surface is off by at most half a sample.
+    assert np.allclose(phantom.line_integrals(source, target), expected, atol=5e-4, rtol=0)
+
+
+def test_sphere_chord_in_closed_form_from_a_far_source() -> None:
+    ball = EllipsoidPhantom((Ellipsoid((0, 0, 0), (2, 2, 2), 0.5),), "ball")
+    height = np.array([0.0, 1.0, 1.9, 1.999999, 2.1])
+    source = np.stack([np.full(5, 1e4), np.zeros(5), height], axis=-1)
+    target = source * [-1, 1, 1]
+    expected = 0.5 * 2 * np.sqrt(np.maximum(4 - height**2, 0))
+    assert np.allclose(ball.line_integrals(source, target), expected, atol=1e-9)
+
+
+def test_segments_stop_at_their_ends() -> None:
+    ball = EllipsoidPhantom((Ellipsoid((0, 0, 0), (2, 2, 2), 1.0),), "ball")
+    target = np.array([[1, 0, 0], [9, 0, 0], [-1, 0, 0], [0, 0, 0]])
+    assert np.allclose(ball.line_integrals([0, 0, 0], target), [1, 2, 1, 0])
+    assert ball.line_integrals([5, 0, 0], [9, 0, 0]) == 0  # the ball lies behind the source
+    assert ball.line_integrals([5, 0, 0], [3, 0, 0]) == 0  # and here beyond the target
+
+
+def test_direction_does_not_matter_and_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    phantom = _random_phantom(3)
+    rng = np.random.default_rng(4)
+    source, target = rng.uniform(-90, 90, (4, 1, 3)), rng.uniform(-90, 90, (7, 3))
+    whole = phantom.line_integrals(source, target)
+    assert whole.shape == (4, 7) and whole.dtype == np.float64
+    assert np.allclose(whole, phantom.line_integrals(target, source), atol=1e-13)
+    monkeypatch.setattr(module, "RAYS_PER_CHUNK", 3)
+    assert np.array_equal(phantom.line_integrals(source, target), whole)
+
+
+def test_parallel_projection_holds_the_volume_of_the_ellipsoid() -> None:
+    rng = np.random.default_rng(5)
+    body = Ellipsoid((3, -4, 5), (11, 17, 7), 0.03, _random_rotation(rng))
+    side = np.linspace(-40, 40, 201)
+    y, z = np.meshgrid(side, side, indexing="ij")
+    rays = EllipsoidPhantom((body,), "one").line_integrals(
+        np.stack([np.full_like(y, -99), y, z], -1), np.stack([np.full_like(y, 99), y, z], -1)
+    )
+    mass = rays.sum() * (side[1] - side[0]) ** 2
+    assert mass == pytest.approx(0.03 * 4 / 3 * np.pi * 11 * 17 * 7, rel=2e-3)
+
+
+def test_voxels_hold_the_volume_and_sit_where_the_density_is() -> None:
+    phantom = EllipsoidPhantom((Ellipsoid((2, -3, 4), (9, 5, 7), 0.1, rotation_about_z(0.6)),), "one")
+    grid = Grid((30, 26, 28), (1.0, 1.1, 0.9), (4.0, -3.0, 2.0))
+    volume = phantom.voxelise(grid, 3)
+    assert volume.shape == grid.shape and volume.dtype == np.float32
+    assert volume.sum() * 0.99 == pytest.approx(0.1 * 4 / 3 * np.pi * 9 * 5 * 7, rel=3e-3)
+    z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    clear = (volume == 0) | np.isclose(volume, 0.1)
+    assert np.allclose(phantom.density(x, y, z)[clear], volume[clear], atol=1e-7)
+    centre = [float((volume * c).sum() / volume.sum()) for c in (x, y, z)]
+    assert np.allclose(centre, (2, -3, 4), atol=0.02)
+
+
+def test_one_sample_a_voxel_is_the_density_at_its_centre() -> None:
+    phantom, grid = _random_phantom(6), Grid((11, 13, 9), (5.0, 4.0, 6.0), (1.0, 2.0, 3.0))
+    z, y, x = grid.axes_mm()
+    expected = phantom.density(x, y[:, None], z[:, None, None])
+    assert np.allclose(phantom.voxelise(grid, 1), expected, atol=1e-8)
+
+
+def test_extent_touches_the_surface() -> None:
+    tilted = EllipsoidPhantom((Ellipsoid((5, 0, 0), (10, 2, 3), 1.0, rotation_about_z(np.pi / 4)),), "one")
+    reach = np.sqrt((10**2 + 2**2) / 2)
+    assert np.allclose(tilted.extent_mm, (5 + reach, reach, 3))
+    assert EllipsoidPhantom((), "none").extent_mm == (0, 0, 0)
+
+
+def test_rotation_about_z_turns_the_long_axis_counter_clockwise() -> None:
+    phantom = EllipsoidPhantom((Ellipsoid((0, 0, 0), (10, 1, 1), 1.0, rotation_about_z(np.pi / 4)),), "one")
+    assert phantom.density(5, 5, 0) == 1 and phantom.density(5, -5, 0) == 0
+
+
+@pytest.mark.parametrize(
+    ("source", "target"), [([0, 0], [1, 1]), (np.zeros((4, 3)), np.zeros((5, 3))), (0.0, 1.0)]
+)
+def test_rays_of_a_wrong_shape_are_refused(source: object, target: object) -> None:
+    with pytest.raises(InputError, match="ray source and target"):
+        _random_phantom(0).line_integrals(source, target)  # type: ignore[arg-type]
+
+
+def test_impossible_ellipsoids_are_refused() -> None:
+    with pytest.raises(InputError, match="semi-axis"):
+        Ellipsoid((0, 0, 0), (1, 0, 1), 1.0)
+    with pytest.raises(InputError, match="rotation"):
+        Ellipsoid((0, 0, 0), (1, 1, 1), 1.0, ((1, 0, 0), (0, 2, 0), (0, 0, 1)))
+    with pytest.raises(InputError, match="semi_axes_mm: found shape"):
+        Ellipsoid((0, 0, 0), (1, 1), 1.0)  # type: ignore[arg-type]
+    assert hash(Ellipsoid(np.zeros(3), [1, 1, 1], 1.0)) == hash(Ellipsoid((0, 0, 0), (1, 1, 1), 1.0))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="centre"):
+        Ellipsoid((0, np.nan, 0), (1, 1, 1), 1.0)
+    with pytest.raises(InputError, match="supersampling"):
+        _random_phantom(0).voxelise(Grid.cube(4, 1.0), 0)

@@ -1,0 +1,109 @@
+"""Volumes from files: two layouts, and an error that names every defect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.phantoms import load_volume
+
+
+def _write(path: Path, data: object, name: str = "volume") -> Path:
+    with h5py.File(path, "w") as file:
+        file[name] = data
+    return path
+
+
+def _write_result(path: Path, grid: Grid, **replace: object) -> Path:
+    axes = dict(zip("zyx", grid.axes_mm(), strict=True)) | replace
+    with h5py.File(path, "w") as file:
+        group = file.create_group("entry/reconstruction")
+        group["volume"] = np.arange(np.prod(grid.shape), dtype=np.float32).reshape(grid.shape) - 5
+        for name, values in axes.items():
+            if values is not None:
+                group[name] = np.asarray(values, dtype=np.float32)
+                group[name].attrs["units"] = "mm"
+    return path
+
+
+@pytest.mark.parametrize(("dtype", "top"), [("u1", 255), ("u2", 65535), ("i2", 32767)])
+def test_integers_are_divided_by_their_types_maximum(tmp_path: Path, dtype: str, top: int) -> None:
+    data = np.zeros((2, 3, 4), dtype)
+    data[1, 2, 3], data[0, 0, 0] = top, top // 2
+    volume, grid = load_volume(_write(tmp_path / "v.h5", data))
+    assert grid is None and volume.dtype == np.float32
+    assert volume[1, 2, 3] == 1 and volume[0, 0, 0] == pytest.approx((top // 2) / top, rel=1e-6)
+
+
+def test_floats_stay_as_they_are_negatives_included(tmp_path: Path) -> None:
+    data = np.random.default_rng(0).normal(size=(3, 4, 5))
+    assert np.array_equal(load_volume(_write(tmp_path / "v.h5", data)).volume, data.astype(np.float32))
+
+
+def test_a_result_file_comes_with_its_grid(tmp_path: Path) -> None:
+    grid = Grid((4, 5, 6), (0.5, 0.25, 0.2), (3.0, -1.0, 0.5))
+    volume, found = load_volume(_write_result(tmp_path / "r.h5", grid))
+    assert volume.shape == (4, 5, 6) and volume.min() == -5
+    assert found is not None and found.shape == grid.shape
+    assert np.allclose(found.voxel_size_mm, grid.voxel_size_mm, rtol=1e-5)
+    assert np.allclose(found.offset_mm, grid.offset_mm, atol=1e-5)
+
+
+def test_missing_and_foreign_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none.h5: found no such file"):
+        load_volume(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("not a volume")
+    with pytest.raises(InputError, match=r"text.h5: found not readable as HDF5"):
+        load_volume(tmp_path / "text.h5")
+    with pytest.raises(InputError, match="no such file"):
+        load_volume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (np.zeros((3, 4)), r"v.h5:/volume: found shape \(3, 4\); expected three axes"),
+        (np.zeros((3, 0, 4)), r"v.h5:/volume: found shape \(3, 0, 4\)"),
+        (np.full((2, 2, 2), np.nan), "v.h5:/volume: found 8 voxels that are NaN"),
+        (np.full((2, 2, 2), 1e300), "v.h5:/volume: found 8 voxels that are NaN, infinite or too large"),
+        (np.zeros((2, 2, 2), complex), "v.h5:/volume: found type complex128"),
+        (np.full((2, 2, 2), b"ab"), "v.h5:/volume: found type"),
+    ],
+)
+def test_defects_of_the_dataset_are_named(tmp_path: Path, data: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_volume(_write(tmp_path / "v.h5", data))
+
+
+def test_a_file_without_a_volume_lists_what_it_has(tmp_path: Path) -> None:
+    path = _write(tmp_path / "v.h5", np.zeros((2, 2, 2)), "density")
+    with pytest.raises(InputError, match="found root members density; expected a 3D dataset /volume or"):
+        load_volume(path)
+
+
+@pytest.mark.parametrize("axis", [None, [0.0, 1.0], [0, 1, 2, 3, 5], [4, 3, 2, 1, 0], [0, 1, np.nan, 3, 4]])
+def test_axes_must_exist_and_be_even(tmp_path: Path, axis: object) -> None:
+    path = _write_result(tmp_path / "r.h5", Grid((4, 5, 6), (1.0, 1.0, 1.0)), y=axis)
+    with pytest.raises(InputError, match=r"r.h5:/entry/reconstruction/y"):
+        load_volume(path)
+
+
+def test_axes_must_be_in_mm(tmp_path: Path) -> None:
+    path = _write_result(tmp_path / "r.h5", Grid((4, 5, 6), (1.0, 1.0, 1.0)))
+    with h5py.File(path, "r+") as file:
+        file["/entry/reconstruction/x"].attrs["units"] = "m"
+    with pytest.raises(InputError, match="units 'm'"):
+        load_volume(path)
+
+
+def test_a_truncated_file_is_an_input_error(tmp_path: Path) -> None:
+    path = _write(tmp_path / "v.h5", np.ones((30, 30, 30)))
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=r"v\.h5"):
+        load_volume(path)

@@ -1,0 +1,125 @@
+"""The named phantoms: known numbers, symmetries, sameness at every resolution."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan, sphere_phantom
+
+
+def _blocks(volume: np.ndarray) -> np.ndarray:
+    n = len(volume) // 2
+    return volume.reshape(n, 2, n, 2, n, 2).mean(axis=(1, 3, 5))
+
+
+@pytest.mark.parametrize(
+    ("variant", "skull", "brain", "ventricle"), [("toft", 1.0, 0.2, 0.0), ("kak-slaney", 2.0, 1.02, 1.0)]
+)
+def test_shepp_logan_grey_levels(variant: str, skull: float, brain: float, ventricle: float) -> None:
+    phantom = shepp_logan(80.0, variant)
+    grey = phantom.density(0, np.array([0.9, -0.3, 0.0]) * 80, 0.0) * 80
+    assert np.allclose(grey[:2], [skull, brain])
+    left = phantom.density(-0.22 * 80, 0, -0.25 * 80) * 80  # centre of the third ellipsoid
+    assert left == pytest.approx(ventricle)
+
+
+def test_shepp_logan_ventricles_lean_outwards_towards_plus_y() -> None:
+    # At 108 degrees the left ellipsoid's long axis runs from the middle at -y outwards to +y.
+    phantom = shepp_logan(1.0)
+    dx, dy = 0.38 * np.cos(np.deg2rad(108)), 0.38 * np.sin(np.deg2rad(108))
+    assert phantom.density(-0.22 - dx, -dy, -0.25) == pytest.approx(0.0, abs=1e-12)
+    assert phantom.density(-0.22 + dx, -dy, -0.25) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("variant", ["toft", "kak-slaney"])
+def test_shepp_logan_mass_from_volumes_equals_mass_from_projections(variant: str) -> None:
+    phantom = shepp_logan(10.0, variant)
+    mass = sum(e.attenuation_per_mm * 4 / 3 * np.pi * np.prod(e.semi_axes_mm) for e in phantom.ellipsoids)
+    side = np.linspace(-10, 10, 401)
+    x, y = np.meshgrid(side, side)
+    along_z = phantom.line_integrals(np.stack([x, y, x * 0 - 20], -1), np.stack([x, y, x * 0 + 20], -1))
+    assert along_z.sum() * (side[1] - side[0]) ** 2 == pytest.approx(mass, rel=2e-3)
+
+
+def test_line_integrals_do_not_depend_on_the_size() -> None:
+    for make in (shepp_logan, sphere_phantom):
+        p = np.array([0.3, 0.2, -0.2]), np.array([-0.9, -0.4, 0.1])
+        small = make(1.0).line_integrals(5 * p[0], 5 * p[1])
+        large = make(75.0).line_integrals(375 * p[0], 375 * p[1])
+        assert small == pytest.approx(large, rel=1e-12) and small > 0
+
+
+def test_attenuation_of_grey_level_one_may_be_given() -> None:
+    assert shepp_logan(80.0, "toft", 0.02).density(0, 72, 0) == pytest.approx(0.02)
+
+
+def test_spheres_stay_apart_inside_the_holder_in_two_layers() -> None:
+    holder, *balls = sphere_phantom(50.0).ellipsoids
+    centres = np.array([b.centre_mm for b in balls])
+    radii = np.array([b.semi_axes_mm[0] for b in balls])
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + np.eye(len(balls)) * 1e3
+    assert (distance > radii[:, None] + radii[None]).all()
+    assert len(np.unique(centres[:, 2])) == 2 and len(np.unique(radii)) >= 3
+    rng = np.random.default_rng(0)
+    way = rng.standard_normal((500, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    surface = centres[:, None] + radii[:, None, None] * way
+    assert (np.sum((surface / np.array(holder.semi_axes_mm)) ** 2, axis=-1) < 1).all()
+    assert max(sphere_phantom(50.0).extent_mm) < 50
+
+
+@pytest.mark.parametrize("draw", [foot, jaw])
+def test_procedural_volumes_are_in_range_in_the_cylinder_and_not_empty(draw) -> None:
+    volume = draw(48, 7)
+    assert volume.shape == (48, 48, 48) and volume.dtype == np.float32
+    assert volume.min() == 0 and 0.7 < volume.max() <= 1
+    centres = (np.arange(48) + 0.5) / 24 - 1
+    outside = np.hypot(centres[:, None], centres[None]) > 1
+    assert not volume[:, outside].any()
+    assert not volume[0].any() and not volume[-1].any()
+    assert 0.03 < np.mean(volume > 0) < 0.5
+
+
+@pytest.mark.parametrize("draw", [foot, jaw])
+def test_the_seed_decides(draw) -> None:
+    assert np.array_equal(draw(24, 3), draw(24, 3))
+    assert not np.array_equal(draw(24, 3), draw(24, 4))
+
+
+@pytest.mark.parametrize("draw", [foot, jaw])
+def test_a_coarse_phantom_is_the_block_mean_of_a_fine_one(draw) -> None:
+    coarse, fine = draw(32, 5), _blocks(draw(64, 5))
+    error = np.sqrt(np.mean((coarse - fine) ** 2) / np.mean(fine**2))
+    # Not exact: edges are averaged as if straight, and shells are thinner than a voxel of either.
+    assert error < 0.12
+    assert coarse.sum() == pytest.approx(fine.sum(), rel=0.04)
+
+
+def test_registry_makes_every_phantom_with_its_kind() -> None:
+    grid = Grid.cube(16, 60.0)
+    for name in PHANTOMS:
+        phantom = make_phantom(name, 30.0, resolution=16, seed=1)
+        assert phantom.name == name and phantom.kind in ("analytic", "voxel")
+        volume = phantom.voxelise(grid)
+        assert volume.shape == grid.shape and volume.dtype == np.float32 and volume.max() > 0
+        assert volume.max() * 30.0 <= 1.001
+    assert {n for n in PHANTOMS if make_phantom(n, 1.0, 8).kind == "analytic"} == {"shepp-logan", "spheres"}
+
+
+def test_voxel_phantoms_are_never_resampled() -> None:
+    with pytest.raises(InputError, match="make the phantom at this resolution"):
+        make_phantom("jaw", 30.0, 16).voxelise(Grid.cube(17, 60.0))
+
+
+def test_unknown_names_and_sizes_are_refused() -> None:
+    with pytest.raises(InputError, match="'hand'; expected one of 'shepp-logan', 'spheres', 'foot', 'jaw'"):
+        make_phantom("hand", 1.0)
+    with pytest.raises(InputError, match="half_size_mm"):
+        make_phantom("foot", -1.0)
+    with pytest.raises(InputError, match="resolution"):
+        make_phantom("foot", 1.0, 0)
+    with pytest.raises(InputError, match="variant"):
+        shepp_logan(1.0, "tofu")
