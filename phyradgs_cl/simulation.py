@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol as Interface
 
 import numpy as np
+from skimage.transform import resize_local_mean
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
@@ -14,7 +15,7 @@ from phyradgs_cl.detector import average, beer_lambert_noise, tigre_noise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector
-from phyradgs_cl.phantoms import EllipsoidPhantom
+from phyradgs_cl.phantoms import EllipsoidPhantom, load_volume, make_phantom
 from phyradgs_cl.runtime import Runtime
 
 
@@ -155,6 +156,70 @@ class AnalyticSource:
             else:
                 frame[:, start:stop] = mean
         return frame.astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx)."""
+
+    source: FrameSource
+    grid: Grid
+    reference: np.ndarray
+    title: str
+
+
+def phantom_scene(
+    rt: Runtime, name: str, geometry: ConeGeometry, box: Grid, size: int, axis: str, seed: int
+) -> Scene:
+    """A phantom by name in the box of the scanner, to be reconstructed with ``size`` voxels a side.
+
+    Closed forms are integrated exactly; procedural phantoms are drawn at twice ``size`` and projected at that
+    resolution, and the truth is their block mean.
+    """
+    half_size_mm = min(box.size_mm) / 2
+    phantom = make_phantom(name, half_size_mm, 2 * size, seed)
+    if isinstance(phantom, EllipsoidPhantom):
+        grid = _resized(box, size)
+        return Scene(AnalyticSource(phantom, geometry), grid, phantom.voxelise(grid, 4), f"phantom {name}")
+    volume = phantom.voxelise(Grid.cube(2 * size, 2 * half_size_mm))
+    fine = Grid.cube(2 * size, 2 * half_size_mm)
+    source = VolumeSource(rt, volume, fine, geometry, axis)
+    return Scene(source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}")
+
+
+def volume_scene(
+    rt: Runtime, path: str, geometry: ConeGeometry, box: Grid, size: int | None, axis: str
+) -> Scene:
+    """A volume from a file, projected at its own resolution.
+
+    A bare array is fitted into the scanner's box, its values being attenuation per half of the longest side (so
+    that line integrals do not depend on the scanner's size); one of our volumes keeps its own grid and 1/mm.
+    """
+    loaded = load_volume(path)
+    volume, fine = loaded.volume, loaded.grid
+    if fine is None:
+        voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
+        fine = Grid(volume.shape, (voxel_mm,) * 3, box.offset_mm)
+        volume = volume / np.float32(fine.half_longest_mm)
+    grid = _resized(fine, size or max(fine.shape))
+    source = VolumeSource(rt, volume, fine, geometry, axis)
+    return Scene(source, grid, block_mean(volume, grid.shape), f"volume {path}")
+
+
+def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Means of a volume (z, y, x) over the voxels of a coarser (or equal) grid of the same box, float32."""
+    if volume.shape == tuple(shape):
+        return volume.astype(np.float32)
+    return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(np.float32)
+
+
+def _resized(grid: Grid, count: int) -> Grid:
+    """The same box with ``count`` voxels along its longest side."""
+    if count < 1:
+        raise InputError("--size", str(count), "at least 1 voxel")
+    shape = [max(1, round(n * count / max(grid.shape))) for n in grid.shape]
+    voxel = [side / n for side, n in zip(grid.size_mm, shape, strict=True)]
+    return Grid((shape[0], shape[1], shape[2]), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
 def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:

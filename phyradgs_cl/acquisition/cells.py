@@ -44,7 +44,9 @@ class TimeCells:
         return total
 
 
-def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
+def static_cells(
+    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
+) -> TimeCells:
     """One cell at the middle of the frame's whole window: the best a frozen gantry can do."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.span_s / 2, lines)
 
@@ -80,7 +82,9 @@ def micro_view_cells(
             last.append(np.full(sub_intervals, line_stop))
     times = np.concatenate(time_s)
     weight = np.full(times.size, 1.0 / sub_intervals)
-    return _table(trajectory, shutter, frame, times, np.concatenate(first), np.concatenate(last), weight, lines)
+    return _table(
+        trajectory, shutter, frame, times, np.concatenate(first), np.concatenate(last), weight, lines
+    )
 
 
 def per_line_cells(

@@ -36,11 +36,15 @@ class ConeGeometry:
         if not (np.isfinite(dsd) and dsd > 0):
             raise InputError("source_to_detector_mm", str(dsd), "a positive length in mm")
         if len(self.detector_shape) != 2 or min(self.detector_shape) < 1:
-            raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
+            raise InputError(
+                "detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1"
+            )
         if len(self.pixel_size_mm) != 2 or not all(np.isfinite(d) and d > 0 for d in self.pixel_size_mm):
             raise InputError("pixel_size_mm", str(self.pixel_size_mm), "two positive lengths in mm (v, u)")
         if len(self.detector_offset_mm) != 2 or not np.all(np.isfinite(self.detector_offset_mm)):
-            raise InputError("detector_offset_mm", str(self.detector_offset_mm), "two finite lengths in mm (v, u)")
+            raise InputError(
+                "detector_offset_mm", str(self.detector_offset_mm), "two finite lengths in mm (v, u)"
+            )
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
         """Poses (..., 12) float64 at gantry angles (...) (design: source at (DSO cos θ, DSO sin θ, 0))."""

@@ -50,7 +50,9 @@ class Protocol:
     def angle_start_rad(self) -> np.ndarray:
         return np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
 
-    def orbit(self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None) -> CircularOrbit:
+    def orbit(
+        self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
+    ) -> CircularOrbit:
         """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan.
 
         Jitter is a smooth wander of the true gantry about constant speed, recorded by the encoder
@@ -75,7 +77,9 @@ class Protocol:
         end_s = start_s[-1] + self.shutter().span_s
         speed_rad_per_s = np.deg2rad(self.exposure_deg) / self.exposure_s
         knot_s = np.linspace(0.0, end_s, self.views + 1)
-        wander = np.interp(np.linspace(0, end_s, 16 * self.views + 1), knot_s, rng.normal(0, jitter_rad, knot_s.size))
+        wander = np.interp(
+            np.linspace(0, end_s, 16 * self.views + 1), knot_s, rng.normal(0, jitter_rad, knot_s.size)
+        )
         time_s = np.linspace(0.0, end_s, wander.size)
         return EncoderTable(time_s, np.deg2rad(self.start_deg) + speed_rad_per_s * time_s + wander)
 

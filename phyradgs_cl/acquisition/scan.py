@@ -41,7 +41,9 @@ class Scan:
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
         if self.projections.shape != expected:
-            raise InputError("projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}")
+            raise InputError(
+                "projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}"
+            )
         if frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
         if np.shape(self.frame_start_s) != (frames,):

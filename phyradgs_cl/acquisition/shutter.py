@@ -33,7 +33,9 @@ class Shutter:
         if self.axis not in AXES:
             raise InputError("readout axis", repr(self.axis), "'rows' or 'columns'")
         if self.direction not in (1, -1):
-            raise InputError("readout direction", str(self.direction), "1 (index 0 first) or -1 (index 0 last)")
+            raise InputError(
+                "readout direction", str(self.direction), "1 (index 0 first) or -1 (index 0 last)"
+            )
 
     @property
     def span_s(self) -> float:

@@ -44,7 +44,7 @@ class SpeedRamp:
 
 @dataclass(frozen=True, eq=False)
 class EncoderTable:
-    """Measured θ(t): linear between the samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
+    """Measured θ(t): linear between samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
 
     time_s: np.ndarray
     angle_rad_table: np.ndarray

@@ -1,6 +1,7 @@
 """Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
 
 from phyradgs_cl.io.atomic import check_writable, written_beside
+from phyradgs_cl.io.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
 from phyradgs_cl.io.grid_io import default_grid, with_grid_count
 from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
@@ -13,9 +14,11 @@ __all__ = [
     "StoredVolume",
     "ToAttenuation",
     "check_writable",
+    "checkpoint_path",
     "default_grid",
     "file_kind",
     "load_scanner",
+    "read_checkpoint",
     "read_scan",
     "read_volume",
     "scan_summary",
@@ -23,6 +26,7 @@ __all__ = [
     "volume_summary",
     "with_detector_count",
     "with_grid_count",
+    "write_checkpoint",
     "write_scan",
     "write_volume",
     "written_beside",

@@ -42,7 +42,9 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
         with file:
             yield Hdf5Source(file, path)
     except (OSError, RuntimeError) as error:  # damage that HDF5 meets between datasets
-        raise InputError(str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again") from error
+        raise InputError(
+            str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
+        ) from error
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
@@ -194,4 +196,6 @@ class Hdf5Source:
         most = file_bytes if chunks is None else _MOST_EXPANSION * file_bytes + _FREE_BYTES
         if declared_bytes > most:
             found = f"shape {shape}, {declared_bytes / 2**30:.3g} GiB in a file of {file_bytes} bytes"
-            raise InputError(self.name(address), found, "a size that the file can hold", "write the file again")
+            raise InputError(
+                self.name(address), found, "a size that the file can hold", "write the file again"
+            )

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, SplatState, ignore_progress
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splatting import reconstruct_splats
 from phyradgs_cl.runtime import Runtime
 
 
 def phyradgs(
-    scan: Scan, options: SplatOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
+    scan: Scan,
+    options: SplatOptions,
+    rt: Runtime,
+    *,
+    seed: int = 0,
+    report: ProgressReport = ignore_progress,
+    resume: SplatState | None = None,
 ) -> Reconstruction:
     """Reconstructs a scan with M×N micro-views a frame; ``options.motion`` static is the paper's "w/o ST"."""
-    return reconstruct_splats(scan, options, rt, seed, report, "phyradgs")
+    return reconstruct_splats(scan, options, rt, seed, report, "phyradgs", resume)

@@ -76,11 +76,11 @@ _RELEASED = SplatOptions(
 )
 _PAPER = SplatOptions(gaussians=50_000, iterations=20_000)
 PRESETS = {"default": SplatOptions(), "paper": _PAPER, "released": _RELEASED}
-
-
-def preset(name: str, **changes: object) -> SplatOptions:
-    """A named preset with the given options that are not None replaced."""
-    if name not in PRESETS:
-        raise InputError("--preset", repr(name), f"one of {', '.join(PRESETS)}")
-    given = {key: value for key, value in changes.items() if value is not None}
-    return replace(PRESETS[name], **given)  # type: ignore[arg-type]
+R2_PUBLISHED = SplatOptions(
+    motion=Motion("static"),
+    affine=True,
+    gaussians=50_000,
+    ssim_weight=0.25,
+    tv_weight=0.05,
+    density_weight=0.0,
+)

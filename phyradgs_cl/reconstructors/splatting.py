@@ -7,6 +7,7 @@ constants mean the same for every scan; both are undone on the way out.
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ from phyradgs_cl.operators.layout import pad_columns, pad_rows, pitch_of, stride
 from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
 from phyradgs_cl.reconstructors.fdk import fdk_volume, fill_masked
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, SplatState
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
@@ -43,9 +44,18 @@ class Scale:
 
 
 def reconstruct_splats(
-    scan: Scan, options: SplatOptions, rt: Runtime, seed: int, report: ProgressReport, method: str
+    scan: Scan,
+    options: SplatOptions,
+    rt: Runtime,
+    seed: int,
+    report: ProgressReport,
+    method: str,
+    resume: SplatState | None,
 ) -> Reconstruction:
-    """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``."""
+    """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``.
+
+    ``resume`` continues an interrupted run of the same scan and options from its state.
+    """
     started = time.perf_counter()
     fdk = _static_fdk(rt, scan)
     scale = internal_scale(fdk, scan.grid)
@@ -53,6 +63,8 @@ def reconstruct_splats(
     rng = np.random.default_rng(seed)
     population = _first_population(fdk / scale.density_per_mm, grid, options, rng)
     run = SplatRun(rt, scan, options, scale, population, rng)
+    if resume is not None:
+        run.restore(resume)
     record = run.optimise(report, started)
     cloud = Gaussians.from_rows(run.parameters())
     volume = voxelise(rt, cloud.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(scale.density_per_mm)
@@ -66,7 +78,9 @@ def reconstruct_splats(
         "seconds": time.perf_counter() - started,
         "interrupted_at": run.interrupted_at,
     }
-    return Reconstruction(volume, scan.grid, cloud.scaled(scale.length_mm, scale.density_per_mm), record, facts)
+    state = run.state() if run.interrupted_at is not None else None
+    cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
+    return Reconstruction(volume, scan.grid, cloud, record, facts, state)
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
@@ -175,6 +189,23 @@ class SplatRun:
                 "loss", f"{loss} at iteration {self.iteration}", "a finite number", "check the scan for extreme values"
             )
         return loss
+
+    # --- stop and go on ---------------------------------------------------------------------------------
+
+    def state(self) -> SplatState:
+        """Everything that the next iteration depends on."""
+        statistics = self.rt.download(self.statistics)[:, : self.gaussians.count]
+        population = self._population()
+        rng = json.dumps(self.rng.bit_generator.state)
+        return SplatState(population.raw, population.moments, statistics, self.iteration, list(self._queue), rng)
+
+    def restore(self, state: SplatState) -> None:
+        self._load(Population(state.raw, state.moments))
+        padded = np.zeros((2, self.gaussians.stride), np.float32)
+        padded[:, : self.gaussians.count] = state.statistics
+        self.rt.write(self.statistics, padded)
+        self.iteration, self._queue = state.iteration, list(state.queue)
+        self.rng.bit_generator.state = json.loads(state.rng)
 
     # --- the population -----------------------------------------------------------------------------------
 

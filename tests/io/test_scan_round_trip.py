@@ -75,14 +75,18 @@ def test_kinematics_come_back(tmp_path, make_scan, name) -> None:
     write_scan(tmp_path / "scan.h5", scan)
     again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
     assert again.is_fly
-    assert isinstance(again.trajectory.kinematics, FrameSweeps if name in ("constant", "backwards") else EncoderTable)
+    assert isinstance(
+        again.trajectory.kinematics, FrameSweeps if name in ("constant", "backwards") else EncoderTable
+    )
     same_poses(scan, again, RAMP_TOLERANCE_MM if name == "ramp" else LENGTH_TOLERANCE_MM)
 
 
 def wobbling_table(scan) -> PoseTable:
     time_s = np.linspace(0.4, 5.7, 25)
     table = scan.geometry.pose(0.2 * time_s)
-    return PoseTable(time_s, table + np.random.default_rng(2).normal(0, 0.5, table.shape) * np.repeat([1, 1, 0, 0], 3))
+    return PoseTable(
+        time_s, table + np.random.default_rng(2).normal(0, 0.5, table.shape) * np.repeat([1, 1, 0, 0], 3)
+    )
 
 
 def test_pose_table_comes_back(tmp_path, make_scan) -> None:
@@ -131,7 +135,9 @@ def test_fly_rule_follows_motion_and_exposure(tmp_path, make_scan) -> None:
         del file["entry/sample/rotation_angle_end"]
     again = read_scan(path, counts_to_attenuation)
     assert not again.is_fly and again.shutter.exposure_s == 0.8
-    np.testing.assert_array_equal(again.trajectory.kinematics.angle_end_rad, again.trajectory.kinematics.angle_start_rad)
+    np.testing.assert_array_equal(
+        again.trajectory.kinematics.angle_end_rad, again.trajectory.kinematics.angle_start_rad
+    )
 
 
 def test_poses_win_over_encoder_over_angles(tmp_path, make_scan) -> None:
@@ -178,7 +184,13 @@ def test_masks_of_frames_follow_their_frames(tmp_path, make_scan) -> None:
     scan, key, data = counts_scan(make_scan)
     mask = np.zeros((4, 3, 5), np.int32)
     mask[[0, 1, 2, 3], [0, 1, 2, 0], [4, 3, 2, 1]] = [1, 2, 64, 256]  # NeXus puts reasons into bits
-    write_scan(tmp_path / "scan.h5", dataclasses.replace(scan, pixel_mask=mask), data=data, image_key=key, quantity="counts")
+    write_scan(
+        tmp_path / "scan.h5",
+        dataclasses.replace(scan, pixel_mask=mask),
+        data=data,
+        image_key=key,
+        quantity="counts",
+    )
     again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
     np.testing.assert_array_equal(again.pixel_mask, mask != 0)
 
@@ -188,7 +200,13 @@ def test_pixels_that_the_conversion_rejects_join_the_mask(tmp_path, make_scan) -
     mask = np.zeros((3, 5), bool)
     mask[2, 4] = True
     data[6, 1, 1] = 0  # below the dark: third projection
-    write_scan(tmp_path / "scan.h5", dataclasses.replace(scan, pixel_mask=mask), data=data, image_key=key, quantity="counts")
+    write_scan(
+        tmp_path / "scan.h5",
+        dataclasses.replace(scan, pixel_mask=mask),
+        data=data,
+        image_key=key,
+        quantity="counts",
+    )
     again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
     expected = np.repeat(mask[None], 4, 0)
     expected[2, 1, 1] = True
@@ -262,12 +280,16 @@ def test_angles_of_the_sample_turn_the_other_way(tmp_path, make_scan, rotates) -
                 attributes["rotates"] = rotates
     again = read_scan(path, counts_to_attenuation)
     ours = scan.trajectory.angle_rad(2, np.array([3.1, 3.9]))
-    np.testing.assert_allclose(again.trajectory.angle_rad(2, np.array([3.1, 3.9])), -ours, atol=ANGLE_TOLERANCE_RAD)
+    np.testing.assert_allclose(
+        again.trajectory.angle_rad(2, np.array([3.1, 3.9])), -ours, atol=ANGLE_TOLERANCE_RAD
+    )
 
 
 def test_an_encoder_that_turns_the_other_way_is_said(tmp_path, make_scan, caplog) -> None:
     path, scan = tmp_path / "scan.h5", make_scan()
-    write_scan(path, dataclasses.replace(scan, trajectory=CircularOrbit(scan.geometry, kinematics("encoder"))))
+    write_scan(
+        path, dataclasses.replace(scan, trajectory=CircularOrbit(scan.geometry, kinematics("encoder")))
+    )
     read_scan(path, counts_to_attenuation)
     assert "from rotation_angle" not in caplog.text
     with h5py.File(path, "r+") as file:

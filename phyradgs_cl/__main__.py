@@ -1,0 +1,29 @@
+"""Entry point: loads the command line (cli.py, inside the package or beside it) and runs it."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from types import ModuleType
+
+from phyradgs_cl.resources import resource
+
+
+def load_cli() -> ModuleType:
+    """The module cli.py, wherever this installation keeps it."""
+    spec = importlib.util.spec_from_file_location("phyradgs_cl_cli", resource("cli.py"))
+    if spec is None or spec.loader is None:
+        raise ImportError("cli.py cannot be loaded: install phyradgs-cl again")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def main() -> None:
+    """Runs the command line and exits with its status."""
+    sys.exit(load_cli().run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

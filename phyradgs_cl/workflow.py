@@ -1,0 +1,296 @@
+"""From file to file: what the commands do between reading their options and printing their result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import __version__
+from phyradgs_cl.acquisition import Protocol, Scan, make_protocol
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import (
+    Scanner,
+    check_writable,
+    checkpoint_path,
+    file_kind,
+    load_scanner,
+    read_checkpoint,
+    read_scan,
+    read_volume,
+    scan_summary,
+    sha256_of,
+    volume_summary,
+    with_detector_count,
+    write_checkpoint,
+    write_scan,
+    write_volume,
+)
+from phyradgs_cl.metrics import psnr, slices_png, ssim
+from phyradgs_cl.phantoms import load_volume
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, method_options, reconstruct
+from phyradgs_cl.reconstructors.result import SplatState
+from phyradgs_cl.resources import resource
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
+
+SPLAT_METHODS = ("phyradgs", "r2")
+
+
+def load_scan(path: str | Path) -> Scan:
+    """A scan file as line integrals; see ``io.read_scan``."""
+    return read_scan(path, counts_to_attenuation)
+
+
+# --- simulate -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SimulationJob:
+    """What to simulate: a phantom by name or a volume file, on which scanner, with how many pixels and voxels."""
+
+    output: Path
+    phantom: str | None = None
+    volume: Path | None = None
+    scanner: str = "r2"
+    detector: int | None = None
+    detector_offset_mm: tuple[float, float] | None = None
+    size: int | None = None
+
+
+def load_scanner_for(job: SimulationJob) -> Scanner:
+    """The job's scanner with its own number of pixels and detector offset."""
+    scanner = load_scanner(job.scanner, resource("data"))
+    geometry = scanner.geometry
+    if job.detector is not None:
+        rows, columns = geometry.detector_shape
+        other = max(1, round(job.detector * rows / columns))
+        geometry = with_detector_count(geometry, other, job.detector)
+    changes = {f.name: getattr(scanner, f.name) for f in fields(scanner)}
+    if job.detector_offset_mm is not None:
+        values = {f.name: getattr(geometry, f.name) for f in fields(geometry)}
+        geometry = type(geometry)(**{**values, "detector_offset_mm": job.detector_offset_mm})
+    return Scanner(**{**changes, "geometry": geometry})
+
+
+def make_scan_protocol(name: str, scanner: Scanner, **changes: float | int | None) -> Protocol:
+    """A named protocol with the command's changes, and the scanner's readout ratio where the command has none."""
+    if changes.get("readout_ratio") is None:
+        changes["readout_ratio"] = scanner.readout_ratio
+    return make_protocol(name, **changes)
+
+
+def run_simulation(
+    job: SimulationJob,
+    scanner: Scanner,
+    options: SimulationOptions,
+    rt: Runtime,
+    report: Callable[[int, int], None],
+) -> Scan:
+    """Simulates and writes a scan file; everything is checked before any work."""
+    check_writable(job.output)
+    scene = _scene(job, scanner, options, rt)
+    scan = simulate(
+        scene.source,
+        scanner.geometry,
+        scene.grid,
+        options,
+        reference=scene.reference,
+        title=f"simulated scan of {scene.title}",
+        report=report,
+    )
+    scan.provenance.update(program=f"phyradgs-cl {__version__}", simulated=scene.title, seed=options.seed)
+    scan.provenance.update(noise=options.noise, dose=options.dose, electronic_noise=options.electronic_noise)
+    write_scan(job.output, scan)
+    return scan
+
+
+def _scene(job: SimulationJob, scanner: Scanner, options: SimulationOptions, rt: Runtime) -> Scene:
+    axis = options.readout_axis
+    if job.volume is not None and job.phantom is not None:
+        raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
+    if job.volume is not None:
+        return volume_scene(rt, str(job.volume), scanner.geometry, scanner.grid, job.size, axis)
+    size = job.size or max(scanner.grid.shape)
+    return phantom_scene(rt, job.phantom or "foot", scanner.geometry, scanner.grid, size, axis, options.seed)
+
+
+# --- reconstruct --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ReconstructionJob:
+    """Which scan to reconstruct by which method into which file."""
+
+    scan: Path
+    output: Path
+    method: str = "phyradgs"
+    preset: str | None = None
+    changes: Mapping[str, Any] | None = None
+    seed: int = 0
+    resume: bool = False
+
+
+def run_reconstruction(
+    job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
+) -> tuple[Reconstruction, dict[str, float]]:
+    """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
+
+    An interrupted run writes the volume as far as it got, and a checkpoint beside it that ``resume`` continues.
+    """
+    options = method_options(job.method, job.preset, job.changes)
+    check_writable(job.output)
+    if Path(job.output).resolve() == Path(job.scan).resolve():
+        raise InputError("-o", f"the scan file {job.output} itself", "another file for the volume")
+    scan = load_scan(job.scan)
+    scan.check_timing()
+    rt = make_runtime()
+    scan_hash = sha256_of(job.scan)
+    fingerprint = _fingerprint(scan_hash, job, options)
+    extra: dict[str, Any] = {}
+    if job.resume:
+        extra["resume"] = _resumed(job, fingerprint)
+    result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=report, **extra)
+    metrics = compare(result.volume, scan.reference) if scan.reference is not None else {}
+    _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
+    _keep_checkpoint(job, result, fingerprint)
+    return result, metrics
+
+
+def _write_result(
+    job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
+) -> None:
+    cloud = result.gaussians
+    arrays = None
+    if cloud is not None:
+        names = ("mean", "scale", "quaternion", "density")
+        arrays = {name: np.asarray(getattr(cloud, name), np.float32) for name in names}
+    write_volume(job.output, result.volume, result.grid, provenance, arrays, metrics or None)
+
+
+def _provenance(result: Reconstruction, scan_hash: str, job: ReconstructionJob, rt: Runtime) -> dict[str, object]:
+    return {
+        **result.facts,
+        "program": f"phyradgs-cl {__version__}",
+        "python": platform.python_version(),
+        "device": rt.device.name,
+        "device_version": rt.device.version,
+        "seed": job.seed,
+        "scan": str(job.scan),
+        "scan_sha256": scan_hash,
+        "record": result.record,
+    }
+
+
+def _fingerprint(scan_hash: str, job: ReconstructionJob, options: object) -> str:
+    text = json.dumps([scan_hash, job.method, repr(options), job.seed])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _resumed(job: ReconstructionJob, fingerprint: str) -> SplatState:
+    if job.method not in SPLAT_METHODS:
+        raise InputError("--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(SPLAT_METHODS)}")
+    path = checkpoint_path(job.output)
+    arrays = read_checkpoint(path, fingerprint)
+    missing = {"raw", "moments", "statistics", "iteration", "queue", "rng"} - set(arrays)
+    if missing:
+        raise InputError(str(path), f"no {', '.join(sorted(missing))}", "a whole checkpoint", "start without --resume")
+    return SplatState(
+        arrays["raw"],
+        arrays["moments"],
+        arrays["statistics"],
+        int(arrays["iteration"]),
+        [int(f) for f in arrays["queue"]],
+        str(arrays["rng"]),
+    )
+
+
+def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
+    path = checkpoint_path(job.output)
+    if result.state is None:
+        path.unlink(missing_ok=True)
+        return
+    state = result.state
+    arrays = {
+        "raw": state.raw,
+        "moments": state.moments,
+        "statistics": state.statistics,
+        "iteration": np.array(state.iteration),
+        "queue": np.array(state.queue, np.int64),
+        "rng": np.array(state.rng),
+    }
+    write_checkpoint(path, arrays, fingerprint)
+
+
+# --- evaluate -----------------------------------------------------------------------------------------------
+
+
+def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """3D PSNR (dB) and SSIM against a reference (z, y, x), with the range that was used: the reference's maximum."""
+    peak = float(reference.max())
+    if peak <= 0:
+        raise InputError("reference", f"a maximum of {peak:g}", "a volume with something in it")
+    return {"psnr_db": psnr(volume, reference, peak), "ssim": ssim(volume, reference, peak), "data_range": peak}
+
+
+def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
+    """Compares a volume with a scan's reference or another volume and writes the picture of slices."""
+    check_writable(picture)
+    stored = read_volume(volume_path)
+    reference, grid = load_reference(reference_path)
+    if grid is not None and not _same_grid(grid, stored.grid):
+        raise InputError(str(reference_path), f"the grid {grid}", f"that of {volume_path}: {stored.grid}")
+    if reference.shape != stored.volume.shape:
+        raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {stored.volume.shape} of {volume_path}")
+    metrics = compare(stored.volume, reference)
+    title = f"{stored.provenance.get('method', 'volume')}: {metrics['psnr_db']:.2f} dB, SSIM {metrics['ssim']:.3f}"
+    slices_png(picture, stored.volume, reference, title)
+    known = {key: stored.provenance[key] for key in ("method", "seconds", "gaussians") if key in stored.provenance}
+    return {**metrics, **known, "volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
+
+
+def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
+    """The reference in a scan, a volume file, or a bare /volume dataset (which has no grid)."""
+    kind = file_kind(path)
+    if kind == "scan":
+        scan = load_scan(path)
+        if scan.reference is None:
+            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth")
+        return scan.reference, scan.grid
+    if kind == "volume":
+        stored = read_volume(path)
+        return stored.volume, stored.grid
+    from_file = _bare_volume(path)
+    return from_file, None
+
+
+def summary(path: Path) -> dict[str, object]:
+    """Facts about a scan or volume file for people."""
+    kind = file_kind(path)
+    if kind == "scan":
+        return {"kind": "scan", **scan_summary(path)}
+    if kind == "volume":
+        facts = volume_summary(path)
+        provenance = dict(facts.pop("provenance", {}) or {})
+        provenance.pop("record", None)
+        provenance.pop("options", None)
+        return {"kind": "volume", **facts, **provenance}
+    volume = _bare_volume(path)
+    return {"kind": "bare volume", "shape": volume.shape, "minimum": float(volume.min()), "maximum": float(volume.max())}
+
+
+def _bare_volume(path: Path) -> np.ndarray:
+    return load_volume(path).volume
+
+
+def _same_grid(a: Grid, b: Grid) -> bool:
+    close = np.allclose(a.voxel_size_mm, b.voxel_size_mm, rtol=1e-5)
+    return a.shape == b.shape and close and np.allclose(a.offset_mm, b.offset_mm, atol=1e-5 * max(a.size_mm))

@@ -1,0 +1,152 @@
+"""Protocols against the paper's numbers, and scans that check themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    EncoderTable,
+    PoseTable,
+    Protocol,
+    Scan,
+    Shutter,
+    make_protocol,
+)
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+
+GEOMETRY = ConeGeometry(5.0, 7.0, (4, 4), (1.0, 1.0))
+ANGLE_TOLERANCE_DEG = 1e-9
+
+
+def angles_deg(protocol: Protocol, frame: int, after_s) -> np.ndarray:
+    orbit = protocol.orbit(GEOMETRY)
+    return np.rad2deg(orbit.angle_rad(frame, protocol.frame_start_s()[frame] + np.asarray(after_s)))
+
+
+@pytest.mark.parametrize("name, views, arc_deg", [("rapid", 25, 14.4), ("standard", 50, 7.2)])
+def test_fly_protocols_of_the_paper(name, views, arc_deg) -> None:
+    protocol = make_protocol(name)
+    assert protocol.is_fly and protocol.views == views
+    for frame in (0, 1, views - 1):
+        first = 360 / views * frame
+        # exposure arc, then the readout continues it to T_exp + T_ro = 1.86 exposures
+        expected = [first, first + arc_deg, first + 1.86 * arc_deg]
+        np.testing.assert_allclose(
+            angles_deg(protocol, frame, [0, 1, 1.86]), expected, atol=ANGLE_TOLERANCE_DEG
+        )
+    assert protocol.shutter().span_s == pytest.approx(1.86)
+
+
+def test_rapid_span_is_that_of_table_2() -> None:
+    assert np.ptp(angles_deg(make_protocol("rapid"), 7, [0.0, 1.86])) == pytest.approx(26.8, abs=0.02)
+
+
+@pytest.mark.parametrize("exposure_s", [1.0, 0.05])
+def test_one_constant_speed_joins_all_frames(exposure_s) -> None:
+    """Frame starts and angles lie on one line: speed is arc over exposure."""
+    protocol = Protocol(views=20, exposure_deg=9.0, exposure_s=exposure_s, start_deg=11.0)
+    starts = protocol.frame_start_s()
+    for frame in (3, 19):
+        expected = 11.0 + 9.0 / exposure_s * starts[frame]
+        assert angles_deg(protocol, frame, [0.0])[0] == pytest.approx(expected, abs=ANGLE_TOLERANCE_DEG)
+
+
+def test_stop_and_shoot_stands_at_the_mid_window_angles_of_the_fly_scan() -> None:
+    static, fly = make_protocol("static"), make_protocol("rapid")
+    for frame in (0, 5, 24):
+        middle = angles_deg(fly, frame, [1.86 / 2])[0]
+        np.testing.assert_allclose(
+            angles_deg(static, frame, [0, 0.4, 1.86]), [middle] * 3, atol=ANGLE_TOLERANCE_DEG
+        )
+    assert not static.is_fly
+
+
+def test_no_arc_is_a_gantry_at_rest_at_every_step() -> None:
+    protocol = Protocol(views=10, exposure_deg=0.0)
+    np.testing.assert_allclose(angles_deg(protocol, 4, [0, 1, 2]), [144.0] * 3, atol=ANGLE_TOLERANCE_DEG)
+    assert np.all(np.diff(protocol.frame_start_s()) > 0)
+
+
+def test_jitter_is_seeded_recorded_and_covers_the_scan() -> None:
+    protocol = make_protocol("rapid")
+    orbit = protocol.orbit(GEOMETRY, 0.2, np.random.default_rng(5))
+    again = protocol.orbit(GEOMETRY, 0.2, np.random.default_rng(5))
+    assert isinstance(orbit.kinematics, EncoderTable)
+    np.testing.assert_array_equal(orbit.kinematics.angle_rad_table, again.kinematics.angle_rad_table)
+    wander = [
+        np.rad2deg(orbit.angle_rad(f, s + np.linspace(0, 1.86, 9)))
+        - angles_deg(protocol, f, np.linspace(0, 1.86, 9))
+        for f, s in enumerate(protocol.frame_start_s())
+    ]
+    assert 0.05 < np.std(wander) < 0.3  # knots of 0.2°, straight between them
+
+
+def test_jitter_needs_a_generator_and_a_gantry_that_turns() -> None:
+    with pytest.raises(InputError, match="jitter"):
+        make_protocol("rapid").orbit(GEOMETRY, 0.2)
+    with pytest.raises(InputError, match="jitter"):
+        Protocol(exposure_deg=0.0).orbit(GEOMETRY, 0.2, np.random.default_rng(0))
+
+
+def test_options_replace_and_nonsense_is_refused() -> None:
+    assert make_protocol("rapid", views=30, exposure_deg=None) == Protocol(views=30)
+    with pytest.raises(InputError, match="rapid, standard, static"):
+        make_protocol("quick")
+    for change in ({"views": 0}, {"exposure_deg": -1.0}, {"readout_ratio": np.nan}):
+        with pytest.raises(InputError):
+            make_protocol("rapid", **change)
+
+
+def scan(**changes) -> Scan:
+    protocol = Protocol(views=3)
+    fields = {
+        "projections": np.zeros((3, 4, 4), np.float32),
+        "geometry": GEOMETRY,
+        "trajectory": protocol.orbit(GEOMETRY),
+        "shutter": protocol.shutter(),
+        "frame_start_s": protocol.frame_start_s(),
+        "grid": Grid.cube(4, 2.0),
+    }
+    return Scan(**(fields | changes))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"projections": np.zeros((3, 4, 5), np.float32)},
+        {"projections": np.zeros((0, 4, 4), np.float32), "frame_start_s": np.zeros(0)},
+        {"frame_start_s": np.zeros(2)},
+        {"detector_model": "linear"},
+        {"reference": np.zeros((4, 4, 5), np.float32)},
+    ],
+)
+def test_scans_that_contradict_themselves_are_refused(change) -> None:
+    with pytest.raises(InputError):
+        scan(**change)
+
+
+def test_timing_names_the_first_frame_that_a_table_misses() -> None:
+    start_s, span_s = np.array([0.0, 10.0, 20.0]), 1.86
+    for end_s, frame in ((20.0 + span_s, None), (21.8, 2), (11.8, 1)):
+        table = EncoderTable([0.0, end_s], [0.0, 1.0])
+        moving = scan(trajectory=CircularOrbit(GEOMETRY, table), frame_start_s=start_s)
+        if frame is None:
+            moving.check_timing()
+        else:
+            with pytest.raises(InputError, match=f"frame {frame} needs"):
+                moving.check_timing()
+
+
+def test_timing_of_a_standing_gantry_is_checked_where_it_is_asked() -> None:
+    """Its cell stands mid-window, so a table that ends before that is refused early."""
+    poses = PoseTable([0.0, 20.5], GEOMETRY.pose(np.array([0.0, 1.0])))
+    standing = scan(trajectory=poses, frame_start_s=np.array([0.0, 10.0, 20.0]), is_fly=False)
+    with pytest.raises(InputError, match="frame 2 needs"):
+        standing.check_timing()
+    dataclasses.replace(standing, shutter=Shutter(0.5, 0.5)).check_timing()

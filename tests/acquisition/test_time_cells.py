@@ -1,0 +1,151 @@
+"""Time cells of every motion model: weights, times (Eq. 2 of the paper), lines and poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Scan, Shutter
+from phyradgs_cl.acquisition.cells import (
+    micro_view_cells,
+    per_line_cells,
+    static_cells,
+    static_start_cells,
+)
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+
+SHAPE = (7, 10)
+GEOMETRY = ConeGeometry(50.0, 70.0, SHAPE, (0.6, 0.5))
+SPEED_RAD_PER_S = 0.25
+ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, SPEED_RAD_PER_S))
+START_S = 3.0
+TIME_TOLERANCE_S = 1e-12
+
+AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
+DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
+
+
+@AXES
+@DIRECTIONS
+@pytest.mark.parametrize("strips", [1, 2, 3, 7, 8, 10, 25])
+@pytest.mark.parametrize("sub_intervals", [1, 3, 5])
+def test_micro_views_have_the_times_of_eq_2_on_every_line(axis, direction, strips, sub_intervals) -> None:
+    shutter = Shutter(0.8, 0.3, axis, direction)
+    lines = shutter.lines(SHAPE)
+    cells = micro_view_cells(ORBIT, shutter, 0, START_S, lines, strips, sub_intervals)
+    assert cells.axis == axis and cells.lines == lines
+    np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+    for line in range(lines):
+        reading_order = line if direction > 0 else lines - 1 - line
+        j = reading_order * strips // lines
+        expected_s = [
+            START_S + (j + 0.5) / strips * 0.3 + (k + 0.5) / sub_intervals * 0.8 for k in range(sub_intervals)
+        ]
+        serving = (cells.line_start <= line) & (line < cells.line_stop)
+        np.testing.assert_allclose(np.sort(cells.time_s[serving]), expected_s, atol=TIME_TOLERANCE_S)
+        np.testing.assert_allclose(cells.weight[serving], 1 / sub_intervals)
+
+
+@AXES
+@DIRECTIONS
+@pytest.mark.parametrize("samples", [1, 4])
+def test_per_line_cells_sample_each_lines_own_exposure(axis, direction, samples) -> None:
+    shutter = Shutter(0.8, 0.3, axis, direction)
+    lines = shutter.lines(SHAPE)
+    cells = per_line_cells(ORBIT, shutter, 0, START_S, lines, samples)
+    np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+    np.testing.assert_array_equal(cells.line_stop - cells.line_start, 1)
+    for line in range(lines):
+        reading_order = line if direction > 0 else lines - 1 - line
+        opens_s = START_S + reading_order / (lines - 1) * 0.3
+        middles_s = opens_s + 0.8 * (np.arange(samples) + 0.5) / samples
+        np.testing.assert_allclose(cells.time_s[cells.line_start == line], middles_s, atol=TIME_TOLERANCE_S)
+
+
+def test_poses_are_those_of_the_times() -> None:
+    cells = micro_view_cells(ORBIT, Shutter(0.8, 0.3), 0, START_S, 7, 3, 2)
+    angles_rad = 0.1 + SPEED_RAD_PER_S * cells.time_s
+    np.testing.assert_allclose(cells.pose[:, 0], 50 * np.cos(angles_rad), atol=1e-12)
+    np.testing.assert_allclose(cells.pose[:, 1], 50 * np.sin(angles_rad), atol=1e-12)
+
+
+@DIRECTIONS
+def test_cells_of_a_line_are_neighbours(direction) -> None:
+    cells = micro_view_cells(ORBIT, Shutter(0.8, 0.3, direction=direction), 0, START_S, 7, 3, 4)
+    assert np.all(np.diff(cells.line_start) >= 0)
+
+
+def test_static_cells_stand_mid_window_and_at_the_start() -> None:
+    shutter = Shutter(0.8, 0.3)
+    middle = static_cells(ORBIT, shutter, 0, START_S, 7)
+    start = static_start_cells(ORBIT, shutter, 0, START_S, 7)
+    for cells, time_s in ((middle, START_S + 0.55), (start, START_S)):
+        assert cells.count == 1 and cells.time_s[0] == pytest.approx(time_s, abs=TIME_TOLERANCE_S)
+        assert (cells.line_start[0], cells.line_stop[0], cells.weight[0]) == (0, 7, 1)
+        np.testing.assert_allclose(cells.pose[0], GEOMETRY.pose(0.1 + SPEED_RAD_PER_S * time_s), atol=1e-12)
+
+
+@pytest.mark.parametrize("strips, sub_intervals", [(1, 1), (8, 5), (20, 3)])
+def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_intervals) -> None:
+    shutter = Shutter(0.0, 0.0)
+    static = static_cells(ORBIT, shutter, 0, START_S, 7)
+    micro = micro_view_cells(ORBIT, shutter, 0, START_S, 7, strips, sub_intervals)
+    per_line = per_line_cells(ORBIT, shutter, 0, START_S, 7, sub_intervals)
+    for cells in (micro, per_line):
+        np.testing.assert_array_equal(cells.pose, np.broadcast_to(static.pose, cells.pose.shape))
+
+
+def test_many_micro_views_meet_the_per_line_times() -> None:
+    """With a strip a line, mean times differ from the exact ones by at most half a strip's readout."""
+    shutter, lines = Shutter(0.8, 0.3), 200
+    micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
+    exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
+    np.testing.assert_array_equal(micro.line_start, exact.line_start)
+    assert np.abs(micro.time_s - exact.time_s).max() <= 0.3 / lines / 2 * (1 + 1e-9)
+
+
+def test_counts_below_one_are_refused() -> None:
+    for strips, sub_intervals in ((0, 1), (1, 0), (-1, 5)):
+        with pytest.raises(InputError, match="strips"):
+            micro_view_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, strips, sub_intervals)
+        with pytest.raises(InputError, match="strips"):
+            Motion("micro-views", strips, sub_intervals)
+    with pytest.raises(InputError, match="time samples"):
+        per_line_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)
+
+
+def scan(is_fly: bool) -> Scan:
+    return Scan(
+        projections=np.zeros((2, *SHAPE), np.float32),
+        geometry=GEOMETRY,
+        trajectory=ORBIT,
+        shutter=Shutter(0.8, 0.3, "columns"),
+        frame_start_s=np.array([0.0, START_S]),
+        grid=Grid.cube(4, 2.0),
+        is_fly=is_fly,
+    )
+
+
+@pytest.mark.parametrize(
+    "motion, fly_count, standing_count",
+    [
+        (Motion("static"), 1, 1),
+        (Motion("static-start"), 1, 1),
+        (Motion("micro-views", 4, 3), 12, 1),
+        (Motion("per-line", sub_intervals=3), 30, 1),
+    ],
+)
+def test_motion_models_of_moving_and_standing_scans(motion, fly_count, standing_count) -> None:
+    assert motion.cells(scan(True), 1).count == fly_count
+    standing = motion.cells(scan(False), 1)
+    assert standing.count == standing_count
+    moving = motion.cells(scan(True), 1)
+    assert moving.lines == 10 and moving.axis == "columns"
+    first_s, last_s = moving.time_s.min(), moving.time_s.max()
+    assert START_S <= first_s <= last_s <= START_S + 1.1
+
+
+def test_unknown_motion_is_refused() -> None:
+    with pytest.raises(InputError, match="micro-views"):
+        Motion("micro-view")

@@ -1,0 +1,172 @@
+"""An output file is there whole or as it was: whatever is raised, killed or full."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import check_writable, read_volume, sha256_of, write_scan, write_volume, written_beside
+
+POSIX = os.name == "posix"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+def test_success_replaces_the_file(tmp_path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_text("old")
+    with written_beside(target) as temporary:
+        assert temporary.parent == tmp_path and temporary != target
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+    assert names(tmp_path) == ["out.txt"]
+
+
+@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt(), InputError("x"), SystemExit(1)])
+@pytest.mark.parametrize("existing", [True, False])
+def test_failure_leaves_everything_as_it_was(tmp_path, error, existing) -> None:
+    target = tmp_path / "out.txt"
+    if existing:
+        target.write_text("old")
+    with pytest.raises(type(error)), written_beside(target) as temporary:
+        temporary.write_text("half of the new")
+        raise error
+    assert names(tmp_path) == (["out.txt"] if existing else [])
+    assert not existing or target.read_text() == "old"
+
+
+def test_system_errors_become_output_errors(tmp_path) -> None:
+    for number, word in ((28, "no room left"), (5, "Input/output")):
+        with pytest.raises(OutputError) as caught, written_beside(tmp_path / "out.txt"):
+            raise OSError(number, os.strerror(number))
+        assert word in str(caught.value) and str(tmp_path) in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_a_missing_folder_is_named_before_the_work(tmp_path) -> None:
+    with pytest.raises(OutputError, match=r"no folder .*nowhere") as caught:
+        check_writable(tmp_path / "nowhere" / "out.h5")
+    assert "create the folder" in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_targets_that_cannot_be_files(tmp_path) -> None:
+    (tmp_path / "file").write_text("a file, not a folder")
+    for path in (tmp_path, f"{tmp_path}/", "", tmp_path / "file" / "out.h5", tmp_path / ("n" * 300)):
+        with pytest.raises(OutputError):
+            check_writable(path)
+        with pytest.raises(OutputError), written_beside(path):
+            raise AssertionError("must not get here")
+    assert names(tmp_path) == ["file"]
+
+
+@pytest.mark.skipif(not POSIX, reason="permissions and devices of POSIX")
+def test_devices_are_no_targets() -> None:
+    with pytest.raises(OutputError, match="regular file"):
+        check_writable("/dev/null")
+
+
+@pytest.mark.skipif(not POSIX or os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_protected_folder_is_named(tmp_path) -> None:
+    folder = tmp_path / "protected"
+    folder.mkdir(mode=0o555)
+    with pytest.raises(OutputError, match="protected"):
+        check_writable(folder / "out.h5")
+
+
+def test_checking_writes_nothing(tmp_path) -> None:
+    check_writable(tmp_path / "out.h5")
+    assert names(tmp_path) == []
+    (tmp_path / "out.h5").write_text("old")
+    check_writable(tmp_path / "out.h5")
+    assert (tmp_path / "out.h5").read_text() == "old" and names(tmp_path) == ["out.h5"]
+
+
+@pytest.mark.skipif(not POSIX, reason="symbolic links and permissions of POSIX")
+def test_a_link_stays_and_permissions_are_kept(tmp_path) -> None:
+    (tmp_path / "real.txt").write_text("old")
+    (tmp_path / "real.txt").chmod(0o640)
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    with written_beside(tmp_path / "link.txt") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_text() == "new"
+    assert (tmp_path / "real.txt").stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.skipif(not POSIX, reason="SIGKILL")
+def test_a_killed_writer_leaves_the_old_file(tmp_path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_text("old")
+    script = f"""
+        import sys, time
+        from phyradgs_cl.io import written_beside
+        with written_beside({str(target)!r}) as temporary:
+            temporary.write_text("half")
+            print("writing", flush=True)
+            time.sleep(60)
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE, env=_environment()
+    ) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"writing\n"
+        process.send_signal(signal.SIGKILL)
+    assert target.read_text() == "old"
+
+
+@pytest.mark.skipif(not POSIX, reason="file size limits of POSIX")
+def test_a_full_disk_leaves_the_old_volume(tmp_path) -> None:
+    """A limit on file sizes stands in for a full disk: HDF5 fails in the middle of the file."""
+    target, grid = tmp_path / "volume.h5", Grid.cube(4, 2.0)
+    write_volume(target, np.ones(grid.shape, np.float32), grid, {"method": "old"})
+    before = sha256_of(target)
+    script = f"""
+        import resource, numpy as np
+        from phyradgs_cl.errors import OutputError
+        from phyradgs_cl.fields import Grid
+        from phyradgs_cl.io import write_volume
+        resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
+        try:
+            write_volume({str(target)!r}, np.ones((64, 64, 64), np.float32), Grid.cube(64, 2.0), {{}})
+        except OutputError as error:
+            print(error)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=_environment(), timeout=60, check=False
+    )
+    assert "no room left" in done.stdout and len(done.stdout.splitlines()) == 1, done.stdout + done.stderr
+    assert sha256_of(target) == before
+    assert names(tmp_path) == ["volume.h5"]
+    assert read_volume(target).provenance == {"method": "old"}
+
+
+def test_a_scan_that_fails_half_way_leaves_the_old_one(tmp_path, make_scan, monkeypatch) -> None:
+    write_scan(tmp_path / "scan.h5", make_scan())
+    before = sha256_of(tmp_path / "scan.h5")
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("interrupted")
+
+    monkeypatch.setattr("phyradgs_cl.io.scan_writer.write_motion", fails)
+    with pytest.raises(RuntimeError, match="interrupted"):
+        write_scan(tmp_path / "scan.h5", make_scan(title="new"))
+    assert sha256_of(tmp_path / "scan.h5") == before and names(tmp_path) == ["scan.h5"]
+
+
+def _environment() -> dict[str, str]:
+    """The child finds the package where this process found it."""
+    root = Path(sys.modules["phyradgs_cl"].__path__[0]).parent
+    return os.environ | {"PYTHONPATH": str(root)}

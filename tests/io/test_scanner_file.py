@@ -1,0 +1,140 @@
+"""Scanner files: the two that come with the project, and messages about others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import default_grid, load_scanner, with_detector_count, with_grid_count
+
+DATA = Path(__file__).parents[2] / "data"
+GOOD = """
+[source]
+to_axis_mm = 500
+to_detector_mm = 1000.0
+[detector]
+rows = 40
+columns = 60
+pixel_size_v_mm = 2.0
+pixel_size_u_mm = 1.0
+offset_u_mm = 3.5
+[volume]
+shape = [10, 20, 40]
+size_mm = [10.0, 20.0, 80.0]
+offset_mm = [1.0, 2.0, 3.0]
+[readout]
+axis = "columns"
+direction = -1
+ratio = 0.5
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(text: str) -> Path:
+        (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+        return tmp_path / "mine.toml"
+
+    return written
+
+
+def test_the_synthetic_scanner_of_the_benchmark() -> None:
+    scanner = load_scanner("r2", DATA)
+    geometry = scanner.geometry
+    assert (geometry.source_to_axis_mm, geometry.source_to_detector_mm) == (5, 7)
+    assert geometry.detector_shape == (512, 512)
+    assert [n * d for n, d in zip(geometry.detector_shape, geometry.pixel_size_mm, strict=True)] == [4, 4]
+    assert scanner.grid.shape == (256,) * 3 and scanner.grid.size_mm == (2, 2, 2)
+
+
+def test_the_c_arm_sees_its_volume_in_every_view() -> None:
+    scanner = load_scanner("carm", DATA)
+    assert scanner.geometry.source_to_axis_mm == 785 and scanner.geometry.source_to_detector_mm == 1200
+    assert scanner.grid.size_mm == pytest.approx((200, 200, 200))
+    assert min(default_grid(scanner.geometry).size_mm) > 200  # the inscribed cylinder
+
+
+def test_all_fields(write) -> None:
+    scanner = load_scanner(write(GOOD), DATA)
+    assert scanner.geometry == ConeGeometry(500.0, 1000.0, (40, 60), (2.0, 1.0), (0.0, 3.5))
+    assert scanner.grid == Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0))
+    assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("columns", -1, 0.5)
+
+
+def test_volume_and_readout_may_be_left_out(write) -> None:
+    scanner = load_scanner(write(GOOD.split("[volume]")[0]), DATA)
+    assert scanner.grid == default_grid(scanner.geometry)
+    assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("rows", 1, None)
+
+
+WRONG = {
+    "unknown key": ("rows = 40", "rows = 40\ncolums = 60", "[detector] colums", "did you mean 'columns'"),
+    "unknown table": ("[volume]", "[volumes]", "volumes", "did you mean 'volume'"),
+    "missing key": ("to_axis_mm = 500", "", "[source] to_axis_mm", "nothing"),
+    "text for a number": ("to_axis_mm = 500", 'to_axis_mm = "500"', "[source] to_axis_mm", "'500'"),
+    "negative": ("pixel_size_v_mm = 2.0", "pixel_size_v_mm = -2.0", "[detector] pixel_size_v_mm", "above 0"),
+    "infinite": ("pixel_size_v_mm = 2.0", "pixel_size_v_mm = inf", "[detector] pixel_size_v_mm", "finite"),
+    "not a number": ("offset_u_mm = 3.5", "offset_u_mm = nan", "[detector] offset_u_mm", "finite"),
+    "boundless": ("rows = 40", "rows = 1" + "0" * 400, "[detector] rows", "finite"),
+    "half a row": ("rows = 40", "rows = 40.5", "[detector] rows", "whole"),
+    "true": ("rows = 40", "rows = true", "[detector] rows", "True"),
+    "detector before axis": (
+        "to_detector_mm = 1000.0",
+        "to_detector_mm = 400",
+        "[source] to_detector_mm",
+        "500",
+    ),
+    "two counts": ("shape = [10, 20, 40]", "shape = [10, 20]", "[volume] shape", "three"),
+    "zero voxels": ("shape = [10, 20, 40]", "shape = [10, 0, 40]", "[volume] shape", "at least 1"),
+    "flat volume": (
+        "size_mm = [10.0, 20.0, 80.0]",
+        "size_mm = [10.0, 0, 80.0]",
+        "[volume] size_mm",
+        "above 0",
+    ),
+    "axis": ('axis = "columns"', 'axis = "cols"', "[readout] axis", "'rows'"),
+    "direction": ("direction = -1", "direction = 0", "[readout] direction", "-1"),
+    "direction true": ("direction = -1", "direction = true", "[readout] direction", "True"),
+    "ratio": ("ratio = 0.5", "ratio = -0.5", "[readout] ratio", "at least 0"),
+    "not TOML": ("[source]", "[source", "", "not TOML"),
+    "table as a number": ("[readout]", "[[readout]]", "[readout]", "a table"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_errors_name_table_and_key(write, case) -> None:
+    old, new, where, word = WRONG[case]
+    assert old in GOOD
+    path = write(GOOD.replace(old, new, 1))
+    with pytest.raises(InputError) as caught:
+        load_scanner(path, DATA)
+    text = str(caught.value)
+    assert text.startswith(f"{path} {where}".strip()) and word in text, text
+    assert "\n" not in text
+
+
+def test_unknown_names_and_paths(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"did you mean 'carm'"):
+        load_scanner("carmm", DATA)
+    with pytest.raises(InputError, match="no such file"):
+        load_scanner(tmp_path / "none.toml", DATA)
+
+
+def test_another_count_keeps_panel_and_box() -> None:
+    geometry = ConeGeometry(500.0, 1000.0, (40, 60), (2.0, 1.0), (1.0, 3.5))
+    coarse = with_detector_count(geometry, 10, 15)
+    # 4 × 4 pixels become one, centred among them
+    fine_mm = pixel_centres(geometry.pose(0.3), geometry.detector_shape).reshape(10, 4, 15, 4, 3)
+    coarse_mm = pixel_centres(coarse.pose(0.3), coarse.detector_shape)
+    assert coarse_mm == pytest.approx(fine_mm.mean((1, 3)), abs=1e-9)
+    grid = with_grid_count(Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0)), 20)
+    assert grid.shape == (5, 10, 20)
+    assert grid.size_mm == pytest.approx((10, 20, 80)) and grid.offset_mm == (1, 2, 3)
+    with pytest.raises(InputError):
+        with_detector_count(geometry, 0, 5)
+    with pytest.raises(InputError):
+        with_grid_count(grid, 0)

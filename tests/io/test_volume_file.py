@@ -1,0 +1,157 @@
+"""Volume files: what is written comes back, viewers find their axes, damage is named."""
+
+from __future__ import annotations
+
+import hashlib
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import file_kind, read_volume, sha256_of, volume_summary, write_volume
+from phyradgs_cl.phantoms.from_file import load_volume
+
+GRID = Grid((2, 3, 4), (1.5, 1.25, 1.0), (0.1, -0.2, 0.3))
+PROVENANCE = {"method": "fdk", "seed": 7, "options": {"filter": "ram-lak", "M": [1, 2]}, "loss": float("inf")}
+
+
+@pytest.fixture
+def stored(tmp_path):
+    volume = np.arange(24, dtype=np.float32).reshape(GRID.shape) / 1000
+    gaussians = {"centre_mm": np.arange(15.0).reshape(5, 3), "density_per_mm": np.ones(5, np.float32)}
+    write_volume(tmp_path / "volume.h5", volume, GRID, PROVENANCE, gaussians, {"psnr_db": np.float64(31.5)})
+    return tmp_path / "volume.h5", volume, gaussians
+
+
+def test_everything_comes_back(stored) -> None:
+    path, volume, gaussians = stored
+    again = read_volume(path)
+    np.testing.assert_array_equal(again.volume, volume)
+    assert again.volume.dtype == np.float32
+    assert again.grid == GRID
+    assert again.provenance == PROVENANCE
+    assert again.metrics == {"psnr_db": 31.5}
+    assert again.gaussians is not None and set(again.gaussians) == set(gaussians)
+    for name, values in gaussians.items():
+        np.testing.assert_array_equal(again.gaussians[name], values)
+
+
+def test_a_bare_volume_has_neither_gaussians_nor_metrics(tmp_path) -> None:
+    write_volume(tmp_path / "v.h5", np.zeros(GRID.shape), GRID, {})
+    again = read_volume(tmp_path / "v.h5")
+    assert again.gaussians is None and again.metrics is None and again.provenance == {}
+
+
+def test_viewers_find_signal_axes_and_plain_facts(stored) -> None:
+    path, volume, _ = stored
+    with h5py.File(path) as file:
+        group = file["entry/reconstruction"]
+        assert group.attrs["NX_class"] == "NXdata" and group.attrs["signal"] == "volume"
+        assert list(group.attrs["axes"]) == ["z", "y", "x"]
+        assert group["volume"].attrs["units"] == "1/mm" and group["x"].attrs["units"] == "mm"
+        np.testing.assert_allclose(group["x"], 0.3 + np.array([-1.5, -0.5, 0.5, 1.5]))
+        np.testing.assert_allclose(group["z"], 0.1 + np.array([-0.75, 0.75]))
+        assert [len(group[axis]) for axis in "zyx"] == list(volume.shape)
+        assert (
+            file["entry/provenance"].attrs["method"] == "fdk" and file["entry/provenance"].attrs["seed"] == 7
+        )
+
+
+def test_the_axes_alone_give_the_grid(stored) -> None:
+    path, _, _ = stored
+    with h5py.File(path, "r+") as file:
+        del file["entry/grid"]
+    grid = read_volume(path).grid
+    np.testing.assert_allclose(grid.voxel_size_mm, GRID.voxel_size_mm)
+    np.testing.assert_allclose(grid.offset_mm, GRID.offset_mm)
+
+
+def test_another_reader_agrees(stored) -> None:
+    path, volume, _ = stored
+    loaded = load_volume(path)
+    np.testing.assert_array_equal(loaded.volume, volume)
+    assert loaded.grid is not None
+    np.testing.assert_allclose(loaded.grid.first_centre_mm, GRID.first_centre_mm)
+
+
+def test_summary(stored) -> None:
+    path, _, _ = stored
+    facts = volume_summary(path)
+    assert facts["shape"] == (2, 3, 4) and facts["gaussians"] == 5
+    assert facts["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest() == sha256_of(path)
+
+
+def test_volumes_that_do_not_fit_are_refused(tmp_path) -> None:
+    for volume in (np.zeros((2, 3, 5)), np.full(GRID.shape, np.nan), np.zeros(3)):
+        with pytest.raises(InputError, match="volume"):
+            write_volume(tmp_path / "v.h5", volume, GRID, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def _set(name: str, value: object, units: str | None = None):
+    def damage(file: h5py.File) -> None:
+        if name in file:
+            del file[name]
+        file[name] = value
+        if units:
+            file[name].attrs["units"] = units
+
+    return damage
+
+
+DAMAGE = {
+    "no volume": (lambda f: f.pop("entry/reconstruction/volume"), "/entry/reconstruction/volume"),
+    "flat volume": (_set("entry/reconstruction/volume", np.zeros((2, 3))), "/entry/reconstruction/volume"),
+    "text": (_set("entry/reconstruction/volume", "no"), "/entry/reconstruction/volume"),
+    "other shape": (_set("entry/reconstruction/volume", np.zeros((3, 3, 4))), "/entry/reconstruction/volume"),
+    "NaN": (_set("entry/reconstruction/volume", np.full(GRID.shape, np.nan)), "/entry/reconstruction/volume"),
+    "units": (
+        _set("entry/reconstruction/volume", np.zeros(GRID.shape), "HU"),
+        "/entry/reconstruction/volume @units",
+    ),
+    "voxels": (_set("entry/grid/voxel_size", [1.0, 0.0, 1.0], "mm"), "/entry/grid/voxel_size"),
+    "facts": (_set("entry/provenance/json", "[1"), "/entry/provenance/json"),
+    "facts a list": (_set("entry/provenance/json", "[1]"), "/entry/provenance/json"),
+    "gaussians": (_set("entry/gaussians/centre_mm", [np.inf]), "/entry/gaussians/centre_mm"),
+    "uneven axis": (
+        lambda f: (f.pop("entry/grid"), _set("entry/reconstruction/x", [0.0, 1, 2, 4], "mm")(f)),
+        "/entry/reconstruction/x",
+    ),
+    "falling axis": (
+        lambda f: (f.pop("entry/grid"), _set("entry/reconstruction/y", [2.0, 1, 0], "mm")(f)),
+        "/entry/reconstruction/y",
+    ),
+    "elsewhere": (
+        lambda f: (f.pop("entry/gaussians"), _set("entry/gaussians", h5py.ExternalLink("o.h5", "/"))(f)),
+        "/entry/gaussians",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_damage_is_named(stored, case) -> None:
+    path, _, _ = stored
+    damage, address = DAMAGE[case]
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(InputError) as caught:
+        read_volume(path)
+    assert caught.value.culprit == f"{path}:{address}"
+    assert "\n" not in str(caught.value)
+
+
+def test_kinds(tmp_path, stored) -> None:
+    path, _, _ = stored
+    assert file_kind(path) == "volume"
+    with h5py.File(tmp_path / "plain.h5", "w") as file:
+        file["volume"] = np.zeros((2, 2, 2))
+    assert file_kind(tmp_path / "plain.h5") == "plain-volume"
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["temperature"] = 3.0
+    with pytest.raises(InputError, match="members: temperature"):
+        file_kind(tmp_path / "other.h5")
+    (tmp_path / "text.h5").write_text("no")
+    with pytest.raises(InputError):
+        file_kind(tmp_path / "text.h5")
