@@ -7,7 +7,7 @@ import sys
 import time
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
@@ -86,13 +86,15 @@ class MotionName(str, Enum):
 
 
 Device = Annotated[
-    Optional[str],
+    str | None,
     typer.Option(
         help=f"OpenCL device: index, cpu, gpu or part of a name (see 'phyradgs devices'); also ${DEVICE_VARIABLE}.",
         show_default="best by capability",
     ),
 ]
-Output = Annotated[Path, typer.Option("--output", "-o", help="File to write; an existing one is replaced whole.")]
+Output = Annotated[
+    Path, typer.Option("--output", "-o", help="File to write; an existing one is replaced whole.")
+]
 
 
 @app.command(
@@ -102,53 +104,76 @@ Output = Annotated[Path, typer.Option("--output", "-o", help="File to write; an 
 def simulate_command(
     output: Output,
     phantom: Annotated[
-        Optional[PhantomName], typer.Option(help="Built-in phantom.", show_default="foot, without --volume")
+        PhantomName | None, typer.Option(help="Built-in phantom.", show_default="foot, without --volume")
     ] = None,
     volume: Annotated[
-        Optional[Path], typer.Option(help="HDF5 file with a dataset /volume (z, y, x), or one of our volumes.")
+        Path | None, typer.Option(help="HDF5 file with a dataset /volume (z, y, x), or one of our volumes.")
     ] = None,
     scanner: Annotated[str, typer.Option(help="Scanner by name (r2, carm) or a TOML file.")] = "r2",
     protocol: Annotated[
         ProtocolName,
-        typer.Option(help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot, 25 mid-window poses."),
+        typer.Option(
+            help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot, 25 mid-window poses."
+        ),
     ] = ProtocolName.rapid,
-    views: Annotated[Optional[int], typer.Option(help="Frames in the turn.", show_default="protocol's")] = None,
+    views: Annotated[int | None, typer.Option(help="Frames in the turn.", show_default="protocol's")] = None,
     exposure_deg: Annotated[
-        Optional[float], typer.Option(help="Arc of one exposure, degrees.", show_default="protocol's")
+        float | None, typer.Option(help="Arc of one exposure, degrees.", show_default="protocol's")
     ] = None,
     readout_ratio: Annotated[
-        Optional[float], typer.Option(help="Readout over exposure time, T_ro/T_exp.", show_default="0.86")
+        float | None, typer.Option(help="Readout over exposure time, T_ro/T_exp.", show_default="0.86")
     ] = None,
-    start_deg: Annotated[Optional[float], typer.Option(help="Gantry angle at the start, degrees.", show_default="0")] = None,
-    readout: Annotated[Optional[Axis], typer.Option(help="What is read out at one time.", show_default="scanner's")] = None,
+    start_deg: Annotated[
+        float | None, typer.Option(help="Gantry angle at the start, degrees.", show_default="0")
+    ] = None,
+    readout: Annotated[
+        Axis | None, typer.Option(help="What is read out at one time.", show_default="scanner's")
+    ] = None,
     readout_direction: Annotated[
-        Optional[int], typer.Option(help="1 reads index 0 first, -1 last.", show_default="scanner's")
+        int | None, typer.Option(help="1 reads index 0 first, -1 last.", show_default="scanner's")
     ] = None,
     detector_model: Annotated[
-        DetectorModel, typer.Option(help="Average line integrals (log) or transmitted intensity over the exposure.")
+        DetectorModel,
+        typer.Option(help="Average line integrals (log) or transmitted intensity over the exposure."),
     ] = DetectorModel.log,
     peak: Annotated[
         float, typer.Option(help="Scale attenuation so that the largest line integral is this; 0 leaves it.")
     ] = 0.0,
     noise: Annotated[
-        Noise, typer.Option(help="tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise.")
+        Noise,
+        typer.Option(
+            help="tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."
+        ),
     ] = Noise.none,
     dose: Annotated[float, typer.Option(help="Photons a pixel without object.")] = 1e4,
-    electronic_noise: Annotated[float, typer.Option(help="Standard deviation of electronic noise, counts.")] = 10.0,
+    electronic_noise: Annotated[
+        float, typer.Option(help="Standard deviation of electronic noise, counts.")
+    ] = 10.0,
     jitter_deg: Annotated[
-        float, typer.Option(help="Wander of the gantry about constant speed (std, degrees), written to the encoder table.")
+        float,
+        typer.Option(
+            help="Wander of the gantry about constant speed (std, degrees), written to the encoder table."
+        ),
     ] = 0.0,
     detector: Annotated[
-        Optional[int], typer.Option(help="Detector columns (rows in proportion); the panel keeps its size.", show_default="scanner's")
+        int | None,
+        typer.Option(
+            help="Detector columns (rows in proportion); the panel keeps its size.", show_default="scanner's"
+        ),
     ] = None,
     detector_offset: Annotated[
-        Optional[str], typer.Option(help="Detector offset V,U in mm.", show_default="scanner's")
+        str | None, typer.Option(help="Detector offset V,U in mm.", show_default="scanner's")
     ] = None,
     size: Annotated[
-        Optional[int], typer.Option(help="Voxels along the longest side of the grid and truth.", show_default="scanner's or the file's")
+        int | None,
+        typer.Option(
+            help="Voxels along the longest side of the grid and truth.",
+            show_default="scanner's or the file's",
+        ),
     ] = None,
     time_samples: Annotated[
-        int, typer.Option(help="Times at which every line is projected in its exposure; 0 chooses by the motion.")
+        int,
+        typer.Option(help="Times at which every line is projected in its exposure; 0 chooses by the motion."),
     ] = 0,
     seed: Annotated[int, typer.Option(help="Seed of phantom, noise and jitter.")] = 0,
     device: Device = None,
@@ -185,9 +210,13 @@ def simulate_command(
         seed=seed,
     )
     with Ticker("frame") as ticker:
-        scan = run_simulation(job, described, options, Runtime(device), lambda done, total: ticker.show(done, total))
+        scan = run_simulation(
+            job, described, options, Runtime(device), lambda done, total: ticker.show(done, total)
+        )
     frames, rows, columns = scan.projections.shape
-    typer.echo(f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}")
+    typer.echo(
+        f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}"
+    )
 
 
 @app.command(
@@ -199,33 +228,49 @@ def reconstruct_command(
     scan: Annotated[Path, typer.Argument(help="Scan file (HDF5, NXtomo).")],
     output: Output,
     method: Annotated[
-        Optional[MethodName],  # type: ignore[valid-type]
-        typer.Option(help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic.", show_default="phyradgs"),
+        MethodName | None,  # type: ignore[valid-type]
+        typer.Option(
+            help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic.",
+            show_default="phyradgs",
+        ),
     ] = None,
     motion: Annotated[
-        Optional[MotionName],
+        MotionName | None,
         typer.Option(
             help="How frames see the moving gantry: frozen at mid-window (static), at the start, or M×N micro-views.",
             show_default="micro-views for phyradgs, static for r2 and fdk",
         ),
     ] = None,
-    strips: Annotated[Optional[int], typer.Option(help="Strips M of a frame (rolling shutter).", show_default="8")] = None,
+    strips: Annotated[
+        int | None, typer.Option(help="Strips M of a frame (rolling shutter).", show_default="8")
+    ] = None,
     sub_intervals: Annotated[
-        Optional[int], typer.Option(help="Sub-intervals N of an exposure (motion blur).", show_default="5")
+        int | None, typer.Option(help="Sub-intervals N of an exposure (motion blur).", show_default="5")
     ] = None,
-    iterations: Annotated[Optional[int], typer.Option(help="Iterations, one frame each.", show_default="preset's: 3000")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Iterations, one frame each.", show_default="preset's: 3000")
+    ] = None,
     gaussians: Annotated[
-        Optional[int], typer.Option(help="Gaussians at the start.", show_default="preset's: from the grid")
+        int | None, typer.Option(help="Gaussians at the start.", show_default="preset's: from the grid")
     ] = None,
-    seed: Annotated[Optional[int], typer.Option(help="Seed of cloud, frame order and sub-volumes.", show_default="0")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of cloud, frame order and sub-volumes.", show_default="0")
+    ] = None,
     preset: Annotated[
-        Optional[str], typer.Option(help="Constants: default, paper or released (phyradgs); published (r2).", show_default="default")
+        str | None,
+        typer.Option(
+            help="Constants: default, paper or released (phyradgs); published (r2).", show_default="default"
+        ),
     ] = None,
     config: Annotated[
-        Optional[Path],
-        typer.Option(help="TOML file with any of these options (underscores for dashes) and the preset's constants; the command line wins."),
+        Path | None,
+        typer.Option(
+            help="TOML file with any of these options (underscores for dashes) and the preset's constants; the command line wins."
+        ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint of an interrupted run.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint of an interrupted run.")
+    ] = False,
     device: Device = None,
 ) -> None:
     """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
@@ -257,7 +302,9 @@ def reconstruct_command(
     interrupted = result.facts.get("interrupted_at")
     typer.echo(f"{output}: {job.method}, {result.facts['seconds']:.1f} s" + _metrics_text(metrics))
     if interrupted is not None:
-        typer.echo(f"interrupted after iteration {interrupted}: repeat the command with --resume to go on", err=True)
+        typer.echo(
+            f"interrupted after iteration {interrupted}: repeat the command with --resume to go on", err=True
+        )
         raise typer.Exit(INTERRUPTED)
 
 
@@ -267,7 +314,8 @@ def evaluate_command(
     reference: Annotated[Path, typer.Option(help="Scan with a known truth, or a volume on the same grid.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     picture: Annotated[
-        Optional[Path], typer.Option(help="PNG of slices: result, truth, difference.", show_default="VOLUME with .png")
+        Path | None,
+        typer.Option(help="PNG of slices: result, truth, difference.", show_default="VOLUME with .png"),
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""

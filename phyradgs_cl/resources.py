@@ -15,4 +15,6 @@ def resource(name: str) -> Path:
     for folder in (_PACKAGE, _PACKAGE.parent):
         if (folder / name).exists():
             return folder / name
-    raise FileNotFoundError(f"{name} is missing from the installation at {_PACKAGE}: install phyradgs-cl again")
+    raise FileNotFoundError(
+        f"{name} is missing from the installation at {_PACKAGE}: install phyradgs-cl again"
+    )

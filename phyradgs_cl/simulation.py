@@ -19,7 +19,6 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, load_volume, make_phantom
 from phyradgs_cl.runtime import Runtime
 
 
-
 class FrameSource(Interface):
     """Whatever can be projected: the merged frame of a cell table, attenuation multiplied by ``factor``."""
 
@@ -124,7 +123,9 @@ def default_time_samples(protocol: Protocol, grid: Grid) -> int:
 class VolumeSource:
     """Frames of a voxel volume (z, y, x) in 1/mm by the ray-driven projector."""
 
-    def __init__(self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str) -> None:
+    def __init__(
+        self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str
+    ) -> None:
         self._projector = RayProjector(rt, grid, geometry.detector_shape, axis)
         self._volume = volume
         self._factor: float | None = None
@@ -184,7 +185,9 @@ def phantom_scene(
     volume = phantom.voxelise(Grid.cube(2 * size, 2 * half_size_mm))
     fine = Grid.cube(2 * size, 2 * half_size_mm)
     source = VolumeSource(rt, volume, fine, geometry, axis)
-    return Scene(source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}")
+    return Scene(
+        source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}"
+    )
 
 
 def volume_scene(
@@ -210,7 +213,9 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Means of a volume (z, y, x) over the voxels of a coarser (or equal) grid of the same box, float32."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
-    return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(np.float32)
+    return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(
+        np.float32
+    )
 
 
 def _resized(grid: Grid, count: int) -> Grid:

@@ -176,7 +176,9 @@ def _write_result(
     write_volume(job.output, result.volume, result.grid, provenance, arrays, metrics or None)
 
 
-def _provenance(result: Reconstruction, scan_hash: str, job: ReconstructionJob, rt: Runtime) -> dict[str, object]:
+def _provenance(
+    result: Reconstruction, scan_hash: str, job: ReconstructionJob, rt: Runtime
+) -> dict[str, object]:
     return {
         **result.facts,
         "program": f"phyradgs-cl {__version__}",
@@ -197,12 +199,16 @@ def _fingerprint(scan_hash: str, job: ReconstructionJob, options: object) -> str
 
 def _resumed(job: ReconstructionJob, fingerprint: str) -> SplatState:
     if job.method not in SPLAT_METHODS:
-        raise InputError("--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(SPLAT_METHODS)}")
+        raise InputError(
+            "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(SPLAT_METHODS)}"
+        )
     path = checkpoint_path(job.output)
     arrays = read_checkpoint(path, fingerprint)
     missing = {"raw", "moments", "statistics", "iteration", "queue", "rng"} - set(arrays)
     if missing:
-        raise InputError(str(path), f"no {', '.join(sorted(missing))}", "a whole checkpoint", "start without --resume")
+        raise InputError(
+            str(path), f"no {', '.join(sorted(missing))}", "a whole checkpoint", "start without --resume"
+        )
     return SplatState(
         arrays["raw"],
         arrays["moments"],
@@ -238,7 +244,11 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     peak = float(reference.max())
     if peak <= 0:
         raise InputError("reference", f"a maximum of {peak:g}", "a volume with something in it")
-    return {"psnr_db": psnr(volume, reference, peak), "ssim": ssim(volume, reference, peak), "data_range": peak}
+    return {
+        "psnr_db": psnr(volume, reference, peak),
+        "ssim": ssim(volume, reference, peak),
+        "data_range": peak,
+    }
 
 
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
@@ -249,12 +259,22 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
     if grid is not None and not _same_grid(grid, stored.grid):
         raise InputError(str(reference_path), f"the grid {grid}", f"that of {volume_path}: {stored.grid}")
     if reference.shape != stored.volume.shape:
-        raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {stored.volume.shape} of {volume_path}")
+        raise InputError(
+            str(reference_path), f"shape {reference.shape}", f"shape {stored.volume.shape} of {volume_path}"
+        )
     metrics = compare(stored.volume, reference)
     title = f"{stored.provenance.get('method', 'volume')}: {metrics['psnr_db']:.2f} dB, SSIM {metrics['ssim']:.3f}"
     slices_png(picture, stored.volume, reference, title)
-    known = {key: stored.provenance[key] for key in ("method", "seconds", "gaussians") if key in stored.provenance}
-    return {**metrics, **known, "volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
+    known = {
+        key: stored.provenance[key] for key in ("method", "seconds", "gaussians") if key in stored.provenance
+    }
+    return {
+        **metrics,
+        **known,
+        "volume": str(volume_path),
+        "reference": str(reference_path),
+        "picture": str(picture),
+    }
 
 
 def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
@@ -263,7 +283,9 @@ def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
     if kind == "scan":
         scan = load_scan(path)
         if scan.reference is None:
-            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth")
+            raise InputError(
+                f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth"
+            )
         return scan.reference, scan.grid
     if kind == "volume":
         stored = read_volume(path)
@@ -284,7 +306,12 @@ def summary(path: Path) -> dict[str, object]:
         provenance.pop("options", None)
         return {"kind": "volume", **facts, **provenance}
     volume = _bare_volume(path)
-    return {"kind": "bare volume", "shape": volume.shape, "minimum": float(volume.min()), "maximum": float(volume.max())}
+    return {
+        "kind": "bare volume",
+        "shape": volume.shape,
+        "minimum": float(volume.min()),
+        "maximum": float(volume.max()),
+    }
 
 
 def _bare_volume(path: Path) -> np.ndarray:

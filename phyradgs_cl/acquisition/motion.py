@@ -31,7 +31,7 @@ class Motion:
             raise InputError("strips × sub-intervals", found, "two counts of at least 1")
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The time cells of one frame. A scan that is not a fly-scan has one pose a frame, whatever the model."""
+        """The time cells of one frame; a scan that is not a fly-scan has one pose a frame in every model."""
         where = (scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines)
         if self.name == "static-start":
             return cells.static_start_cells(*where)

@@ -44,7 +44,11 @@ class Gaussians:
 
     def rows(self) -> np.ndarray:
         """The parameters as (11, G) float64, the order that kernels use."""
-        q = self.quaternion / np.linalg.norm(self.quaternion, axis=1, keepdims=True) if self.count else self.quaternion
+        q = (
+            self.quaternion / np.linalg.norm(self.quaternion, axis=1, keepdims=True)
+            if self.count
+            else self.quaternion
+        )
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
     @classmethod

@@ -21,7 +21,9 @@ class Grid:
         if len(self.shape) != 3 or any(int(n) < 1 for n in self.shape):
             raise InputError("grid shape", str(self.shape), "three counts of at least 1 (z, y, x)")
         if len(self.voxel_size_mm) != 3 or not all(np.isfinite(d) and d > 0 for d in self.voxel_size_mm):
-            raise InputError("grid voxel_size", str(self.voxel_size_mm), "three positive lengths in mm (z, y, x)")
+            raise InputError(
+                "grid voxel_size", str(self.voxel_size_mm), "three positive lengths in mm (z, y, x)"
+            )
         if len(self.offset_mm) != 3 or not np.all(np.isfinite(self.offset_mm)):
             raise InputError("grid offset", str(self.offset_mm), "three finite lengths in mm (z, y, x)")
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))

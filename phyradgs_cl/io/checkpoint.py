@@ -27,15 +27,21 @@ def write_checkpoint(path: str | Path, arrays: dict[str, np.ndarray], fingerprin
 def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]:
     """The arrays of a checkpoint. Raises InputError if it is missing, damaged or of another scan or options."""
     if not Path(path).is_file():
-        raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", "start without --resume")
+        raise InputError(
+            "--resume", f"no checkpoint {path}", "one left by an interrupted run", "start without --resume"
+        )
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"a damaged checkpoint ({error})", "a whole one", "start without --resume") from error
+        raise InputError(
+            str(path), f"a damaged checkpoint ({error})", "a whole one", "start without --resume"
+        ) from error
     if arrays.pop("format", None) != _FORMAT:
         raise InputError(str(path), "another checkpoint format", str(_FORMAT), "start without --resume")
     if str(arrays.pop("fingerprint", "")) != fingerprint:
         remedy = "use the same scan and options, or start without --resume"
-        raise InputError(str(path), "a checkpoint of another scan or other options", "one of this run", remedy)
+        raise InputError(
+            str(path), "a checkpoint of another scan or other options", "one of this run", remedy
+        )
     return arrays

@@ -31,7 +31,9 @@ class ImageLoss:
         self._line_sums = rt.zeros((lines, 4))
         self.gradient = rt.zeros(image + _GUARD)
 
-    def evaluate(self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float) -> DeviceArray:
+    def evaluate(
+        self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
+    ) -> DeviceArray:
         """dL/drendered, until the next call; ``mask`` is 1 where a pixel counts and ``pixels`` its sum."""
         rt = self.rt
         vectors = -(-self.width // rt.lanes)
@@ -56,7 +58,13 @@ class ImageLoss:
             group=group,
         )
         rt.launch(
-            kernel("ssim_spread"), (vectors, self.lines), self._partials, self._window, *size, self._spread, group=group
+            kernel("ssim_spread"),
+            (vectors, self.lines),
+            self._partials,
+            self._window,
+            *size,
+            self._spread,
+            group=group,
         )
         rt.launch(
             kernel("image_gradient"),

@@ -10,7 +10,9 @@ from phyradgs_cl.operators.rays import voxel_matrices
 from phyradgs_cl.runtime import Runtime
 
 
-def backproject(rt: Runtime, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:
+def backproject(
+    rt: Runtime, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid
+) -> np.ndarray:
     """Σ_f weight_f / z² · frame_f(u, v) at every voxel centre, z the voxel's depth as a share of the ray.
 
     frames (F, rows, columns), bilinear and zero outside; pose (F, 12); weight (F,). Returns (z, y, x) float32.

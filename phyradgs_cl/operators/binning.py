@@ -32,7 +32,14 @@ class TileLists:
         chunks = max(-(-count // _CHUNK), 1)
         if self._counts.size < self.total * chunks:
             self._counts = rt.empty(self.total * chunks, np.int32)
-        domain = (np.int32(stride), np.int32(count), np.int32(_CHUNK), np.int32(chunks), self.tile, self.tiles)
+        domain = (
+            np.int32(stride),
+            np.int32(count),
+            np.int32(_CHUNK),
+            np.int32(chunks),
+            self.tile,
+            self.tiles,
+        )
         group = rt.group()
         rt.launch(rt.kernel("binning", "bin_count"), chunks, extents, *domain, self._counts, group=group)
         rt.launch(

@@ -128,13 +128,18 @@ class SplatProjector:
             group=rt.group(),
         )
 
-    def evaluated_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int]:
-        """(pixels in bounding boxes, Gaussian–cell footprints) of the last ``forward``, for benchmarks."""
+    def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
+        """Of the last ``forward``: Gaussian–pixel pairs in bounding boxes, pairs that were evaluated (whole vectors),
+        and Gaussian–cell footprints.
+        """
         shape = (gaussians.stride, cells.count, RECORD_FLOATS)
-        whole = self.rt.download(DeviceArray(self._records.buffer, shape, np.dtype(np.int32)))[: gaussians.count]
+        whole = self.rt.download(DeviceArray(self._records.buffer, shape, np.dtype(np.int32)))[
+            : gaussians.count
+        ]
         rows = np.maximum(whole[..., 14].astype(np.int64) - whole[..., 13] + 1, 0)
         columns = np.where(rows > 0, whole[..., 12].astype(np.int64) - whole[..., 11] + 1, 0)
-        return int((rows * columns).sum()), int((rows > 0).sum())
+        vectors = -(-columns // self.rt.lanes) * self.rt.lanes
+        return int((rows * columns).sum()), int((rows * vectors).sum()), int((rows > 0).sum())
 
     def _prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
         rt = self.rt

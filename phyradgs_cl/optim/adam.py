@@ -85,7 +85,13 @@ class DeviceAdam:
         )
 
     def step(
-        self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray, step: int
+        self,
+        raw: DeviceArray,
+        gradients: DeviceArray,
+        moments: DeviceArray,
+        stride: int,
+        rates: np.ndarray,
+        step: int,
     ) -> None:
         """One step of Adam; ``rates`` (11,), ``step`` counts from 1."""
         self.rt.write(self._rates, folded_rates(rates, step))

@@ -79,7 +79,9 @@ def control_density(
     return prune(grown, activation, control, box)
 
 
-def prune(population: Population, activation: Activation, control: DensityControl, box: np.ndarray) -> Population:
+def prune(
+    population: Population, activation: Activation, control: DensityControl, box: np.ndarray
+) -> Population:
     """Without what has faded or left the box, sorted by height so that neighbours in memory share detector lines."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)

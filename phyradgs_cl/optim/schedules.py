@@ -19,6 +19,7 @@ class Rates:
     def at(self, progress: float) -> np.ndarray:
         """Rates (11,) a parameter row at ``progress`` (0 to 1) through the run."""
         position, scale, rotation, density = (
-            first * (last / first) ** progress for first, last in (self.position, self.scale, self.rotation, self.density)
+            first * (last / first) ** progress
+            for first, last in (self.position, self.scale, self.rotation, self.density)
         )
         return np.array([position] * 3 + [scale] * 3 + [rotation] * 4 + [density])

@@ -38,10 +38,7 @@ def fdk(
     """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing."""
     started = time.perf_counter()
     pose = np.concatenate([options.motion.cells(scan, f).pose for f in range(scan.frames)])
-    frames = scan.projections
-    if scan.pixel_mask is not None:
-        frames = fill_masked(frames, np.broadcast_to(scan.pixel_mask != 0, frames.shape))
-    volume = fdk_volume(rt, frames, pose, scan.grid)
+    volume = fdk_volume(rt, unmasked_frames(scan), pose, scan.grid)
     facts = {"method": "fdk", "options": asdict(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
@@ -81,6 +78,13 @@ def angular_gaps(source: np.ndarray) -> np.ndarray:
     gaps = np.empty(len(angle))
     gaps[order] = (ahead + np.roll(ahead, 1)) / 2
     return gaps
+
+
+def unmasked_frames(scan: Scan) -> np.ndarray:
+    """The scan's line integrals with masked pixels filled in, for methods that cannot leave pixels out."""
+    if scan.pixel_mask is None:
+        return scan.projections
+    return fill_masked(scan.projections, np.broadcast_to(scan.pixel_mask != 0, scan.projections.shape))
 
 
 def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:

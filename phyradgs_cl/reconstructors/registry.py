@@ -46,7 +46,9 @@ def method_options(method: str, preset: str | None = None, changes: Mapping[str,
         raise InputError("--preset", repr(name), f"one of {', '.join(presets)} for --method {method}")
     changes = dict(changes or {})
     base = presets[name]
-    motion = _motion(method, base.motion, {k: changes.pop(k, None) for k in ("motion", "strips", "sub_intervals")})
+    motion = _motion(
+        method, base.motion, {k: changes.pop(k, None) for k in ("motion", "strips", "sub_intervals")}
+    )
     return _changed(replace(base, motion=motion), changes, f"--method {method}")
 
 
@@ -70,7 +72,9 @@ def _motion(method: str, base: Motion, given: dict[str, Any]) -> Motion:
     counts = {k: v for k, v in given.items() if k != "motion" and v is not None}
     if counts and name != "micro-views":
         option = "--" + next(iter(counts)).replace("_", "-")
-        raise InputError(option, f"--motion {name} for --method {method}", "--motion micro-views, which alone has strips")
+        raise InputError(
+            option, f"--motion {name} for --method {method}", "--motion micro-views, which alone has strips"
+        )
     return replace(base, name=name, **counts)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 from phyradgs_cl.acquisition import Motion
 from phyradgs_cl.errors import InputError

@@ -16,12 +16,12 @@ import numpy as np
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import NumericalError
-from phyradgs_cl.fields import Activation, Gaussians, Grid
+from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser, sub_grid, voxelise
-from phyradgs_cl.operators.layout import pad_columns, pad_rows, pitch_of, stride_of
+from phyradgs_cl.operators.layout import pad_columns, pad_rows, stride_of
 from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
-from phyradgs_cl.reconstructors.fdk import fdk_volume, fill_masked
+from phyradgs_cl.reconstructors.fdk import fdk_volume, unmasked_frames
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, SplatState
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
@@ -61,13 +61,15 @@ def reconstruct_splats(
     scale = internal_scale(fdk, scan.grid)
     grid = scan.grid.scaled(1 / scale.length_mm)
     rng = np.random.default_rng(seed)
-    population = _first_population(fdk / scale.density_per_mm, grid, options, rng)
+    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
     run = SplatRun(rt, scan, options, scale, population, rng)
     if resume is not None:
         run.restore(resume)
     record = run.optimise(report, started)
     cloud = Gaussians.from_rows(run.parameters())
-    volume = voxelise(rt, cloud.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(scale.density_per_mm)
+    volume = voxelise(rt, cloud.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(
+        scale.density_per_mm
+    )
     facts = {
         "method": method,
         "options": options.as_dict(),
@@ -110,7 +112,9 @@ class SplatRun:
         self.projector = SplatProjector(
             rt, self.frames.lines, self.frames.width, affine=options.affine, cutoff_sigma=options.cutoff_sigma
         )
-        self.loss = ImageLoss(rt, self.frames.lines, self.frames.width, self.projector.pitch, options.ssim_weight)
+        self.loss = ImageLoss(
+            rt, self.frames.lines, self.frames.width, self.projector.pitch, options.ssim_weight
+        )
         edge = [min(options.tv_edge, n) for n in self.grid.shape]
         self.crop = Voxeliser(rt, (edge[0], edge[1], edge[2]), cutoff_sigma=options.cutoff_sigma)
         self.tv = TotalVariation(rt, self.crop.shape, self.crop.pitch)
@@ -132,7 +136,12 @@ class SplatRun:
                 if self.iteration % REPORT_EVERY == 0 or self.iteration == total:
                     loss, seconds = self._checked_loss(), time.perf_counter() - started
                     record.append(
-                        {"iteration": self.iteration, "loss": loss, "gaussians": self.gaussians.count, "seconds": seconds}
+                        {
+                            "iteration": self.iteration,
+                            "loss": loss,
+                            "gaussians": self.gaussians.count,
+                            "seconds": seconds,
+                        }
                     )
                     report(Progress(self.iteration, total, loss, self.gaussians.count, seconds))
         except KeyboardInterrupt:
@@ -176,7 +185,10 @@ class SplatRun:
         return self._queue.pop()
 
     def _add_total_variation(self) -> None:
-        start = [int(self.rng.integers(n - edge + 1)) for n, edge in zip(self.grid.shape, self.crop.shape, strict=True)]
+        start = [
+            int(self.rng.integers(n - edge + 1))
+            for n, edge in zip(self.grid.shape, self.crop.shape, strict=True)
+        ]
         part = sub_grid(self.grid, (start[0], start[1], start[2]), self.crop.shape)
         by_volume = self.tv.evaluate(self.crop.forward(self.gaussians, part))
         weight = self.options.tv_weight
@@ -186,7 +198,10 @@ class SplatRun:
         loss = self.loss.value()
         if not np.isfinite(loss):
             raise NumericalError(
-                "loss", f"{loss} at iteration {self.iteration}", "a finite number", "check the scan for extreme values"
+                "loss",
+                f"{loss} at iteration {self.iteration}",
+                "a finite number",
+                "check the scan for extreme values",
             )
         return loss
 
@@ -197,7 +212,9 @@ class SplatRun:
         statistics = self.rt.download(self.statistics)[:, : self.gaussians.count]
         population = self._population()
         rng = json.dumps(self.rng.bit_generator.state)
-        return SplatState(population.raw, population.moments, statistics, self.iteration, list(self._queue), rng)
+        return SplatState(
+            population.raw, population.moments, statistics, self.iteration, list(self._queue), rng
+        )
 
     def restore(self, state: SplatState) -> None:
         self._load(Population(state.raw, state.moments))
@@ -224,7 +241,9 @@ class SplatRun:
         centre = np.array(self.grid.offset_mm[::-1])
         box = np.stack([centre - half, centre + half])
         population = self._population()
-        self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
+        self._load(
+            control_density(population, statistic, self.activation, self.options.control, box, self.rng)
+        )
 
     def _load(self, population: Population) -> None:
         count, stride = population.count, stride_of(population.count)
@@ -245,7 +264,9 @@ class DeviceFrames:
         by_column = scan.shutter.axis == "columns"
         rows, columns = scan.geometry.detector_shape
         self.lines, self.width = (columns, rows) if by_column else (rows, columns)
-        tables = [scaled_cells(options.motion.cells(scan, f), 1 / scale.length_mm) for f in range(scan.frames)]
+        tables = [
+            scaled_cells(options.motion.cells(scan, f), 1 / scale.length_mm) for f in range(scan.frames)
+        ]
         self._cells = [DeviceCells.upload(rt, table) for table in tables]
         frames = scan.projections / np.float32(scale.line_integral)
         self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
@@ -280,18 +301,20 @@ def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
     )
 
 
+def static_poses(scan: Scan) -> np.ndarray:
+    """Mid-window poses (F, 12)."""
+    return np.concatenate([Motion("static").cells(scan, f).pose for f in range(scan.frames)])
+
+
 def _static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
     """FDK at the mid-window poses, the start of every splatting method."""
-    pose = np.concatenate([Motion("static").cells(scan, f).pose for f in range(scan.frames)])
-    frames = scan.projections
-    if scan.pixel_mask is not None:
-        frames = fill_masked(frames, np.broadcast_to(scan.pixel_mask != 0, frames.shape))
-    return fdk_volume(rt, frames, pose, scan.grid)
+    return fdk_volume(rt, unmasked_frames(scan), static_poses(scan), scan.grid)
 
 
-def _first_population(
+def first_population(
     volume: np.ndarray, grid: Grid, options: SplatOptions, rng: np.random.Generator
 ) -> Population:
+    """The raw parameters of the initial cloud, drawn from an FDK volume in internal units."""
     activation = options.activation(grid)
     cloud = initial_cloud(
         volume,

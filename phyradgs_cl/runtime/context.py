@@ -94,7 +94,10 @@ class Runtime:
         except cl.RuntimeError as error:
             message = " ".join(str(error).split())[-600:]
             raise DeviceError(
-                f"kernel {program}.cl on {self.device.name}", message, "a program that builds", "try another --device"
+                f"kernel {program}.cl on {self.device.name}",
+                message,
+                "a program that builds",
+                "try another --device",
             ) from error
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)
         return built
@@ -108,7 +111,9 @@ class Runtime:
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
         if nbytes > self.device.largest_allocation_bytes:
             limit = f"at most {self.device.largest_allocation_bytes / 2**20:.0f} MiB in one allocation"
-            raise DeviceError(f"memory of {self.device.name}", f"{nbytes / 2**20:.0f} MiB", limit, "use a smaller problem")
+            raise DeviceError(
+                f"memory of {self.device.name}", f"{nbytes / 2**20:.0f} MiB", limit, "use a smaller problem"
+            )
         try:
             buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes)
         except cl.Error as error:
@@ -123,7 +128,9 @@ class Runtime:
 
     def fill(self, array: DeviceArray, value: float) -> None:
         pattern = np.array(value, dtype=array.dtype)
-        event = cl.enqueue_fill_buffer(self.queue, array.buffer, pattern, 0, max(array.nbytes, array.dtype.itemsize))
+        event = cl.enqueue_fill_buffer(
+            self.queue, array.buffer, pattern, 0, max(array.nbytes, array.dtype.itemsize)
+        )
         self._record("fill", event)
 
     def upload(self, values: np.ndarray, dtype: np.typing.DTypeLike | None = None) -> DeviceArray:
@@ -152,7 +159,9 @@ class Runtime:
         return value[0]
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
-        self._record("copy", cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes))
+        self._record(
+            "copy", cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes)
+        )
 
     # --- launches -----------------------------------------------------------------------------------
 

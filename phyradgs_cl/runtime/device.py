@@ -70,14 +70,19 @@ def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
     devices = list_devices()
     if not devices:
         raise DeviceError(
-            "OpenCL", "no device", "at least one", "pip install 'phyradgs-cl[cpu]' brings PoCL, which runs on the CPU"
+            "OpenCL",
+            "no device",
+            "at least one",
+            "pip install 'phyradgs-cl[cpu]' brings PoCL, which runs on the CPU",
         )
     if wish:
         return _wished(wish, source, devices)
     eligible = [d for d in devices if d.by_default]
     if not eligible:
         names = ", ".join(d.name for d in devices)
-        raise DeviceError("OpenCL", f"only {names}", "a real device", "name one with --device to use it all the same")
+        raise DeviceError(
+            "OpenCL", f"only {names}", "a real device", "name one with --device to use it all the same"
+        )
     best = max(eligible, key=lambda d: d.rank)
     return best, f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
 

@@ -7,14 +7,14 @@ marks, and the compiler's messages keep naming file and line.
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from functools import cache
 
 from phyradgs_cl.resources import resource
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
-@lru_cache(maxsize=None)
+@cache
 def kernel_source(name: str) -> str:
     """The text of ``cl/<name>.cl`` with every header pasted once."""
     pasted: set[str] = set()

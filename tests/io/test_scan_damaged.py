@@ -649,3 +649,14 @@ def test_motion_without_meaning_is_still_said(good, caplog) -> None:
         file[f"{SAMPLE}/x_translation"] = np.zeros(4)
     read_scan(good, counts_to_attenuation)
     assert f"{SAMPLE}/x_translation: not read" in caplog.text
+
+
+def test_a_mask_of_all_projections_is_named_though_a_flat_is_free(tmp_path, make_scan) -> None:
+    scan, path = make_scan(), tmp_path / "scan.h5"
+    data = np.concatenate([np.full((1, 3, 5), 60000), np.full((4, 3, 5), 30000)]).astype(np.uint16)
+    write_scan(path, scan, data=data, image_key=np.array([1, 0, 0, 0, 0]), quantity="counts")
+    mask = np.ones((5, 3, 5), np.uint8)
+    mask[0] = 0
+    with h5py.File(path, "r+") as file:
+        file[f"{DETECTOR}/pixel_mask"] = mask
+    refuses(path, f"{DETECTOR}/pixel_mask", ("every pixel",))

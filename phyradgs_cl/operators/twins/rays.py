@@ -9,7 +9,9 @@ from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 
 
-def joseph_image(volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarray:
+def joseph_image(
+    volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]
+) -> np.ndarray:
     """Line integrals (nv, nu) of a volume (z, y, x) from one pose (12,)."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     source = (pose[:3] - first) / pitch

@@ -32,8 +32,10 @@ def splat_image(
     source = pose[:3]
     to_pixel = pixel_centres(pose, detector_shape) - source
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
-        image += _affine(row, precision, pose, detector_shape, cutoff_sigma) if affine else _exact(
-            row, precision, source, to_pixel, cutoff_sigma
+        image += (
+            _affine(row, precision, pose, detector_shape, cutoff_sigma)
+            if affine
+            else _exact(row, precision, source, to_pixel, cutoff_sigma)
         )
     return image
 
@@ -61,7 +63,11 @@ def _exact(
 
 
 def _affine(
-    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float
+    row: np.ndarray,
+    precision: np.ndarray,
+    pose: np.ndarray,
+    detector_shape: tuple[int, int],
+    cutoff_sigma: float,
 ) -> np.ndarray:
     """R2-Gaussian's splat: covariance through the Jacobian at the centre, ray factor of the central ray."""
     source, eu, ev = pose[:3], pose[6:9], pose[9:12]
@@ -100,7 +106,9 @@ def splat_frame(
     return frame
 
 
-def voxel_field(rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0) -> np.ndarray:
+def voxel_field(
+    rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0
+) -> np.ndarray:
     """The field (nz, ny, nx) of parameter rows (11, G) at axes z, y, x, by direct evaluation."""
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
     volume = np.zeros(points.shape[:3])

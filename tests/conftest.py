@@ -1,0 +1,100 @@
+"""Runtimes and random clouds for all rooms; makes ``tolerances`` importable wherever pytest starts."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
+from phyradgs_cl.acquisition.cells import TimeCells  # noqa: E402
+from phyradgs_cl.runtime import Runtime  # noqa: E402
+
+Cloud = Callable[..., np.ndarray]
+
+
+@pytest.fixture(scope="session")
+def rt() -> Runtime:
+    """The device that the package would choose, as it would drive it."""
+    return Runtime()
+
+
+@pytest.fixture(scope="session", params=["own lanes", "lanes 1", "work-items as lanes", "float pairs"])
+def any_rt(request: pytest.FixtureRequest) -> Runtime:
+    """Every way in which kernels are built: the device's own vectors, scalars, a GPU's work-groups, no float64."""
+    if request.param == "lanes 1":
+        return Runtime(lanes=1)
+    if request.param == "float pairs":
+        return Runtime(fp64=False)
+    runtime = Runtime(lanes=1 if request.param == "work-items as lanes" else None)
+    if request.param == "work-items as lanes":
+        runtime.is_cpu = False  # a GPU's kernels and group sizes, whatever the device
+    return runtime
+
+
+@pytest.fixture(scope="session")
+def make_cloud() -> Cloud:
+    """A factory of parameter rows (11, G) float64: random centres, axes, turns and densities.
+
+    Numbers are rounded to float32, so that kernels and float64 oracles see the same cloud.
+    """
+
+    def make(
+        count: int, seed: int = 0, *, spread: float = 0.6, scale: tuple[float, float] = (0.05, 0.2)
+    ) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        quaternion = rng.normal(size=(4, count))
+        parts = [
+            rng.uniform(-spread, spread, (3, count)),
+            np.exp(rng.uniform(*np.log(scale), (3, count))),
+            quaternion / np.linalg.norm(quaternion, axis=0),
+            rng.uniform(0.5, 2.0, (1, count)),
+        ]
+        return np.concatenate(parts).astype(np.float32).astype(np.float64)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_geometry() -> Callable[..., ConeGeometry]:
+    """A factory of cones whose detector sees a volume of side 2 from a distance of 5."""
+
+    def make(rows: int, columns: int, *, offset: tuple[float, float] = (0.0, 0.0)) -> ConeGeometry:
+        return ConeGeometry(5.0, 7.5, (rows, columns), (3.9 / rows, 4.1 / columns), offset)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def one_cell() -> Callable[..., TimeCells]:
+    """A factory of tables with a single pose (12,) for the whole frame."""
+
+    def make(pose: np.ndarray, lines: int, axis: str = "rows") -> TimeCells:
+        one = np.ones(1)
+        first, last = np.zeros(1, np.int32), np.full(1, lines, np.int32)
+        return TimeCells(np.asarray(pose).reshape(1, 12), 0 * one, first, last, one, lines, axis)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def finite_differences() -> Callable[..., np.ndarray]:
+    """Central differences (shape of ``at``) of a scalar function, one entry after the other."""
+
+    def differentiate(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6) -> np.ndarray:
+        gradient = np.zeros(at.shape)
+        for index in np.ndindex(*at.shape):
+            ends = []
+            for sign in (1, -1):
+                moved = at.copy()
+                moved[index] += sign * step
+                ends.append(function(moved))
+            gradient[index] = (ends[0] - ends[1]) / (2 * step)
+        return gradient
+
+    return differentiate
