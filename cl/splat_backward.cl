@@ -85,11 +85,11 @@ __kernel void splat_backward(
                                 v_sum(u_), v_sum(v_), v_sum(b_), v_sum(bu_), v_sum(bv_)};
         for (int f = 0; f < 10; ++f)
             tree[f * GROUP + item] = mine[f];
-        for (int half = GROUP / 2; half > 0; half /= 2) {
+        for (int reach = GROUP / 2; reach > 0; reach /= 2) {
             barrier(CLK_LOCAL_MEM_FENCE);
-            if (item < half)
+            if (item < reach)
                 for (int f = 0; f < 10; ++f)
-                    tree[f * GROUP + item] += tree[f * GROUP + item + half];
+                    tree[f * GROUP + item] += tree[f * GROUP + item + reach];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int f = item; f < 10; f += GROUP)

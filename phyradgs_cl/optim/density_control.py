@@ -21,7 +21,7 @@ class DensityControl:
     every: int = 100
     start_iteration: int = 500
     stop_fraction: float = 0.75
-    threshold: float = 5e-5
+    threshold: float = 3e-4
     split_scale: float = 0.2
     split_factor: float = 1.6
     prune_density: float = 1e-5

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from phyradgs_cl.acquisition import Motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
-from phyradgs_cl.optim import DensityControl, Rates
+from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,11 @@ class SplatOptions:
         return asdict(self)
 
 
-_RELEASED = SplatOptions(
-    gaussians=50_000,
-    ssim_weight=0.25,
-    tv_weight=0.05,
-    density_weight=0.01,
-    shape_weight=0.02,
-    iterations=20_000,
-)
-_PAPER = SplatOptions(gaussians=50_000, iterations=20_000)
+PUBLISHED_CONTROL = DensityControl(threshold=5e-5)
+_PAPER = SplatOptions(gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL)
+_RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 PRESETS = {"default": SplatOptions(), "paper": _PAPER, "released": _RELEASED}
+# R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
     motion=Motion("static"),
     affine=True,
@@ -83,4 +78,6 @@ R2_PUBLISHED = SplatOptions(
     ssim_weight=0.25,
     tv_weight=0.05,
     density_weight=0.0,
+    rates=PUBLISHED_RATES,
+    control=PUBLISHED_CONTROL,
 )

@@ -23,6 +23,7 @@ from phyradgs_cl.operators.layout import pad_columns, pad_rows, stride_of
 from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
 from phyradgs_cl.reconstructors.fdk import fdk_volume, unmasked_frames
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
+from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, SplatState
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -127,27 +128,25 @@ class SplatRun:
     # --- the loop ---------------------------------------------------------------------------------------
 
     def optimise(self, report: ProgressReport, started: float) -> list[dict[str, float]]:
-        """All iterations; Ctrl-C ends the run after the one under way and keeps what it has."""
+        """All iterations; Ctrl-C (or a report that raises KeyboardInterrupt) ends the run after the one under way."""
         record: list[dict[str, float]] = []
         total = self.options.iterations
-        try:
-            while self.iteration < total:
+        with stop_on_interrupt() as request:
+            while self.iteration < total and self.interrupted_at is None:
                 self.step()
                 if self.iteration % REPORT_EVERY == 0 or self.iteration == total:
-                    loss, seconds = self._checked_loss(), time.perf_counter() - started
-                    record.append(
-                        {
-                            "iteration": self.iteration,
-                            "loss": loss,
-                            "gaussians": self.gaussians.count,
-                            "seconds": seconds,
-                        }
-                    )
-                    report(Progress(self.iteration, total, loss, self.gaussians.count, seconds))
-        except KeyboardInterrupt:
-            self.rt.finish()
-            self.interrupted_at = self.iteration
+                    record.append(self._report(report, started))
+                if request.is_set and self.iteration < total:
+                    self.interrupted_at = self.iteration
         return record
+
+    def _report(self, report: ProgressReport, started: float) -> dict[str, float]:
+        loss, seconds, count = self._checked_loss(), time.perf_counter() - started, self.gaussians.count
+        try:
+            report(Progress(self.iteration, self.options.iterations, loss, count, seconds))
+        except KeyboardInterrupt:
+            self.interrupted_at = self.iteration
+        return {"iteration": self.iteration, "loss": loss, "gaussians": count, "seconds": seconds}
 
     def step(self) -> None:
         """One frame: render, compare, go back, regularise, move, and now and then control the density."""

@@ -29,22 +29,21 @@ def splat_image(
 ) -> np.ndarray:
     """One static projection (nv, nu) of parameter rows (11, G) from one pose (12,)."""
     image = np.zeros(detector_shape)
-    source = pose[:3]
-    to_pixel = pixel_centres(pose, detector_shape) - source
+    to_pixel = pixel_centres(pose, detector_shape) - pose[:3]
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
         image += (
             _affine(row, precision, pose, detector_shape, cutoff_sigma)
             if affine
-            else _exact(row, precision, source, to_pixel, cutoff_sigma)
+            else _exact(row, precision, pose, to_pixel, cutoff_sigma)
         )
     return image
 
 
 def _exact(
-    row: np.ndarray, precision: np.ndarray, source: np.ndarray, to_pixel: np.ndarray, cutoff_sigma: float
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, to_pixel: np.ndarray, cutoff_sigma: float
 ) -> np.ndarray:
-    centre = row[:3] - source
-    normal = np.cross(to_pixel[0, -1] - to_pixel[0, 0], to_pixel[-1, 0] - to_pixel[0, 0])
+    centre = row[:3] - pose[:3]
+    normal = np.cross(pose[6:9], pose[9:12])
     if normal @ centre * (normal @ to_pixel[0, 0]) <= 0:
         return np.zeros(to_pixel.shape[:2])
     kappa = centre @ precision @ centre

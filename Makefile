@@ -1,0 +1,53 @@
+# make demo    simulate a fly-scan, reconstruct it three ways, print a table (minutes on two cores)
+# make test    style, tests on a CPU device; a skipped kernel test is a failure
+# make clean   remove what the two have made
+#
+# Needs python3 >= 3.10 with the module venv; nothing else has to be installed.
+
+PYTHON ?= python3
+VENV   ?= .venv
+OUT    ?= demo
+
+BIN      := $(VENV)/bin
+PHYRADGS := $(BIN)/phyradgs
+CONFIG   := data/demo.toml
+
+.PHONY: demo test clean
+.DELETE_ON_ERROR:
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
+		|| { echo "$(PYTHON) is older than 3.10: choose another with make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+# Both installs are editable, so that the code that runs is the code in this folder.
+$(VENV)/.installed-cpu: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[cpu]"
+	@touch $@
+
+$(VENV)/.installed-test: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[cpu,test]"
+	@touch $@ $(VENV)/.installed-cpu
+
+demo: $(VENV)/.installed-cpu
+	@mkdir -p $(OUT)
+	$(PHYRADGS) devices
+	$(PHYRADGS) simulate --phantom foot --size 64 --detector 128 --protocol rapid --noise tigre --dose 1e4 \
+		--electronic-noise 10 --seed 0 -o $(OUT)/scan.h5
+	$(PHYRADGS) reconstruct $(OUT)/scan.h5 --method fdk -o $(OUT)/fdk.h5
+	$(PHYRADGS) reconstruct $(OUT)/scan.h5 --method phyradgs --motion static --config $(CONFIG) -o $(OUT)/static.h5
+	$(PHYRADGS) reconstruct $(OUT)/scan.h5 --method phyradgs --config $(CONFIG) -o $(OUT)/phyradgs.h5
+	$(PHYRADGS) evaluate $(OUT)/fdk.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/fdk.json
+	$(PHYRADGS) evaluate $(OUT)/static.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/static.json
+	$(PHYRADGS) evaluate $(OUT)/phyradgs.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/phyradgs.json
+	@$(BIN)/python benchmarks/demo_table.py "fdk=$(OUT)/fdk.json" "phyradgs, static=$(OUT)/static.json" \
+		"phyradgs=$(OUT)/phyradgs.json"
+
+test: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/python -m pytest --junit-xml=$(VENV)/junit.xml
+	@$(BIN)/python .ci/no_skips.py $(VENV)/junit.xml
+
+clean:
+	rm -rf $(VENV) $(OUT) build dist

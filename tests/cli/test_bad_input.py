@@ -1,0 +1,184 @@
+"""Bad input: one line that names the culprit, exit status 2, nothing written, an existing output untouched."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+@pytest.fixture(scope="module")
+def good_scan(cli, tmp_path_factory):
+    path = tmp_path_factory.mktemp("good") / "scan.h5"
+    options = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--jitter-deg", "0.1"]
+    assert cli.run(["simulate", *options, "--time-samples", "2", "-o", str(path)]) == 0
+    return path
+
+
+def _replace(path, name, value, **attributes):
+    with h5py.File(path, "r+") as file:
+        old = dict(file[name].attrs) if name in file else {}
+        if name in file:
+            del file[name]
+        if value is not None:
+            dataset = file.create_dataset(name, data=value)
+            dataset.attrs.update({**old, **attributes})
+
+
+def _rename(path, old, new):
+    with h5py.File(path, "r+") as file:
+        file.move(old, new)
+
+
+def _poison(path, name):
+    with h5py.File(path, "r+") as file:
+        file[name][0, 0, 0] = np.nan
+
+
+DETECTOR = "entry/instrument/detector"
+DAMAGE = {
+    "missing data": (lambda p: _replace(p, f"{DETECTOR}/data", None), "detector/data"),
+    "misnamed data": (lambda p: _rename(p, f"{DETECTOR}/data", f"{DETECTOR}/dat"), "detector/data"),
+    "flat data": (lambda p: _replace(p, f"{DETECTOR}/data", np.zeros(7, np.float32)), "detector/data"),
+    "text data": (lambda p: _replace(p, f"{DETECTOR}/data", "projections"), "detector/data"),
+    "NaN in data": (lambda p: _poison(p, f"{DETECTOR}/data"), "detector/data"),
+    "no projection": (lambda p: _replace(p, f"{DETECTOR}/image_key", np.ones(4, np.int32)), "image_key"),
+    "negative pitch": (lambda p: _replace(p, f"{DETECTOR}/x_pixel_size", -0.3), "x_pixel_size"),
+    "zero distance": (lambda p: _replace(p, "entry/instrument/source/distance", 0.0), "source/distance"),
+    "NaN distance": (lambda p: _replace(p, f"{DETECTOR}/distance", np.nan), "detector/distance"),
+    "too few angles": (lambda p: _replace(p, "entry/sample/rotation_angle", np.zeros(3)), "rotation_angle"),
+    "unknown unit": (lambda p: _replace(p, f"{DETECTOR}/x_pixel_size", 0.3, units="furlong"), "x_pixel_size"),
+    "short encoder table": (
+        lambda p: (
+            _replace(p, "entry/phyradgs/kinematics/time_s", np.array([0.0, 1.0])),
+            _replace(p, "entry/phyradgs/kinematics/angle_deg", np.array([0.0, 14.4])),
+        ),
+        "kinematics",
+    ),
+    "empty grid": (lambda p: _replace(p, "entry/phyradgs/grid/shape", np.array([0, 8, 8])), "grid/shape"),
+    "wrong reference": (
+        lambda p: _replace(p, "entry/phyradgs/reference/volume", np.zeros((2, 2, 2))),
+        "reference",
+    ),
+    "wrong axis": (lambda p: _replace(p, "entry/phyradgs/readout_axis", "diagonal"), "readout_axis"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_scans(cli, good_scan, tmp_path, capfd, name):
+    damage, culprit = DAMAGE[name]
+    scan = tmp_path / "scan.h5"
+    shutil.copy(good_scan, scan)
+    damage(scan)
+    _expect_refusal(cli, capfd, tmp_path, ["reconstruct", str(scan), "--iterations", "2"], culprit)
+
+
+OPTIONS = {
+    "no such scan": (["reconstruct", "{tmp}/none.h5"], "none.h5"),
+    "not HDF5": (["reconstruct", "{text}"], "text.h5"),
+    "no such device": (["reconstruct", "{scan}", "--device", "abacus"], "abacus"),
+    "no such method": (["reconstruct", "{scan}", "--method", "magic"], "--method"),
+    "no such motion": (["reconstruct", "{scan}", "--motion", "wobble"], "--motion"),
+    "strips without micro-views": (
+        ["reconstruct", "{scan}", "--motion", "static", "--strips", "4"],
+        "--strips",
+    ),
+    "no strips": (["reconstruct", "{scan}", "--strips", "0"], "strips"),
+    "negative iterations": (["reconstruct", "{scan}", "--iterations", "-5"], "--iterations"),
+    "iterations of fdk": (["reconstruct", "{scan}", "--method", "fdk", "--iterations", "5"], "iterations"),
+    "micro-views of fdk": (
+        ["reconstruct", "{scan}", "--method", "fdk", "--motion", "micro-views"],
+        "--motion",
+    ),
+    "no such preset": (["reconstruct", "{scan}", "--preset", "best"], "--preset"),
+    "negative seed": (["reconstruct", "{scan}", "--seed", "-1"], "seed"),
+    "missing config": (["reconstruct", "{scan}", "--config", "{tmp}/none.toml"], "none.toml"),
+    "config that is not TOML": (["reconstruct", "{scan}", "--config", "{text}"], "text.h5"),
+    "resume without checkpoint": (["reconstruct", "{scan}", "--resume"], "--resume"),
+    "unknown option": (["reconstruct", "{scan}", "--iteration-count", "5"], "--iteration-count"),
+    "no such phantom": (["simulate", "--phantom", "elephant"], "--phantom"),
+    "no such volume": (["simulate", "--volume", "{tmp}/none.h5"], "none.h5"),
+    "phantom and volume": (["simulate", "--phantom", "foot", "--volume", "{scan}"], "--volume"),
+    "no such scanner": (["simulate", "--scanner", "r3"], "r3"),
+    "no views": (["simulate", "--views", "0"], "views"),
+    "negative exposure": (["simulate", "--exposure-deg", "-3"], "exposure"),
+    "no dose": (["simulate", "--noise", "beer", "--dose", "0", "--size", "8", "--detector", "8"], "--dose"),
+    "bad offset": (["simulate", "--detector-offset", "left"], "--detector-offset"),
+    "bad size": (["simulate", "--size", "-4", "--detector", "8"], ""),
+    "wrong direction": (
+        ["simulate", "--readout-direction", "2", "--size", "8", "--detector", "8"],
+        "direction",
+    ),
+    "a word for a number": (["simulate", "--views", "many"], "--views"),
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_wrong_options(cli, good_scan, tmp_path, capfd, name):
+    arguments, culprit = OPTIONS[name]
+    text = tmp_path / "text.h5"
+    text.write_text("this is [not a table")
+    filled = [a.format(tmp=tmp_path, scan=good_scan, text=text) for a in arguments]
+    _expect_refusal(cli, capfd, tmp_path, filled, culprit)
+
+
+CONFIGS = {
+    "unknown key": ("iteration = 5", "iteration"),
+    "text for a number": ("iterations = 'many'", "iterations"),
+    "half a Gaussian": ("gaussians = 10.5", "gaussians"),
+    "number for a table": ("rates = 3", "rates"),
+    "short pair": ("[rates]\nposition = [1e-3]", "position"),
+    "boolean weight": ("tv_weight = true", "tv_weight"),
+}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_wrong_configs(cli, good_scan, tmp_path, capfd, name):
+    text, culprit = CONFIGS[name]
+    config = tmp_path / "run.toml"
+    config.write_text(text)
+    _expect_refusal(cli, capfd, tmp_path, ["reconstruct", str(good_scan), "--config", str(config)], culprit)
+
+
+def test_outputs_that_cannot_be_written(cli, good_scan, tmp_path, capfd):
+    for output in (tmp_path / "nowhere" / "volume.h5", tmp_path):
+        for arguments in (
+            ["reconstruct", str(good_scan), "--method", "fdk"],
+            ["simulate", "--size", "8", "--detector", "8"],
+        ):
+            assert cli.run([*arguments, "-o", str(output)]) == 2
+            line = capfd.readouterr().err
+            assert line.count("\n") == 1
+            assert str(output) in line or str(output.parent) in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_scan_is_never_overwritten_by_its_volume(cli, good_scan, tmp_path, capfd):
+    scan = tmp_path / "scan.h5"
+    shutil.copy(good_scan, scan)
+    before = scan.read_bytes()
+    assert cli.run(["reconstruct", str(scan), "-o", str(scan), "--method", "fdk"]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert scan.read_bytes() == before
+
+
+def _expect_refusal(cli, capfd, folder, arguments, culprit):
+    output = folder / "existing.h5"
+    output.write_bytes(b"an older result")
+    before = sorted(p.name for p in folder.iterdir())
+    capfd.readouterr()
+    assert cli.run([*arguments, "-o", str(output)]) == 2
+    captured = capfd.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.strip()]
+    assert len(lines) == 1, captured.err
+    assert culprit in lines[0]
+    assert "Traceback" not in captured.err
+    assert output.read_bytes() == b"an older result"
+    assert sorted(p.name for p in folder.iterdir()) == before

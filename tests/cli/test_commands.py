@@ -1,0 +1,199 @@
+"""The commands, run as a user would, in a process of their own or through the same entry point."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+
+SIMULATE = [
+    "simulate",
+    "--phantom",
+    "jaw",
+    "--size",
+    "16",
+    "--detector",
+    "24",
+    "--views",
+    "6",
+    "--time-samples",
+    "4",
+]
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+@pytest.fixture(scope="module")
+def scan(cli, tmp_path_factory):
+    path = tmp_path_factory.mktemp("scan") / "scan.h5"
+    assert cli.run([*SIMULATE, "--noise", "tigre", "-o", str(path)]) == 0
+    return path
+
+
+def test_help_shows_every_command_with_an_example(cli, capsys):
+    for command in ("simulate", "reconstruct", "evaluate", "info", "devices"):
+        assert cli.run([command, "--help"]) == 0
+        assert f"Example: phyradgs {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--method", "fdk"],
+        ["--method", "r2", "--iterations", "30"],
+        ["--method", "phyradgs", "--motion", "static", "--iterations", "30"],
+        ["--iterations", "30", "--strips", "3", "--sub-intervals", "2"],
+    ],
+)
+def test_each_method_writes_a_volume_that_evaluates(cli, scan, tmp_path, capsys, options):
+    output = tmp_path / "volume.h5"
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), *options]) == 0
+    capsys.readouterr()
+    assert cli.run(["evaluate", str(output), "--reference", str(scan), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert np.isfinite(facts["psnr_db"])
+    assert 0 < facts["ssim"] <= 1
+    assert Path(facts["picture"]).stat().st_size > 1000
+    assert cli.run(["info", str(output)]) == 0
+    assert "voxel size mm" in capsys.readouterr().out
+
+
+def test_columns_and_intensity_and_jitter_are_simulated(cli, tmp_path):
+    path = tmp_path / "scan.h5"
+    options = [
+        "--readout",
+        "columns",
+        "--readout-direction",
+        "-1",
+        "--detector-model",
+        "intensity",
+        "--jitter-deg",
+        "0.2",
+    ]
+    assert (
+        cli.run(
+            [
+                *SIMULATE,
+                *options,
+                "--noise",
+                "beer",
+                "--peak",
+                "3",
+                "--detector-offset",
+                "0.1,-0.2",
+                "-o",
+                str(path),
+            ]
+        )
+        == 0
+    )
+    with h5py.File(path) as file:
+        own = file["entry/phyradgs"]
+        assert own["readout_axis"][()].decode() == "columns"
+        assert own["readout_direction"][()] == -1
+        assert own["detector_model"][()].decode() == "intensity"
+        assert "kinematics" in own
+    assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "v.h5"), "--iterations", "5"]) == 0
+
+
+def test_simulating_twice_with_one_seed_gives_the_same_frames(cli, tmp_path):
+    frames = []
+    for run, seed in enumerate((3, 3, 4)):
+        path = tmp_path / f"{run}.h5"
+        assert cli.run([*SIMULATE, "--noise", "tigre", "--seed", str(seed), "-o", str(path)]) == 0
+        with h5py.File(path) as file:
+            frames.append(file["entry/instrument/detector/data"][()])
+    np.testing.assert_array_equal(frames[0], frames[1])
+    assert np.abs(frames[0] - frames[2]).max() > 0
+
+
+def test_the_command_line_wins_over_the_config_file(cli, scan, tmp_path):
+    config = tmp_path / "run.toml"
+    config.write_text("iterations = 7\ngaussians = 50\nmotion = 'static'\n[rates]\nposition = [1e-3, 1e-4]\n")
+    output = tmp_path / "volume.h5"
+    assert (
+        cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config), "--iterations", "4"])
+        == 0
+    )
+    with h5py.File(output) as file:
+        options = json.loads(file["entry/provenance/json"][()])["options"]
+    assert options["iterations"] == 4
+    assert options["gaussians"] == 50
+    assert options["motion"]["name"] == "static"
+    assert options["rates"]["position"] == [1e-3, 1e-4]
+
+
+def test_volume_files_are_simulated_at_their_own_resolution(cli, tmp_path):
+    source = tmp_path / "bare.h5"
+    volume = np.zeros((24, 24, 24), np.uint8)
+    volume[6:18, 8:16, 9:15] = 200
+    with h5py.File(source, "w") as file:
+        file["volume"] = volume
+    path = tmp_path / "scan.h5"
+    options = [
+        "--volume",
+        str(source),
+        "--size",
+        "12",
+        "--detector",
+        "20",
+        "--views",
+        "4",
+        "--protocol",
+        "static",
+    ]
+    assert cli.run(["simulate", *options, "-o", str(path)]) == 0
+    with h5py.File(path) as file:
+        reference = file["entry/phyradgs/reference/volume"][()]
+    block = (volume / 255).reshape(12, 2, 12, 2, 12, 2).mean((1, 3, 5))
+    np.testing.assert_allclose(reference, block, atol=1e-6)
+
+
+def test_ctrl_c_keeps_the_volume_and_resume_ends_with_the_same_bits(cli, scan, tmp_path):
+    whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
+    common = ["--iterations", "600", "--gaussians", "400"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(whole), *common]) == 0
+    command = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(stopped), *common]
+    started = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    time.sleep(2.5)
+    started.send_signal(signal.SIGINT)
+    _, errors = started.communicate(timeout=120)
+    if started.returncode == 130 and stopped.exists():
+        assert "--resume" in errors
+        assert Path(f"{stopped}.checkpoint.npz").exists()
+        assert cli.run(["reconstruct", str(scan), "-o", str(stopped), *common, "--resume"]) == 0
+    else:  # the signal came before the first or after the last iteration: then nothing, or everything, is there
+        assert started.returncode in (0, 130)
+        if not stopped.exists():
+            assert cli.run(["reconstruct", str(scan), "-o", str(stopped), *common]) == 0
+    assert not Path(f"{stopped}.checkpoint.npz").exists()
+    with h5py.File(whole) as a, h5py.File(stopped) as b:
+        np.testing.assert_array_equal(
+            a["entry/reconstruction/volume"][()], b["entry/reconstruction/volume"][()]
+        )
+
+
+def test_devices_names_the_choice_and_the_reason(cli, capsys):
+    assert cli.run(["devices"]) == 0
+    text = capsys.readouterr().out
+    assert "vector width" in text
+    assert "takes" in text
+
+
+def test_the_module_runs_outside_the_repository(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(Path(load_cli().__file__).parent)}
+    command = [sys.executable, "-m", "phyradgs_cl", "--version"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stdout.startswith("phyradgs-cl ")

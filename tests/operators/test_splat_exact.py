@@ -1,0 +1,187 @@
+"""The splat kernels against their float64 twin: one Gaussian at a time on 512², then clouds and odd cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import CUTOFF_EDGE_SIGMA, SPLAT_AFFINE, SPLAT_CLOUD, SPLAT_COMPACT, SPLAT_NEEDLE
+
+from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, SplatProjector
+from phyradgs_cl.operators.layout import projection_matrices, unpad_rows
+from phyradgs_cl.operators.twins.splat import splat_image
+from phyradgs_cl.runtime import Runtime
+
+SIDE = 512
+CROP = 32
+LARGE = ConeGeometry(5.0, 7.5, (SIDE, SIDE), (3.9 / SIDE, 4.1 / SIDE))
+PIXEL_AT_AXIS = LARGE.pixel_size_mm[0] / LARGE.magnification
+
+
+def render(rt: Runtime, rows: np.ndarray, table, shape: tuple[int, int], **options: object) -> np.ndarray:
+    return SplatProjector(rt, *shape, **options).project(rows, DeviceCells.upload(rt, table))
+
+
+def random_gaussian(rng: np.random.Generator, smallest_px: tuple[float, float], aspect: float) -> np.ndarray:
+    """One Gaussian (11, 1) whose smallest axis covers so many pixels and whose longest is ``aspect`` times that."""
+    smallest = np.exp(rng.uniform(*np.log(smallest_px))) * PIXEL_AT_AXIS
+    ratio = np.array([1.0, aspect ** rng.uniform(), aspect])
+    quaternion = rng.normal(size=4)
+    scale = rng.permutation(smallest * ratio)
+    row = [rng.uniform(-0.6, 0.6, 3), scale, quaternion / np.linalg.norm(quaternion), rng.uniform(0.5, 2, 1)]
+    return np.concatenate(row).astype(np.float32).astype(np.float64)[:, None]
+
+
+def centre_on_detector(rows: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
+    """Row and column, as fractions, where the Gaussian's centre is seen."""
+    x, y, z = projection_matrices(pose[None]).reshape(3, 4) @ np.append(rows[:3, 0], 1.0)
+    return float(y / z), float(x / z)
+
+
+def part_of(pose: np.ndarray, first: tuple[float, float], step: int) -> np.ndarray:
+    """The pose of a detector that has every ``step``-th pixel from ``first`` (row, column) on."""
+    part = pose.copy()
+    part[3:6] += first[0] * pose[9:12] + first[1] * pose[6:9]
+    part[6:12] *= step
+    return part
+
+
+def error_of_peak(image: np.ndarray, rows: np.ndarray, pose: np.ndarray) -> float:
+    """Largest deviation from the twin in a crop about the centre and on a coarse net over all, over the peak.
+
+    The peak is the ray's through the centre: no pixel may lie on a Gaussian much smaller than a pixel.
+    """
+    centre = centre_on_detector(rows, pose)
+    peak = splat_image(rows, part_of(pose, centre, 1), (1, 1))[0, 0]
+    v, u = (int(np.clip(at - CROP / 2, 0, SIDE - CROP)) for at in centre)
+    near = splat_image(rows, part_of(pose, (v, u), 1), (CROP, CROP))
+    far = splat_image(rows, part_of(pose, (0, 0), 16), (SIDE // 16, SIDE // 16))
+    errors = np.abs(image[v : v + CROP, u : u + CROP] - near).max(), np.abs(image[::16, ::16] - far).max()
+    return float(max(errors) / peak)
+
+
+@pytest.mark.parametrize(
+    ("smallest_px", "aspects", "tolerance"),
+    [
+        ((0.5, 15.0), (1.0, 3.0, 10.0), SPLAT_COMPACT),
+        ((0.1, 1.0), (30.0, 100.0, 300.0, 1000.0), SPLAT_NEEDLE),
+        ((0.02, 0.3), (1.0, 10.0, 1000.0), SPLAT_NEEDLE),
+    ],
+    ids=["compact", "needles", "below a pixel"],
+)
+def test_single_gaussians_on_512_pixels(any_rt, one_cell, smallest_px, aspects, tolerance) -> None:
+    rng = np.random.default_rng(11)
+    projector = SplatProjector(any_rt, SIDE, SIDE, cutoff_sigma=0.0)
+    for aspect in aspects:
+        for _ in range(6):
+            pose = LARGE.pose(rng.uniform(0, 2 * np.pi))
+            rows = random_gaussian(rng, smallest_px, aspect)
+            image = projector.project(rows, DeviceCells.upload(any_rt, one_cell(pose, SIDE)))
+            assert error_of_peak(image, rows, pose) <= tolerance, rows[:, 0]
+
+
+SHAPES = [(61, 77), (17, 5), (1, 1), (1, 33), (40, 1)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("affine", [False, True])
+def test_clouds_on_odd_detectors(any_rt, one_cell, make_cloud, make_geometry, shape, affine) -> None:
+    rows, pose = make_cloud(7, 1), make_geometry(*shape, offset=(0.1, -0.2)).pose(0.4)
+    image = render(any_rt, rows, one_cell(pose, shape[0]), shape, affine=affine, cutoff_sigma=0.0)
+    expected = splat_image(rows, pose, shape, affine=affine)
+    tolerance = SPLAT_AFFINE if affine else SPLAT_CLOUD
+    np.testing.assert_allclose(image, expected, rtol=0, atol=tolerance * expected.max())
+
+
+@pytest.mark.parametrize("affine", [False, True])
+def test_cutoff_means_the_same_as_in_the_twin(any_rt, one_cell, make_cloud, make_geometry, affine) -> None:
+    rows, pose, shape = make_cloud(9, 2, scale=(0.02, 0.3)), make_geometry(61, 77).pose(1.1), (61, 77)
+    image = render(any_rt, rows, one_cell(pose, 61), shape, affine=affine)
+    low, high = (
+        splat_image(rows, pose, shape, DEFAULT_CUTOFF_SIGMA + edge, affine)
+        for edge in (-CUTOFF_EDGE_SIGMA, CUTOFF_EDGE_SIGMA)
+    )
+    slack = SPLAT_CLOUD * high.max()
+    assert np.all(image >= low - slack) and np.all(image <= high + slack)
+    assert (high > 0).mean() < 1  # the cutoff leaves pixels without any splat
+    np.testing.assert_array_equal(image[high == 0], 0)
+
+
+def test_exact_and_affine_differ_for_large_gaussians(rt, one_cell, make_cloud, make_geometry) -> None:
+    rows, pose = make_cloud(5, 3, scale=(0.2, 0.4)), make_geometry(40, 40).pose(0.2)
+    exact, affine = (render(rt, rows, one_cell(pose, 40), (40, 40), affine=a, cutoff_sigma=0.0) for a in (False, True))
+    assert np.abs(exact - affine).max() > 3e-3 * exact.max()  # design: 1.7 to 3.4 % for large ones
+
+
+def test_no_gaussian_gives_an_empty_frame(any_rt, one_cell, make_geometry) -> None:
+    pose = make_geometry(9, 11).pose(0.0)
+    image = render(any_rt, np.zeros((11, 0)), one_cell(pose, 9), (9, 11))
+    np.testing.assert_array_equal(image, np.zeros((9, 11), np.float32))
+
+
+@pytest.mark.parametrize("cutoff_sigma", [0.0, DEFAULT_CUTOFF_SIGMA])
+def test_one_gaussian(any_rt, one_cell, make_cloud, make_geometry, cutoff_sigma) -> None:
+    rows, pose = make_cloud(1, 4, spread=0.1, scale=(0.1, 0.2)), make_geometry(23, 19).pose(2.0)
+    image = render(any_rt, rows, one_cell(pose, 23), (23, 19), cutoff_sigma=cutoff_sigma)
+    expected = splat_image(rows, pose, (23, 19), cutoff_sigma)
+    np.testing.assert_allclose(image, expected, rtol=0, atol=SPLAT_CLOUD * expected.max())
+
+
+def test_off_the_detector_only_the_tail_is_seen(any_rt, one_cell, make_cloud, make_geometry) -> None:
+    rows, pose = make_cloud(1, 5, scale=(0.1, 0.1)), make_geometry(20, 20).pose(0.0)
+    rows[:3, 0] = 0.0, 1.6, 0.0  # the detector sees up to 1.37 at the axis
+    tail = render(any_rt, rows, one_cell(pose, 20), (20, 20))
+    expected = splat_image(rows, pose, (20, 20), DEFAULT_CUTOFF_SIGMA)
+    assert expected.max() > 0
+    np.testing.assert_allclose(tail, expected, rtol=0, atol=SPLAT_CLOUD * rows[10, 0])
+    rows[1, 0] = 3.0
+    np.testing.assert_array_equal(render(any_rt, rows, one_cell(pose, 20), (20, 20)), 0)
+
+
+@pytest.mark.parametrize("affine", [False, True])
+@pytest.mark.parametrize("cutoff_sigma", [0.0, DEFAULT_CUTOFF_SIGMA])
+def test_behind_the_source_nothing_is_seen(
+    any_rt, one_cell, make_cloud, make_geometry, cutoff_sigma, affine
+) -> None:
+    rows, pose = make_cloud(2, 6), make_geometry(20, 20).pose(0.0)
+    alone = rows[:, :1].copy()
+    rows[:3, 1] = 9.0, 0.1, 0.2  # the source is at x = 5
+    options = {"cutoff_sigma": cutoff_sigma, "affine": affine}
+    both = render(any_rt, rows, one_cell(pose, 20), (20, 20), **options)
+    np.testing.assert_array_equal(both, render(any_rt, alone, one_cell(pose, 20), (20, 20), **options))
+    assert both.max() > 0
+
+
+@pytest.mark.parametrize("x", [4.8, 5.0, 5.2, 4.0, 3.0])
+def test_an_ellipsoid_across_the_source_plane_stays_finite(any_rt, one_cell, make_cloud, make_geometry, x) -> None:
+    """At 3.7 σ those nearer than 1.85 contain a point at the source's own depth: they are not drawn."""
+    rows, pose = make_cloud(1, 7, scale=(0.5, 0.5)), make_geometry(20, 20).pose(0.0)
+    rows[:3, 0] = x, 0.05, -0.03
+    image = render(any_rt, rows, one_cell(pose, 20), (20, 20))
+    expected = splat_image(rows, pose, (20, 20), DEFAULT_CUTOFF_SIGMA)
+    assert (expected.max() > 0) == (x == 3.0)
+    np.testing.assert_allclose(image, expected, rtol=0, atol=SPLAT_CLOUD * max(expected.max(), 1.0))
+    assert np.all(np.isfinite(render(any_rt, rows, one_cell(pose, 20), (20, 20), cutoff_sigma=0.0)))
+
+
+def test_needle_bounding_boxes_hold_their_ellipse(any_rt, one_cell, make_geometry) -> None:
+    """A needle at 22.5° across the detector: the box must reach its far ends, every tile in between too."""
+    rows = np.array([[0.01, 0.02, -0.01, 0.0005, 0.25, 0.0005, *np.cos([np.pi / 16, np.pi * 7 / 16]), 0, 0, 1.0]]).T
+    pose = LARGE.pose(0.0)
+    image = render(any_rt, rows, one_cell(pose, SIDE), (SIDE, SIDE))
+    low, high = (splat_image(rows, pose, (SIDE, SIDE), DEFAULT_CUTOFF_SIGMA + e) for e in (-1e-3, 1e-3))
+    columns = np.flatnonzero(high.any(axis=0))
+    assert columns.size > 150 and np.ptp(columns) > 300  # long, and thinner than a pixel
+    slack = SPLAT_NEEDLE * high.max()
+    assert np.all(image >= low - slack) and np.all(image <= high + slack)
+
+
+def test_padding_stays_zero(any_rt, one_cell, make_cloud, make_geometry) -> None:
+    """Other kernels read past the ends of lines and count on zeros there."""
+    shape = (11, 21)
+    projector = SplatProjector(any_rt, *shape)
+    rows, pose = make_cloud(6, 8), make_geometry(*shape).pose(0.3)
+    image = projector.project(rows, DeviceCells.upload(any_rt, one_cell(pose, 11)))
+    flat = any_rt.download(projector.image)
+    assert np.count_nonzero(flat) == np.count_nonzero(image) > 0
+    np.testing.assert_array_equal(unpad_rows(flat, shape), image)

@@ -1,0 +1,162 @@
+"""Multi-pose batch rendering: one launch an operator for all micro-views of a frame, equal to Eq. 3 written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import BRUTE_FORCE, MERGED_FRAME, MICRO_VIEWS_FINE, MICRO_VIEWS_ORDER, STANDING_PICTURE
+
+from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
+from phyradgs_cl.operators.layout import pad_rows
+from phyradgs_cl.operators.twins.splat import splat_frame, splat_image
+from phyradgs_cl.runtime import Runtime
+
+SHAPE = (13, 18)
+START_S = 0.4
+AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
+DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
+
+
+@pytest.fixture
+def orbit(make_geometry) -> CircularOrbit:
+    return CircularOrbit(make_geometry(*SHAPE, offset=(0.1, 0.2)), ConstantSpeed(0.3, 0.6))
+
+
+def render(rt: Runtime, rows: np.ndarray, table: TimeCells, **options: object) -> np.ndarray:
+    lines, width = SHAPE if table.axis == "rows" else SHAPE[::-1]
+    frame = SplatProjector(rt, lines, width, **options).project(rows, DeviceCells.upload(rt, table))
+    return frame if table.axis == "rows" else frame.T
+
+
+def unfused(rows: np.ndarray, orbit: CircularOrbit, shutter: Shutter, strips: int, sub_intervals: int) -> np.ndarray:
+    """Eq. 2 and 3 with loops: render every micro-view, average over k, cut line r out of strip ⌊r·M/H⌋."""
+    lines = shutter.lines(SHAPE)
+    frame = np.zeros(SHAPE)
+    for j in range(strips):
+        mean = np.zeros(SHAPE)
+        for k in range(sub_intervals):
+            t = START_S + (j + 0.5) / strips * shutter.readout_s + (k + 0.5) / sub_intervals * shutter.exposure_s
+            mean += splat_image(rows, orbit.pose(0, np.array(t)), SHAPE) / sub_intervals
+        for order in range(lines):
+            if order * strips // lines == j:
+                line = order if shutter.direction > 0 else lines - 1 - order
+                where = (line, slice(None)) if shutter.axis == "rows" else (slice(None), line)
+                frame[where] = mean[where]
+    return frame
+
+
+@AXES
+@DIRECTIONS
+@pytest.mark.parametrize(("strips", "sub_intervals"), [(1, 1), (4, 3), (13, 1), (5, 2), (25, 2), (1, 4)])
+def test_fused_equals_unfused(rt, make_cloud, orbit, axis, direction, strips, sub_intervals) -> None:
+    rows, shutter = make_cloud(4, 31), Shutter(0.5, 0.4, axis, direction)
+    table = micro_view_cells(orbit, shutter, 0, START_S, shutter.lines(SHAPE), strips, sub_intervals)
+    expected = unfused(rows, orbit, shutter, strips, sub_intervals)
+    np.testing.assert_allclose(
+        render(rt, rows, table, cutoff_sigma=0.0), expected, rtol=0, atol=MERGED_FRAME * expected.max()
+    )
+    twin = splat_frame(rows, table, SHAPE)
+    np.testing.assert_allclose(twin, expected, rtol=0, atol=1e-12)
+
+
+def test_fused_in_every_build(any_rt, make_cloud, orbit) -> None:
+    rows, shutter = make_cloud(4, 32), Shutter(0.5, 0.4, "columns", -1)
+    table = micro_view_cells(orbit, shutter, 0, START_S, SHAPE[1], 7, 3)
+    expected = unfused(rows, orbit, shutter, 7, 3)
+    np.testing.assert_allclose(
+        render(any_rt, rows, table, cutoff_sigma=0.0), expected, rtol=0, atol=MERGED_FRAME * expected.max()
+    )
+
+
+@AXES
+def test_no_exposure_and_no_readout_is_static(rt, make_cloud, orbit, axis) -> None:
+    rows, shutter = make_cloud(4, 33), Shutter(0.0, 0.0, axis)
+    where = (orbit, shutter, 0, START_S, shutter.lines(SHAPE))
+    static = render(rt, rows, static_cells(*where))
+    frame = render(rt, rows, micro_view_cells(*where, 5, 3))
+    np.testing.assert_allclose(frame, static, rtol=0, atol=STANDING_PICTURE * static.max())
+
+
+def test_without_readout_strips_do_not_matter(rt, make_cloud, orbit) -> None:
+    rows, shutter = make_cloud(4, 34), Shutter(0.7, 0.0)
+    one, many = (
+        render(rt, rows, micro_view_cells(orbit, shutter, 0, START_S, SHAPE[0], strips, 4)) for strips in (1, 6)
+    )
+    np.testing.assert_allclose(many, one, rtol=0, atol=STANDING_PICTURE * one.max())
+    static = render(rt, rows, static_cells(orbit, shutter, 0, START_S, SHAPE[0]))
+    assert np.abs(one - static).max() > 0.01 * one.max()  # the exposure does matter
+
+
+@AXES
+@DIRECTIONS
+def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axis, direction) -> None:
+    """Static projections at hundreds of times, each line averaging those within its own window."""
+    shutter = Shutter(0.3, 0.4, axis, direction)
+    lines, fine = shutter.lines(SHAPE), 24
+    rows = make_cloud(3, 35)
+    step_s = shutter.readout_s / (lines - 1)  # one line's delay, cut in ``fine`` / exposure lines below
+    exposure_lines = 9
+    shutter = Shutter(exposure_lines * step_s, shutter.readout_s, axis, direction)
+    times = START_S + (np.arange((lines - 1 + exposure_lines) * fine) + 0.5) / fine * step_s
+    images = np.stack([splat_image(rows, pose, SHAPE) for pose in orbit.pose(0, times)])
+    assert len(images) > 400
+    brute = np.zeros(SHAPE)
+    for line in range(lines):
+        first = (line if direction > 0 else lines - 1 - line) * fine
+        mean = images[first : first + exposure_lines * fine].mean(axis=0)
+        where = (line, slice(None)) if axis == "rows" else (slice(None), line)
+        brute[where] = mean[where]
+
+    where = (orbit, shutter, 0, START_S, lines)
+    exact = render(rt, rows, per_line_cells(*where, exposure_lines * fine), cutoff_sigma=0.0)
+    np.testing.assert_allclose(exact, brute, rtol=0, atol=BRUTE_FORCE * brute.max())
+
+    def error(strips: int, sub_intervals: int) -> float:
+        frame = render(rt, rows, micro_view_cells(*where, strips, sub_intervals), cutoff_sigma=0.0)
+        return float(np.abs(frame - brute).max() / brute.max())
+
+    coarse, fine_error = error(1, 1), error(lines, 12)
+    assert fine_error <= MICRO_VIEWS_FINE
+    assert coarse >= MICRO_VIEWS_ORDER * fine_error
+
+
+def test_an_axially_symmetric_cloud_does_not_move(rt, make_geometry) -> None:
+    """Turning bodies on the axis: fly-scan and static show the same picture."""
+    heights = np.array([-0.5, 0.0, 0.4])
+    rows = np.zeros((11, 3))
+    rows[2], rows[3:5], rows[5], rows[6], rows[10] = heights, [0.1, 0.3, 0.2], [0.2, 0.1, 0.3], 1.0, [1.0, 0.5, 2.0]
+    orbit = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 0.6))
+    shutter = Shutter(0.5, 0.4)
+    where = (orbit, shutter, 0, START_S, SHAPE[0])
+    static = render(rt, rows, static_cells(*where), cutoff_sigma=0.0)
+    for table in (micro_view_cells(*where, 4, 5), per_line_cells(*where, 3)):
+        frame = render(rt, rows, table, cutoff_sigma=0.0)
+        np.testing.assert_allclose(frame, static, rtol=0, atol=STANDING_PICTURE * static.max())
+
+
+def test_launches_do_not_grow_with_the_micro_views(rt, make_cloud, orbit, monkeypatch) -> None:
+    """Preparation, gather and both adjoint passes once a frame, 1 micro-view or 40 (no serial loop)."""
+    launched: list[str] = []
+    launch = Runtime.launch
+
+    def counting(self, kernel, items, *args, group=1):
+        launched.append(kernel.function_name)
+        launch(self, kernel, items, *args, group=group)
+
+    monkeypatch.setattr(Runtime, "launch", counting)
+    counts = []
+    for strips, sub_intervals in ((1, 1), (8, 5)):
+        table = micro_view_cells(orbit, Shutter(0.5, 0.4), 0, START_S, SHAPE[0], strips, sub_intervals)
+        assert table.count == strips * sub_intervals
+        launched.clear()
+        projector, cells = SplatProjector(rt, *SHAPE), DeviceCells.upload(rt, table)
+        gaussians = DeviceGaussians.upload(rt, make_cloud(4, 36))
+        projector.forward(gaussians, cells)
+        gradients = rt.zeros((13, gaussians.stride))
+        projector.backward(gaussians, cells, rt.upload(pad_rows(np.ones(SHAPE))), gradients)
+        counts.append(list(launched))
+    assert counts[0] == counts[1]
+    for kernel in ("splat_prepare", "splat_forward", "splat_backward", "splat_chain"):
+        assert counts[1].count(kernel) == 1

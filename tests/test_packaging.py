@@ -1,0 +1,102 @@
+"""What an installation needs travels with it: kernels, data and command line, in a wheel as in a checkout."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from phyradgs_cl.resources import resource
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+MOST_BYTES = 500_000  # kernels, code and small TOML files; nothing measured or rendered
+
+
+def tracked(folder: str, pattern: str) -> set[str]:
+    """Names below a folder of the repository that match, as the wheel must have them."""
+    root = REPOSITORY / folder
+    return {f"{folder}/{path.relative_to(root).as_posix()}" for path in root.rglob(pattern)}
+
+
+NEEDED = tracked("cl", "*.cl") | tracked("cl", "*.h") | tracked("data", "*.toml") | {"cli.py"}
+
+
+def build(target: str, folder: Path) -> Path:
+    """Build the wheel or sdist of this repository without any download."""
+    pytest.importorskip("hatchling")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (built,) = folder.iterdir()
+    return built
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("wheel", tmp_path_factory.mktemp("wheel"))
+
+
+def test_this_installation_finds_its_resources() -> None:
+    assert len(tracked("cl", "*.cl")) > 10
+    for name in NEEDED:
+        assert resource(name.split("/")[0]).exists()
+    assert (resource("cl") / "splat_forward.cl").is_file()
+    assert (resource("data") / "demo.toml").is_file()
+
+
+def test_a_missing_resource_is_named() -> None:
+    with pytest.raises(FileNotFoundError, match="nothing-here is missing"):
+        resource("nothing-here")
+
+
+def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    assert {f"phyradgs_cl/{name}" for name in NEEDED} <= names
+    modules = {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "phyradgs_cl").rglob("*.py")}
+    assert modules <= names
+    outside = [n for n in names if not n.startswith(("phyradgs_cl/", "phyradgs_cl-"))]
+    assert not outside, "the wheel would install more than one package"
+    assert not [n for n in names if "__pycache__" in n]
+
+
+def test_the_wheel_is_small(wheel: Path) -> None:
+    assert wheel.stat().st_size < MOST_BYTES
+
+
+def test_the_wheel_has_a_script_and_a_licence(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        by_name = {name.rsplit("/", 1)[-1]: name for name in archive.namelist() if ".dist-info/" in name}
+        assert "phyradgs = phyradgs_cl.__main__:main" in archive.read(by_name["entry_points.txt"]).decode()
+        assert "Apache License" in archive.read(by_name["LICENSE"]).decode()
+
+
+def test_the_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> None:
+    site, elsewhere = tmp_path / "site", tmp_path / "a folder with spaces"
+    elsewhere.mkdir()
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    for arguments, expected in (
+        (["-c", "from phyradgs_cl.resources import resource; print(resource('cl'))"], str(site)),
+        (["-c", "from phyradgs_cl.runtime.source import kernel_source as s; print(s('rays'))"], "__kernel"),
+        (["-m", "phyradgs_cl", "--help"], "reconstruct"),
+    ):
+        command = [sys.executable, *arguments]
+        done = subprocess.run(
+            command, cwd=elsewhere, env=environment, capture_output=True, text=True, timeout=120
+        )
+        assert done.returncode == 0, done.stderr
+        assert expected in done.stdout
+
+
+def test_the_sdist_can_build_the_wheel(tmp_path: Path) -> None:
+    with tarfile.open(build("sdist", tmp_path)) as archive:
+        names = {name.split("/", 1)[1] for name in archive.getnames() if "/" in name}
+    needed = NEEDED | {"pyproject.toml", "LICENSE", "README.md", "phyradgs_cl/__init__.py"}
+    assert needed <= names

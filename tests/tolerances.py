@@ -1,0 +1,55 @@
+"""Every tolerance of the kernel tests, with its reason and what was measured (PoCL, 2 cores, AVX-512).
+
+Relative errors of images are to the peak of the image, of gradients the norm of the difference over the norm.
+"""
+
+from __future__ import annotations
+
+# --- float64 oracles -----------------------------------------------------------------------------------------
+# closed form against Gauss–Legendre along the ray: q = κ − b²/a loses κ = (distance / scale)² ≈ 1e4 last places
+TWIN_QUADRATURE = 5e-12  # measured 2e-12
+
+# --- splat ---------------------------------------------------------------------------------------------------
+SPLAT_COMPACT = 1e-5  # goal for σ ≥ 0.5 px, aspect ≤ 10 on 512²; float32 rounding of the exponent leaves 5e-7
+SPLAT_NEEDLE = 1e-4  # goal up to aspect 1000: the Gram form keeps digits, a covariance would lose all (5e-6)
+SPLAT_CLOUD = 1e-5  # sums of a few splats on a small detector (1e-6)
+SPLAT_AFFINE = 1e-5  # the same arithmetic without Q (1e-6)
+CUTOFF_EDGE_SIGMA = 1e-4  # float32 may decide differently about pixels this close to the cutoff's ellipse
+MERGED_FRAME = 1e-5  # Eq. 3 in one launch: a sum of splats, no other error than theirs (1e-6)
+BRUTE_FORCE = 1e-5  # per-line cells at the brute force's own times: the same sums in another order
+STANDING_PICTURE = 1e-5  # frames that must not depend on time differ by rounding alone
+
+# --- gradients -----------------------------------------------------------------------------------------------
+GRADIENT = 1e-4  # goal 1e-3; float32 sums over a footprint leave 1e-6 to 2e-5
+FINITE_DIFFERENCE_STEP = 1e-6  # in units of 1: truncation 1e-10, cancellation 1e-10 in float64
+
+# --- micro-views against the brute force ------------------------------------------------------------------------
+MICRO_VIEWS_FINE = 1e-2  # a strip a line, 12 sub-intervals: strip middles miss by up to half a line (4.4e-3)
+MICRO_VIEWS_ORDER = 8.0  # one micro-view (static) must be so much worse, or the test saw no motion (13 to 18)
+
+# --- voxeliser and rays --------------------------------------------------------------------------------------
+VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
+VOXEL_BRICKS = 1e-6  # a brick counts voxels from its own corner: a centre's float32 rest may round the other way
+VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
+RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
+ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders
+# Joseph's bilinear samples smooth: second order in voxel over σ. 48 voxels over 4, σ ≥ 0.12 are σ ≥ 1.4 voxels.
+DISCRETISATION_GAUSSIANS = 0.05
+DISCRETISATION_ORDER = 3.0  # of 4 that second order gives for half the voxel
+DISCRETISATION_ELLIPSOID = 0.05  # relative L2 at 48³: the edge of one ellipsoid (0.037; 0.062 at 24³)
+DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.084; 0.14 at 24³)
+
+# --- FDK -----------------------------------------------------------------------------------------------------
+BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1
+FDK_MEAN = 0.02  # mean inside a sphere: 90 views, 32³ voxels, a cone of ±10°, samples of the edge
+FDK_SCALE = 1e-4  # frames are equal to float32 rounding; the ramp filter amplifies it
+RAMP = 1e-5  # float32 result of a float64 FFT
+
+# --- objective -----------------------------------------------------------------------------------------------
+IMAGE_VALUE = 1e-5  # float32 sums of a frame against float64
+IMAGE_GRADIENT = 2e-5  # of the largest: variances as E[x²] − E[x]² lose some digits in float32
+TWIN_GRADIENT = 1e-6  # float64 formula against central differences with a step of 1e-6
+SSIM_REFERENCE = 1e-12  # the same float64 formula as scikit-image's, mean over the image
+TV_VALUE = 1e-5
+TV_GRADIENT = 1e-7  # a sum of six signs times a weight
+PARAMETER_GRADIENT = 1e-5  # of the largest: float32 ratio of scales, squared
