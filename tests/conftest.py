@@ -31,10 +31,9 @@ def any_rt(request: pytest.FixtureRequest) -> Runtime:
         return Runtime(lanes=1)
     if request.param == "float pairs":
         return Runtime(fp64=False)
-    runtime = Runtime(lanes=1 if request.param == "work-items as lanes" else None)
-    if request.param == "work-items as lanes":
-        runtime.is_cpu = False  # a GPU's kernels and group sizes, whatever the device
-    return runtime
+    if request.param == "work-items as lanes":  # a GPU's kernels and group sizes, whatever the device
+        return Runtime(lanes=1, pixel_items=True)
+    return Runtime()
 
 
 @pytest.fixture(scope="session")

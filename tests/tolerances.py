@@ -53,3 +53,8 @@ SSIM_REFERENCE = 1e-12  # the same float64 formula as scikit-image's, mean over 
 TV_VALUE = 1e-5
 TV_GRADIENT = 1e-7  # a sum of six signs times a weight
 PARAMETER_GRADIENT = 1e-5  # of the largest: float32 ratio of scales, squared
+
+# --- optimiser -----------------------------------------------------------------------------------------------
+ADAM_TEXTBOOK = 1e-6  # of the largest rate: ε is folded differently, which shows in gradients near 1e-9 alone (not used)
+ADAM_KERNEL = 5e-5  # of the largest rate, over some steps on raw numbers near 1 in float32
+ADAM_SECOND_MOMENT = 2e-5  # 1 − 0.999 in float32 is 1.3e-5 too small: a common factor, 6e-6 of every step

@@ -48,7 +48,7 @@ class SplatProjector:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
         self.cutoff2 = np.float32(cutoff_sigma**2)
-        self.by_pixel = rt.lanes == 1 and not rt.is_cpu
+        self.by_pixel = rt.pixel_items
         self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
@@ -96,7 +96,7 @@ class SplatProjector:
         Uses what the last ``forward`` of the same Gaussians and cells prepared.
         """
         rt = self.rt
-        group = 1 if rt.is_cpu else _BACKWARD_GROUP
+        group = _BACKWARD_GROUP if self.by_pixel else 1
         kernel = rt.kernel("splat_backward", "splat_backward", GROUP=group, **self._defines)
         rt.launch(
             kernel,

@@ -34,7 +34,7 @@ class Voxeliser:
         nz, ny, nx = shape
         self.pitch = pitch_of(nx)
         self.cutoff2 = np.float32(cutoff_sigma**2)
-        self.by_pixel = rt.lanes == 1 and not rt.is_cpu
+        self.by_pixel = rt.pixel_items
         tile_x = 16 if self.by_pixel else self.pitch
         tile = (tile_x, _TILE_ROWS, _TILE_ROWS)
         self.tile = np.array([*tile, 0], np.int32)

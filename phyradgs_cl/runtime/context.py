@@ -43,6 +43,8 @@ class Runtime:
 
     ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
     the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
+    ``pixel_items`` selects the launch shape: a work-item a pixel and small groups (GPUs, needs ``lanes`` 1), or a
+    work-item a band of lines (CPUs).
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Runtime:
         *,
         lanes: int | None = None,
         fp64: bool | None = None,
+        pixel_items: bool | None = None,
         profile: bool = False,
     ) -> None:
         self.device: DeviceInfo
@@ -62,7 +65,9 @@ class Runtime:
         if self.lanes not in LANE_CHOICES:
             raise DeviceError("lanes", str(self.lanes), f"one of {LANE_CHOICES}")
         self.fp64 = self.device.has_fp64 if fp64 is None else (fp64 and self.device.has_fp64)
-        self.is_cpu = self.device.kind == "cpu"
+        self.pixel_items = self.device.kind != "cpu" if pixel_items is None else pixel_items
+        if self.pixel_items and self.lanes != 1:
+            raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
         self.profile = profile
         self.events: dict[str, list[cl.Event]] = defaultdict(list)
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
@@ -177,7 +182,7 @@ class Runtime:
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
         """The work-group size for this class of device."""
-        return on_cpu if self.is_cpu else on_gpu
+        return on_gpu if self.pixel_items else on_cpu
 
     def finish(self) -> None:
         self.queue.finish()

@@ -32,4 +32,6 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
             pasted.add(match.group(1))
             lines += _expand(match.group(1), pasted)
             lines.append(f'#line {number + 1} "{relative}"')
+        else:
+            lines.append("")  # keeps the count of lines
     return lines

@@ -1,0 +1,146 @@
+"""Clone, split, prune: who is chosen, what mass and moments they get, and that the seed decides all else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from phyradgs_cl.fields import Activation
+from phyradgs_cl.optim import DensityControl, Population, control_density, prune
+from phyradgs_cl.optim.density_control import rotate
+
+ACTIVATION = Activation(0.01, 0.5)
+CONTROL = DensityControl(threshold=1.0, split_scale=0.2, prune_density=1e-3)
+BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+SMALL, LARGE = 0.05, 0.4
+
+
+@pytest.fixture
+def population() -> Population:
+    """Five Gaussians, 0 to 2 small, 3 and 4 large, centres sorted by height, moments that name their owner."""
+    rows = np.zeros((11, 5))
+    rows[:3] = np.array([[0.1, -0.2, 0.3, 0.0, 0.2], [0.1, 0.3, -0.3, 0.1, 0.0], [-0.4, -0.2, 0.0, 0.2, 0.4]])
+    rows[3:6] = np.array([SMALL] * 3 + [LARGE] * 2)
+    rows[6] = 1.0
+    rows[10] = [1.1, 2.0, 3.6, 4.0, 5.0]
+    moments = np.broadcast_to(np.arange(1.0, 6.0), (2, 11, 5)).copy()
+    return Population(ACTIVATION.invert(rows), moments)
+
+
+def run(population: Population, statistic: list[float], control: DensityControl = CONTROL, seed: int = 0) -> Population:
+    return control_density(
+        population, np.array(statistic, float), ACTIVATION, control, BOX, np.random.default_rng(seed)
+    )
+
+
+def test_nobody_is_chosen_below_the_threshold(population) -> None:
+    grown = run(population, [0.99] * 5)
+    np.testing.assert_array_equal(grown.raw, population.raw)
+    np.testing.assert_array_equal(grown.moments, population.moments)
+
+
+def test_a_clone_shares_place_shape_and_mass(population) -> None:
+    grown = run(population, [0, 2, 0, 0, 0])
+    assert grown.count == 6
+    rows = ACTIVATION.apply(grown.raw)
+    pair = np.flatnonzero(np.isclose(rows[2], -0.2))
+    assert pair.size == 2
+    np.testing.assert_allclose(rows[:3, pair], np.array([[-0.2], [0.3], [-0.2]]) * np.ones(2), rtol=1e-9)
+    np.testing.assert_allclose(rows[3:6, pair], SMALL, rtol=1e-9)
+    np.testing.assert_allclose(rows[10, pair], 1.0, rtol=1e-9)  # half of 2 each
+    assert rows[10].sum() == pytest.approx(15.7, rel=1e-9)
+    moments = grown.moments[0, 0, pair]
+    assert sorted(moments) == [0.0, 2.0]  # the old one keeps its moments, the new one has none
+
+
+def test_a_split_gives_two_smaller_halves_from_within(population) -> None:
+    grown = run(population, [0, 0, 0, 2, 0])
+    assert grown.count == 6
+    rows = ACTIVATION.apply(grown.raw)
+    children = np.flatnonzero(np.all(grown.moments == 0, axis=(0, 1)))
+    assert children.size == 2
+    np.testing.assert_allclose(rows[3:6, children], LARGE / CONTROL.split_factor, rtol=1e-6)
+    np.testing.assert_allclose(rows[10, children], 2.0, rtol=1e-9)  # half of 4 each
+    assert not np.any(np.isclose(rows[10], 4.0))  # the parent is gone
+    assert np.all(np.abs(rows[:3, children] - np.array([[0.0], [0.1], [0.2]])) < 5 * LARGE)
+    assert np.ptp(rows[0, children]) > 0
+
+
+def test_children_are_drawn_from_the_parent() -> None:
+    """Many children of one turned ellipsoid have its covariance."""
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.8])
+    scale = np.array([0.4, 0.25, 0.1])
+    count = 4000
+    rows = np.zeros((11, count))
+    rows[3:6], rows[6:10], rows[10] = scale[:, None], turn.as_quat()[[3, 0, 1, 2]][:, None], 1.0
+    population = Population(ACTIVATION.invert(rows), np.zeros((2, 11, count)))
+    box = 100 * BOX
+    grown = control_density(population, np.full(count, 2.0), ACTIVATION, CONTROL, box, np.random.default_rng(4))
+    assert grown.count == 2 * count
+    covariance = np.cov(ACTIVATION.apply(grown.raw)[:3])
+    expected = turn.as_matrix() @ np.diag(scale**2) @ turn.as_matrix().T
+    np.testing.assert_allclose(covariance, expected, atol=5 * 0.16 * np.sqrt(2 / (2 * count)))  # 5 standard errors
+
+
+def test_rotate_is_scipys() -> None:
+    rng = np.random.default_rng(5)
+    quaternion, vector = rng.normal(size=(4, 9)), rng.normal(size=(3, 9))
+    quaternion /= np.linalg.norm(quaternion, axis=0)
+    expected = Rotation.from_quat(quaternion[[1, 2, 3, 0]].T).apply(vector.T).T
+    np.testing.assert_allclose(rotate(quaternion, vector), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("room", [0, 1, 2, 3])
+def test_never_more_than_allowed_and_the_strongest_first(population, room) -> None:
+    control = replace(CONTROL, max_gaussians=5 + room)
+    grown = run(population, [3, 5, 4, 0, 0], control)
+    assert grown.count == 5 + room
+    densities = ACTIVATION.apply(grown.raw)[10]
+    halved = [np.isclose(densities, d / 2).sum() == 2 for d in (2.0, 3.6, 1.1)]  # statistic 5, 4, 3
+    assert halved == [room > 0, room > 1, room > 2]
+
+
+def test_a_full_population_is_left_in_peace(population) -> None:
+    assert run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "kept"),
+    [(10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False), (2, 1.2, False)],
+)
+def test_the_faded_and_the_lost_are_pruned(population, row, value, kept) -> None:
+    rows = ACTIVATION.apply(population.raw)
+    rows[row, 4] = value
+    pruned = prune(Population(ACTIVATION.invert(rows), population.moments), ACTIVATION, CONTROL, BOX)
+    assert pruned.count == 4 + kept
+    assert (5.0 in pruned.moments[0, 0]) == kept
+
+
+def test_the_rest_is_sorted_by_height_with_its_moments(population) -> None:
+    order = np.array([3, 0, 4, 2, 1])
+    pruned = prune(population.take(order), ACTIVATION, CONTROL, BOX)
+    np.testing.assert_array_equal(pruned.raw, population.raw)
+    np.testing.assert_array_equal(pruned.moments, population.moments)
+
+
+def test_the_seed_decides(population) -> None:
+    one, same, other = (run(population, [2, 2, 0, 2, 2], seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.raw, same.raw)
+    assert np.any(one.raw != other.raw)
+
+
+def test_the_caller_keeps_his_population(population) -> None:
+    raw, moments = population.raw.copy(), population.moments.copy()
+    run(population, [2] * 5)
+    np.testing.assert_array_equal(population.raw, raw)
+    np.testing.assert_array_equal(population.moments, moments)
+
+
+def test_when_it_acts() -> None:
+    control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
+    due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
+    assert due == list(range(600, 1500, 100))
+    assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))

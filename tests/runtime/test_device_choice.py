@@ -1,0 +1,152 @@
+"""Which device is taken: by capability, by wish, by environment; never a checker or an emulator unasked."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pyopencl as cl
+import pytest
+
+from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.runtime import device as devices
+from phyradgs_cl.runtime.device import DEVICE_VARIABLE, choose_device, list_devices
+
+
+def fake_device(name: str, kind: str = "cpu", **changes: object) -> SimpleNamespace:
+    types = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
+    facts = {
+        "name": name,
+        "version": "OpenCL 3.0",
+        "type": types[kind],
+        "available": True,
+        "compiler_available": True,
+        "max_compute_units": 8,
+        "global_mem_size": 1 << 33,
+        "max_mem_alloc_size": 1 << 31,
+        "native_vector_width_float": 8,
+        "native_vector_width_double": 4,
+        "extensions": "",
+        "host_unified_memory": kind == "cpu",
+        "int_ptr": 0,
+    }
+    return SimpleNamespace(**(facts | changes))
+
+
+def fake_platform(name: str, *found: SimpleNamespace, vendor: str = "") -> SimpleNamespace:
+    return SimpleNamespace(name=name, vendor=vendor, get_devices=lambda: list(found))
+
+
+OCLGRIND = fake_platform("Oclgrind", fake_device("Oclgrind Simulator", "gpu", max_compute_units=999))
+FPGA = fake_platform(
+    "Intel(R) FPGA Emulation Platform for OpenCL(TM)",
+    fake_device("Intel(R) FPGA Emulation Device", "accelerator", native_vector_width_float=16, max_compute_units=999),
+)
+EMULATOR = fake_platform("Other", fake_device("Some Emulator", "gpu"))
+CPU = fake_platform("Some CPU runtime", fake_device("EPYC", native_vector_width_float=16))
+GPU = fake_platform("Some GPU runtime", fake_device("H200", "gpu", native_vector_width_float=1))
+INTEGRATED = fake_platform("Integrated", fake_device("UHD", "gpu", host_unified_memory=True))
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Puts platforms into the machine, in the order in which OpenCL would name them."""
+    monkeypatch.delenv(DEVICE_VARIABLE, raising=False)
+
+    def install(*platforms: SimpleNamespace) -> None:
+        monkeypatch.setattr(devices.cl, "get_platforms", lambda: list(platforms))
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("platforms", "chosen"),
+    [
+        ((OCLGRIND, CPU), "EPYC"),
+        ((FPGA, OCLGRIND, EMULATOR, CPU), "EPYC"),
+        ((CPU, GPU), "H200"),
+        ((GPU, CPU), "H200"),
+        ((OCLGRIND, INTEGRATED, GPU, CPU), "H200"),
+        ((CPU, INTEGRATED), "UHD"),
+    ],
+)
+def test_by_capability(machine, platforms, chosen) -> None:
+    machine(*platforms)
+    device, reason = choose_device()
+    assert device.name == chosen
+    assert "capability" in reason
+
+
+@pytest.mark.parametrize("platform", [OCLGRIND, FPGA, EMULATOR])
+def test_never_a_checker_or_emulator_by_default_but_by_name(machine, platform) -> None:
+    machine(platform)
+    name = platform.get_devices()[0].name
+    with pytest.raises(DeviceError, match=name.replace("(", r"\(").replace(")", r"\)")):
+        choose_device()
+    assert choose_device(name)[0].name == name
+    assert choose_device("0")[0].name == name
+
+
+def test_cpu_and_gpu_as_a_wish_leave_checkers_out(machine) -> None:
+    machine(OCLGRIND, CPU)
+    with pytest.raises(DeviceError, match="gpu"):
+        choose_device("gpu")
+    machine(OCLGRIND, CPU, GPU)
+    assert choose_device("gpu")[0].name == "H200"
+    assert choose_device("CPU")[0].name == "EPYC"
+
+
+@pytest.mark.parametrize(("wish", "name"), [("epyc", "EPYC"), ("some gpu", "H200"), ("1", "H200"), ("0", "EPYC")])
+def test_by_part_of_a_name_and_by_index(machine, wish, name) -> None:
+    machine(CPU, GPU)
+    device, reason = choose_device(wish)
+    assert device.name == name and wish in reason
+
+
+@pytest.mark.parametrize("wish", ["no such thing", "7"])
+def test_an_unknown_device_is_named_with_the_known_ones(machine, wish) -> None:
+    machine(CPU, GPU)
+    with pytest.raises(DeviceError) as raised:
+        choose_device(wish)
+    text = str(raised.value)
+    assert wish in text and "--device" in text and "0: EPYC" in text and "1: H200" in text
+
+
+def test_the_environment_wishes_too_and_the_option_wins(machine, monkeypatch) -> None:
+    machine(CPU, GPU)
+    monkeypatch.setenv(DEVICE_VARIABLE, "epyc")
+    device, reason = choose_device()
+    assert device.name == "EPYC" and DEVICE_VARIABLE in reason
+    assert choose_device("h200")[0].name == "H200"
+    monkeypatch.setenv(DEVICE_VARIABLE, "nothing")
+    with pytest.raises(DeviceError, match=DEVICE_VARIABLE):
+        choose_device()
+
+
+def test_a_device_that_cannot_compile_is_not_taken(machine) -> None:
+    machine(fake_platform("Half", fake_device("no compiler", "gpu", compiler_available=False)), CPU)
+    assert choose_device()[0].name == "EPYC"
+
+
+def test_no_device_says_how_to_get_one(machine, monkeypatch) -> None:
+    machine()
+    with pytest.raises(DeviceError, match="pip install"):
+        choose_device()
+
+    def none_found() -> list:
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(devices.cl, "get_platforms", none_found)
+    assert list_devices() == []
+
+
+def test_types_are_bit_fields(machine) -> None:
+    """PoCL answers ALL | CPU for its one device."""
+    machine(fake_platform("Some CPU runtime", fake_device("pthread", type=0xFFFFFFFF)))
+    assert list_devices()[0].kind == "cpu"
+
+
+def test_this_machine_has_a_device_that_reports_itself(rt) -> None:
+    device = rt.device
+    assert device in list_devices() and device.by_default
+    assert device.vector_width >= 1 and device.largest_allocation_bytes > 1 << 20
+    assert rt.lanes == 1 or device.kind == "cpu"
