@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -43,6 +44,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
 
 SPLAT_METHODS = ("phyradgs", "r2")
+log = logging.getLogger(__name__)
 
 
 def load_scan(path: str | Path) -> Scan:
@@ -152,6 +154,10 @@ def run_reconstruction(
         raise InputError("-o", f"the scan file {job.output} itself", "another file for the volume")
     scan = load_scan(job.scan)
     scan.check_timing()
+    if scan.detector_model == "intensity":
+        log.warning(
+            "%s averages intensity over an exposure; reconstruction averages line integrals", job.scan
+        )
     rt = make_runtime()
     scan_hash = sha256_of(job.scan)
     fingerprint = _fingerprint(scan_hash, job, options)

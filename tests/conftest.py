@@ -85,7 +85,9 @@ def one_cell() -> Callable[..., TimeCells]:
 def finite_differences() -> Callable[..., np.ndarray]:
     """Central differences (shape of ``at``) of a scalar function, one entry after the other."""
 
-    def differentiate(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6) -> np.ndarray:
+    def differentiate(
+        function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6
+    ) -> np.ndarray:
         gradient = np.zeros(at.shape)
         for index in np.ndindex(*at.shape):
             ends = []

@@ -29,7 +29,9 @@ MICRO_VIEWS_ORDER = 8.0  # one micro-view (static) must be so much worse, or the
 
 # --- voxeliser and rays --------------------------------------------------------------------------------------
 VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
-VOXEL_BRICKS = 1e-6  # a brick counts voxels from its own corner: a centre's float32 rest may round the other way
+VOXEL_BRICKS = (
+    1e-6  # a brick counts voxels from its own corner: a centre's float32 rest may round the other way
+)
 VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
 ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders
@@ -55,6 +57,8 @@ TV_GRADIENT = 1e-7  # a sum of six signs times a weight
 PARAMETER_GRADIENT = 1e-5  # of the largest: float32 ratio of scales, squared
 
 # --- optimiser -----------------------------------------------------------------------------------------------
-ADAM_TEXTBOOK = 1e-6  # of the largest rate: ε is folded differently, which shows in gradients near 1e-9 alone (not used)
+ADAM_TEXTBOOK = (
+    1e-6  # of the largest rate: ε is folded differently, which shows in gradients near 1e-9 alone (not used)
+)
 ADAM_KERNEL = 5e-5  # of the largest rate, over some steps on raw numbers near 1 in float32
 ADAM_SECOND_MOMENT = 2e-5  # 1 − 0.999 in float32 is 1.3e-5 too small: a common factor, 6e-6 of every step

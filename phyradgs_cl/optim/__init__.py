@@ -4,4 +4,13 @@ from phyradgs_cl.optim.adam import DeviceAdam, adam_step
 from phyradgs_cl.optim.density_control import DensityControl, Population, control_density, prune
 from phyradgs_cl.optim.schedules import PUBLISHED_RATES, Rates
 
-__all__ = ["PUBLISHED_RATES", "DensityControl", "DeviceAdam", "Population", "Rates", "adam_step", "control_density", "prune"]
+__all__ = [
+    "PUBLISHED_RATES",
+    "DensityControl",
+    "DeviceAdam",
+    "Population",
+    "Rates",
+    "adam_step",
+    "control_density",
+    "prune",
+]

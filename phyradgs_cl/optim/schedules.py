@@ -29,4 +29,6 @@ class Rates:
         return np.array([position] * 3 + [scale] * 3 + [rotation] * 4 + [density])
 
 
-PUBLISHED_RATES = Rates(position=(2e-4, 2e-5), scale=(5e-3, 5e-4), rotation=(1e-3, 1e-4), density=(1e-2, 1e-3))
+PUBLISHED_RATES = Rates(
+    position=(2e-4, 2e-5), scale=(5e-3, 5e-4), rotation=(1e-3, 1e-4), density=(1e-2, 1e-3)
+)

@@ -73,7 +73,7 @@ def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
             "OpenCL",
             "no device",
             "at least one",
-            "pip install 'phyradgs-cl[cpu]' brings PoCL, which runs on the CPU",
+            "install your vendor's OpenCL driver; on Linux x86-64, pip install 'phyradgs-cl[cpu]' brings PoCL for the CPU",
         )
     if wish:
         return _wished(wish, source, devices)

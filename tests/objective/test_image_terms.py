@@ -98,7 +98,13 @@ def test_ssim_is_scikit_images() -> None:
     """
     rendered, measured = images((40, 44), 4)
     _, full = structural_similarity(
-        rendered, measured, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
+        rendered,
+        measured,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        full=True,
     )
     assert (C1, C2) == (0.01**2, 0.03**2) and WINDOW.size == 11
     border = np.ones((40, 44), bool)
@@ -107,12 +113,19 @@ def test_ssim_is_scikit_images() -> None:
     changed = measured.copy()
     changed[inner] = rendered[inner]  # SSIM changes within 5 pixels of this: all inside the interior
     _, full_changed = structural_similarity(
-        rendered, changed, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
+        rendered,
+        changed,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        full=True,
     )
     np.testing.assert_array_equal(full[border], full_changed[border])
     ones = np.ones((40, 44))
     one, two = (
-        image_loss(rendered, m, ones, 1.0)[0] - image_loss(rendered, m, ones, 0.0)[0] for m in (measured, changed)
+        image_loss(rendered, m, ones, 1.0)[0] - image_loss(rendered, m, ones, 0.0)[0]
+        for m in (measured, changed)
     )
     difference = (full_changed - full)[~border].sum() / rendered.size
     assert difference > 0.05

@@ -49,7 +49,9 @@ def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_difference
     parameters, gradients = any_rt.zeros((11, stride)), any_rt.zeros((13, stride))
     statistics = any_rt.zeros((2, stride))
     adam.activate(device_raw, parameters, count, stride)
-    np.testing.assert_allclose(any_rt.download(parameters)[:, :count], activation.apply(raw), rtol=2e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        any_rt.download(parameters)[:, :count], activation.apply(raw), rtol=2e-6, atol=1e-7
+    )
     adam.chain(
         device_raw,
         parameters,
@@ -73,7 +75,11 @@ def test_statistics_gather_norms_and_sightings(any_rt, make_cloud) -> None:
     raw = np.zeros((11, stride), np.float32)
     raw[6] = 1.0
     raw[:, :count] = activation.invert(make_cloud(count, 73))
-    adam, device_raw, statistics = DeviceAdam(any_rt, activation), any_rt.upload(raw), any_rt.zeros((2, stride))
+    adam, device_raw, statistics = (
+        DeviceAdam(any_rt, activation),
+        any_rt.upload(raw),
+        any_rt.zeros((2, stride)),
+    )
     parameters = any_rt.zeros((11, stride))
     adam.activate(device_raw, parameters, count, stride)
     for _ in range(3):

@@ -28,5 +28,7 @@ def test_weighted_sum_of_bilinear_samples(any_rt, make_geometry, shape) -> None:
         sample = map_coordinates(frame.astype(np.float64), [v, u], order=1, mode="nearest")
         expected += np.where(inside, w / depth**2 * sample, 0)
     found = backproject(any_rt, frames, pose, weight, grid)
-    assert np.any(expected) == (min(shape) > 1)  # a voxel's centre is seldom exactly on a single line of pixels
+    assert np.any(expected) == (
+        min(shape) > 1
+    )  # a voxel's centre is seldom exactly on a single line of pixels
     np.testing.assert_allclose(found, expected, rtol=0, atol=BACKPROJECTION)

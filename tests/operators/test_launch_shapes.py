@@ -35,7 +35,9 @@ def rows():
 def table():
     protocol = make_protocol("rapid")
     orbit = protocol.orbit(ConeGeometry(5, 7, DETECTOR, (0.1, 0.09), (0.1, -0.2)))
-    return micro_view_cells(orbit, protocol.shutter(), 2, float(protocol.frame_start_s()[2]), DETECTOR[0], 4, 3)
+    return micro_view_cells(
+        orbit, protocol.shutter(), 2, float(protocol.frame_start_s()[2]), DETECTOR[0], 4, 3
+    )
 
 
 @pytest.mark.parametrize("affine", [False, True])

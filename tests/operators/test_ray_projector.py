@@ -30,7 +30,9 @@ def noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
 
 
-def project(rt, volume: np.ndarray, grid: Grid, table: TimeCells, shape: tuple[int, int], model: str = "log") -> np.ndarray:
+def project(
+    rt, volume: np.ndarray, grid: Grid, table: TimeCells, shape: tuple[int, int], model: str = "log"
+) -> np.ndarray:
     projector = RayProjector(rt, grid, shape, table.axis)
     return projector.forward(projector.upload_volume(volume), table, model)
 
@@ -148,7 +150,9 @@ def test_voxelised_gaussians_project_like_splats(rt, one_cell, make_cloud, make_
     assert errors[1] <= errors[0] / DISCRETISATION_ORDER
 
 
-ONE_ELLIPSOID = EllipsoidPhantom((Ellipsoid((0.1, -0.2, 0.1), (0.7, 0.4, 0.5), 1.3, rotation_about_z(0.5)),), "one")
+ONE_ELLIPSOID = EllipsoidPhantom(
+    (Ellipsoid((0.1, -0.2, 0.1), (0.7, 0.4, 0.5), 1.3, rotation_about_z(0.5)),), "one"
+)
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,9 @@ def test_cutoff_means_the_same_as_in_the_twin(any_rt, one_cell, make_cloud, make
 
 def test_exact_and_affine_differ_for_large_gaussians(rt, one_cell, make_cloud, make_geometry) -> None:
     rows, pose = make_cloud(5, 3, scale=(0.2, 0.4)), make_geometry(40, 40).pose(0.2)
-    exact, affine = (render(rt, rows, one_cell(pose, 40), (40, 40), affine=a, cutoff_sigma=0.0) for a in (False, True))
+    exact, affine = (
+        render(rt, rows, one_cell(pose, 40), (40, 40), affine=a, cutoff_sigma=0.0) for a in (False, True)
+    )
     assert np.abs(exact - affine).max() > 3e-3 * exact.max()  # design: 1.7 to 3.4 % for large ones
 
 
@@ -153,7 +155,9 @@ def test_behind_the_source_nothing_is_seen(
 
 
 @pytest.mark.parametrize("x", [4.8, 5.0, 5.2, 4.0, 3.0])
-def test_an_ellipsoid_across_the_source_plane_stays_finite(any_rt, one_cell, make_cloud, make_geometry, x) -> None:
+def test_an_ellipsoid_across_the_source_plane_stays_finite(
+    any_rt, one_cell, make_cloud, make_geometry, x
+) -> None:
     """At 3.7 σ those nearer than 1.85 contain a point at the source's own depth: they are not drawn."""
     rows, pose = make_cloud(1, 7, scale=(0.5, 0.5)), make_geometry(20, 20).pose(0.0)
     rows[:3, 0] = x, 0.05, -0.03
@@ -166,7 +170,9 @@ def test_an_ellipsoid_across_the_source_plane_stays_finite(any_rt, one_cell, mak
 
 def test_needle_bounding_boxes_hold_their_ellipse(any_rt, one_cell, make_geometry) -> None:
     """A needle at 22.5° across the detector: the box must reach its far ends, every tile in between too."""
-    rows = np.array([[0.01, 0.02, -0.01, 0.0005, 0.25, 0.0005, *np.cos([np.pi / 16, np.pi * 7 / 16]), 0, 0, 1.0]]).T
+    rows = np.array(
+        [[0.01, 0.02, -0.01, 0.0005, 0.25, 0.0005, *np.cos([np.pi / 16, np.pi * 7 / 16]), 0, 0, 1.0]]
+    ).T
     pose = LARGE.pose(0.0)
     image = render(any_rt, rows, one_cell(pose, SIDE), (SIDE, SIDE))
     low, high = (splat_image(rows, pose, (SIDE, SIDE), DEFAULT_CUTOFF_SIGMA + e) for e in (-1e-3, 1e-3))

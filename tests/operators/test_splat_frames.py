@@ -30,14 +30,20 @@ def render(rt: Runtime, rows: np.ndarray, table: TimeCells, **options: object) -
     return frame if table.axis == "rows" else frame.T
 
 
-def unfused(rows: np.ndarray, orbit: CircularOrbit, shutter: Shutter, strips: int, sub_intervals: int) -> np.ndarray:
+def unfused(
+    rows: np.ndarray, orbit: CircularOrbit, shutter: Shutter, strips: int, sub_intervals: int
+) -> np.ndarray:
     """Eq. 2 and 3 with loops: render every micro-view, average over k, cut line r out of strip ⌊r·M/H⌋."""
     lines = shutter.lines(SHAPE)
     frame = np.zeros(SHAPE)
     for j in range(strips):
         mean = np.zeros(SHAPE)
         for k in range(sub_intervals):
-            t = START_S + (j + 0.5) / strips * shutter.readout_s + (k + 0.5) / sub_intervals * shutter.exposure_s
+            t = (
+                START_S
+                + (j + 0.5) / strips * shutter.readout_s
+                + (k + 0.5) / sub_intervals * shutter.exposure_s
+            )
             mean += splat_image(rows, orbit.pose(0, np.array(t)), SHAPE) / sub_intervals
         for order in range(lines):
             if order * strips // lines == j:
@@ -82,7 +88,8 @@ def test_no_exposure_and_no_readout_is_static(rt, make_cloud, orbit, axis) -> No
 def test_without_readout_strips_do_not_matter(rt, make_cloud, orbit) -> None:
     rows, shutter = make_cloud(4, 34), Shutter(0.7, 0.0)
     one, many = (
-        render(rt, rows, micro_view_cells(orbit, shutter, 0, START_S, SHAPE[0], strips, 4)) for strips in (1, 6)
+        render(rt, rows, micro_view_cells(orbit, shutter, 0, START_S, SHAPE[0], strips, 4))
+        for strips in (1, 6)
     )
     np.testing.assert_allclose(many, one, rtol=0, atol=STANDING_PICTURE * one.max())
     static = render(rt, rows, static_cells(orbit, shutter, 0, START_S, SHAPE[0]))
@@ -126,7 +133,13 @@ def test_an_axially_symmetric_cloud_does_not_move(rt, make_geometry) -> None:
     """Turning bodies on the axis: fly-scan and static show the same picture."""
     heights = np.array([-0.5, 0.0, 0.4])
     rows = np.zeros((11, 3))
-    rows[2], rows[3:5], rows[5], rows[6], rows[10] = heights, [0.1, 0.3, 0.2], [0.2, 0.1, 0.3], 1.0, [1.0, 0.5, 2.0]
+    rows[2], rows[3:5], rows[5], rows[6], rows[10] = (
+        heights,
+        [0.1, 0.3, 0.2],
+        [0.2, 0.1, 0.3],
+        1.0,
+        [1.0, 0.5, 2.0],
+    )
     orbit = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 0.6))
     shutter = Shutter(0.5, 0.4)
     where = (orbit, shutter, 0, START_S, SHAPE[0])

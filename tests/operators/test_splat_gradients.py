@@ -19,7 +19,9 @@ SHAPE = (13, 18)
 CLASSES = {"mean": MEAN, "scale": SCALE, "quaternion": QUATERNION, "density": DENSITY}
 
 
-@pytest.fixture(params=[("rows", 1), ("rows", -1), ("columns", 1), ("columns", -1)], ids=lambda p: f"{p[0]}{p[1]:+d}")
+@pytest.fixture(
+    params=[("rows", 1), ("rows", -1), ("columns", 1), ("columns", -1)], ids=lambda p: f"{p[0]}{p[1]:+d}"
+)
 def make_table(request, make_geometry) -> Callable[[str], TimeCells]:
     """Tables of one frame, read out along rows or columns, either way."""
     axis, direction = request.param
@@ -103,7 +105,10 @@ def test_with_cutoff_only_drawn_pixels_pull(
     rows = make_cloud(4, 24, scale=(0.05, 0.25))
     h, expected = weights(), np.zeros((11, 4))
     masks = [
-        [splat_frame(row[:, None], table, SHAPE, DEFAULT_CUTOFF_SIGMA + e) > 0 for e in (-1, 1) * np.array(CUTOFF_EDGE_SIGMA)]
+        [
+            splat_frame(row[:, None], table, SHAPE, DEFAULT_CUTOFF_SIGMA + e) > 0
+            for e in (-1, 1) * np.array(CUTOFF_EDGE_SIGMA)
+        ]
         for row in rows.T
     ]
     h[np.any([low != high for low, high in masks], axis=0)] = 0.0  # float32 may disagree there
@@ -124,7 +129,9 @@ def test_what_is_not_drawn_has_no_gradient(any_rt, make_cloud, make_geometry, on
     assert np.all(np.isfinite(found)) and np.any(found[:, 0])
 
 
-def image_with_moved_centre(row: np.ndarray, pose: np.ndarray, shape: tuple[int, int], shift: np.ndarray) -> np.ndarray:
+def image_with_moved_centre(
+    row: np.ndarray, pose: np.ndarray, shape: tuple[int, int], shift: np.ndarray
+) -> np.ndarray:
     """The detector-space splat with its centre moved by ``shift`` (v, u) pixels and nothing else changed.
 
     p = |d| ρ √(2π/α) exp(−q/2) / √Q with Q = 1 + 2 b·Δ + ΔᵀCΔ and q = ΔᵀSΔ/Q (design notes, section 3).
@@ -139,7 +146,9 @@ def image_with_moved_centre(row: np.ndarray, pose: np.ndarray, shape: tuple[int,
     delta = np.stack([u - x / z - shift[1], v - y / z - shift[0]], -1)
     big_q = 1 + 2 * delta @ b + np.einsum("...i,ij,...j", delta, c, delta)
     q = np.einsum("...i,ij,...j", delta, s, delta) / big_q
-    length = np.linalg.norm(pose[3:6] - pose[:3] + u[..., None] * pose[6:9] + v[..., None] * pose[9:12], axis=-1)
+    length = np.linalg.norm(
+        pose[3:6] - pose[:3] + u[..., None] * pose[6:9] + v[..., None] * pose[9:12], axis=-1
+    )
     return length * row[10] * np.sqrt(2 * np.pi / alpha / big_q) * np.exp(-q / 2)
 
 

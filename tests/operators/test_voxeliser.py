@@ -37,7 +37,8 @@ def test_cutoff_means_the_same_as_in_the_twin(any_rt, make_cloud, grid) -> None:
     rows = make_cloud(9, 42, scale=(0.03, 0.2))
     volume = voxelise(any_rt, rows, grid)
     low, high = (
-        voxel_field(rows, *grid.axes_mm(), DEFAULT_CUTOFF_SIGMA + edge) for edge in (-CUTOFF_EDGE_SIGMA, CUTOFF_EDGE_SIGMA)
+        voxel_field(rows, *grid.axes_mm(), DEFAULT_CUTOFF_SIGMA + edge)
+        for edge in (-CUTOFF_EDGE_SIGMA, CUTOFF_EDGE_SIGMA)
     )
     slack = VOXEL * rows[DENSITY].max()
     assert np.all(volume >= low - slack) and np.all(volume <= high + slack)

@@ -30,7 +30,9 @@ def population() -> Population:
     return Population(ACTIVATION.invert(rows), moments)
 
 
-def run(population: Population, statistic: list[float], control: DensityControl = CONTROL, seed: int = 0) -> Population:
+def run(
+    population: Population, statistic: list[float], control: DensityControl = CONTROL, seed: int = 0
+) -> Population:
     return control_density(
         population, np.array(statistic, float), ACTIVATION, control, BOX, np.random.default_rng(seed)
     )
@@ -78,11 +80,15 @@ def test_children_are_drawn_from_the_parent() -> None:
     rows[3:6], rows[6:10], rows[10] = scale[:, None], turn.as_quat()[[3, 0, 1, 2]][:, None], 1.0
     population = Population(ACTIVATION.invert(rows), np.zeros((2, 11, count)))
     box = 100 * BOX
-    grown = control_density(population, np.full(count, 2.0), ACTIVATION, CONTROL, box, np.random.default_rng(4))
+    grown = control_density(
+        population, np.full(count, 2.0), ACTIVATION, CONTROL, box, np.random.default_rng(4)
+    )
     assert grown.count == 2 * count
     covariance = np.cov(ACTIVATION.apply(grown.raw)[:3])
     expected = turn.as_matrix() @ np.diag(scale**2) @ turn.as_matrix().T
-    np.testing.assert_allclose(covariance, expected, atol=5 * 0.16 * np.sqrt(2 / (2 * count)))  # 5 standard errors
+    np.testing.assert_allclose(
+        covariance, expected, atol=5 * 0.16 * np.sqrt(2 / (2 * count))
+    )  # 5 standard errors
 
 
 def test_rotate_is_scipys() -> None:
@@ -109,7 +115,14 @@ def test_a_full_population_is_left_in_peace(population) -> None:
 
 @pytest.mark.parametrize(
     ("row", "value", "kept"),
-    [(10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False), (2, 1.2, False)],
+    [
+        (10, 0.5e-3, False),
+        (10, 2e-3, True),
+        (0, 1.01, False),
+        (0, 0.99, True),
+        (1, -1.01, False),
+        (2, 1.2, False),
+    ],
 )
 def test_the_faded_and_the_lost_are_pruned(population, row, value, kept) -> None:
     rows = ACTIVATION.apply(population.raw)

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from tolerances import FDK_MEAN, FDK_SCALE, RAMP
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter, pixel_centres
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    FrameSweeps,
+    Motion,
+    Scan,
+    Shutter,
+    pixel_centres,
+)
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.acquisition import Motion
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
 from phyradgs_cl.reconstructors.fdk import FdkOptions, angular_gaps, fdk, fdk_volume, fill_masked, ramp_filter
@@ -31,7 +38,9 @@ def cone(half_size_mm: float) -> ConeGeometry:
     return ConeGeometry(6 * half_size_mm, 9 * half_size_mm, (PIXELS, PIXELS), (pitch, pitch))
 
 
-def reconstruct(rt, phantom: EllipsoidPhantom, half_size_mm: float, angles: np.ndarray) -> tuple[np.ndarray, Grid]:
+def reconstruct(
+    rt, phantom: EllipsoidPhantom, half_size_mm: float, angles: np.ndarray
+) -> tuple[np.ndarray, Grid]:
     grid, pose = Grid.cube(VOXELS, 2 * half_size_mm), cone(half_size_mm).pose(angles)
     return fdk_volume(rt, projections(phantom, pose, (PIXELS, PIXELS)), pose, grid), grid
 
@@ -55,7 +64,9 @@ def test_a_sphere_has_its_attenuation_in_1_per_mm(rt, full_turn, half_size_mm) -
 
 def test_uneven_angles_are_weighed(rt, full_turn) -> None:
     """Twice as many views over one half of the turn must not brighten the volume."""
-    angles = np.concatenate([np.linspace(0, np.pi, 60, endpoint=False), np.linspace(np.pi, 2 * np.pi, 30, endpoint=False)])
+    angles = np.concatenate(
+        [np.linspace(0, np.pi, 60, endpoint=False), np.linspace(np.pi, 2 * np.pi, 30, endpoint=False)]
+    )
     volume, grid = reconstruct(rt, sphere(1.0), 1.0, np.random.default_rng(0).permutation(angles))
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
     inside = np.hypot(np.hypot(x - 0.1, y + 0.15), z - 0.05) < 0.5
@@ -116,7 +127,9 @@ def test_angular_gaps_make_a_full_turn() -> None:
     gaps = angular_gaps(source)
     assert gaps.sum() == pytest.approx(2 * np.pi, rel=1e-12)
     assert np.all(gaps > 0)
-    even = angular_gaps(np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4), np.zeros(8)], -1))
+    even = angular_gaps(
+        np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4), np.zeros(8)], -1)
+    )
     np.testing.assert_allclose(even, np.pi / 4, rtol=1e-12)
 
 

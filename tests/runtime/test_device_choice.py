@@ -39,7 +39,9 @@ def fake_platform(name: str, *found: SimpleNamespace, vendor: str = "") -> Simpl
 OCLGRIND = fake_platform("Oclgrind", fake_device("Oclgrind Simulator", "gpu", max_compute_units=999))
 FPGA = fake_platform(
     "Intel(R) FPGA Emulation Platform for OpenCL(TM)",
-    fake_device("Intel(R) FPGA Emulation Device", "accelerator", native_vector_width_float=16, max_compute_units=999),
+    fake_device(
+        "Intel(R) FPGA Emulation Device", "accelerator", native_vector_width_float=16, max_compute_units=999
+    ),
 )
 EMULATOR = fake_platform("Other", fake_device("Some Emulator", "gpu"))
 CPU = fake_platform("Some CPU runtime", fake_device("EPYC", native_vector_width_float=16))
@@ -95,7 +97,9 @@ def test_cpu_and_gpu_as_a_wish_leave_checkers_out(machine) -> None:
     assert choose_device("CPU")[0].name == "EPYC"
 
 
-@pytest.mark.parametrize(("wish", "name"), [("epyc", "EPYC"), ("some gpu", "H200"), ("1", "H200"), ("0", "EPYC")])
+@pytest.mark.parametrize(
+    ("wish", "name"), [("epyc", "EPYC"), ("some gpu", "H200"), ("1", "H200"), ("0", "EPYC")]
+)
 def test_by_part_of_a_name_and_by_index(machine, wish, name) -> None:
     machine(CPU, GPU)
     device, reason = choose_device(wish)

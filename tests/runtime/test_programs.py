@@ -31,7 +31,11 @@ def test_defines_are_told_apart(rt) -> None:
 def test_programs_are_built_once_for_all_their_kernels(rt, monkeypatch) -> None:
     built: list[str] = []
     build = Runtime._build
-    monkeypatch.setattr(Runtime, "_build", lambda self, program, options: built.append(program) or build(self, program, options))
+    monkeypatch.setattr(
+        Runtime,
+        "_build",
+        lambda self, program, options: built.append(program) or build(self, program, options),
+    )
     runtime = Runtime()
     for _ in range(3):
         for name in ("bin_count", "bin_within", "bin_starts", "bin_fill"):
@@ -68,7 +72,9 @@ def broken_folder(tmp_path, monkeypatch):
     """A ``cl`` folder (with a space in its path) whose header has an error on its third line."""
     folder = tmp_path / "with space" / "cl"
     (folder / "common").mkdir(parents=True)
-    (folder / "common" / "broken.h").write_text("inline float good(float x) { return x; }\n\nthis is not C;\n")
+    (folder / "common" / "broken.h").write_text(
+        "inline float good(float x) { return x; }\n\nthis is not C;\n"
+    )
     (folder / "uses_broken.cl").write_text(
         '/* a comment */\n#include "common/broken.h"\n__kernel void nothing(__global float *x) { x[0] = good(x[0]); }\n'
     )
@@ -79,7 +85,9 @@ def broken_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(sources, "resource", lambda name: folder)
 
 
-@pytest.mark.parametrize(("program", "place"), [("uses_broken", "common/broken.h:3"), ("breaks_later", "breaks_later.cl:2")])
+@pytest.mark.parametrize(
+    ("program", "place"), [("uses_broken", "common/broken.h:3"), ("breaks_later", "breaks_later.cl:2")]
+)
 def test_a_build_error_names_file_and_line(rt, broken_folder, program, place) -> None:
     with pytest.raises(DeviceError) as raised:
         rt.kernel(program, "nothing")
