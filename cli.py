@@ -265,7 +265,8 @@ def reconstruct_command(
     config: Annotated[
         Path | None,
         typer.Option(
-            help="TOML file with any of these options (underscores for dashes) and the preset's constants; the command line wins."
+            help="TOML file with any of these options (underscores for dashes) and the preset's constants; "
+            "the command line wins."
         ),
     ] = None,
     resume: Annotated[
