@@ -5,6 +5,10 @@ Relative errors of images are to the peak of the image, of gradients the norm of
 
 from __future__ import annotations
 
+# --- rounding ------------------------------------------------------------------------------------------------
+FLOAT64 = 1e-9  # two float64 ways to one number of order 1, or its relative error
+FLOAT32 = 1e-5  # the same where one way ends, or runs through a few operations, in float32
+
 # --- float64 oracles -----------------------------------------------------------------------------------------
 # closed form against Gauss–Legendre along the ray: q = κ − b²/a loses κ = (distance / scale)² ≈ 1e4 last places
 TWIN_QUADRATURE = 5e-12  # measured 2e-12
@@ -15,6 +19,7 @@ SPLAT_NEEDLE = 1e-4  # goal up to aspect 1000: the Gram form keeps digits, a cov
 SPLAT_CLOUD = 1e-5  # sums of a few splats on a small detector (1e-6)
 SPLAT_AFFINE = 1e-5  # the same arithmetic without Q (1e-6)
 CUTOFF_EDGE_SIGMA = 1e-4  # float32 may decide differently about pixels this close to the cutoff's ellipse
+CUTOFF_EDGE_NEEDLE = 1e-3  # across a needle a float32 position is a larger share of σ
 MERGED_FRAME = 1e-5  # Eq. 3 in one launch: a sum of splats, no other error than theirs (1e-6)
 BRUTE_FORCE = 1e-5  # per-line cells at the brute force's own times: the same sums in another order
 STANDING_PICTURE = 1e-5  # frames that must not depend on time differ by rounding alone
@@ -29,9 +34,8 @@ MICRO_VIEWS_ORDER = 8.0  # one micro-view (static) must be so much worse, or the
 
 # --- voxeliser and rays --------------------------------------------------------------------------------------
 VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
-VOXEL_BRICKS = (
-    1e-6  # a brick counts voxels from its own corner: a centre's float32 rest may round the other way
-)
+# a brick counts voxels from its own corner: the float32 rest of a centre may round the other way
+VOXEL_BRICKS = 1e-6
 VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
 ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders
@@ -44,6 +48,7 @@ DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.
 # --- FDK -----------------------------------------------------------------------------------------------------
 BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1
 FDK_MEAN = 0.02  # mean inside a sphere: 90 views, 32³ voxels, a cone of ±10°, samples of the edge
+FDK_SHEPP_LOGAN = 0.04  # of a brain at 0.2 in a skull at 1, averaged over some voxels near the mid-plane
 FDK_SCALE = 1e-4  # frames are equal to float32 rounding; the ramp filter amplifies it
 RAMP = 1e-5  # float32 result of a float64 FFT
 
@@ -57,8 +62,26 @@ TV_GRADIENT = 1e-7  # a sum of six signs times a weight
 PARAMETER_GRADIENT = 1e-5  # of the largest: float32 ratio of scales, squared
 
 # --- optimiser -----------------------------------------------------------------------------------------------
-ADAM_TEXTBOOK = (
-    1e-6  # of the largest rate: ε is folded differently, which shows in gradients near 1e-9 alone (not used)
-)
+ADAM_TEXTBOOK = 1e-6  # of the largest rate: ε = 1e-15 is folded differently, gradients go down to 1e-6
 ADAM_KERNEL = 5e-5  # of the largest rate, over some steps on raw numbers near 1 in float32
 ADAM_SECOND_MOMENT = 2e-5  # 1 − 0.999 in float32 is 1.3e-5 too small: a common factor, 6e-6 of every step
+
+# --- activation ----------------------------------------------------------------------------------------------
+ACTIVATION_INVERSE = 1e-7  # logit and the inverse of softplus lose digits near their ends
+ACTIVATION_MARGIN = 1.001e-4  # a scale at its bound is inverted from 1e-4 of the span inside
+
+# --- simulation ----------------------------------------------------------------------------------------------
+ANALYTIC_FRAME = 1e-6  # float32 frames of float64 closed forms
+# default samples against four times as many, relative L2 of Shepp–Logan: 6e-4, on finer detectors 1.0e-3
+TIME_SAMPLING = 2e-3
+# relative L2 of 64³ voxels to the closed form: Shepp–Logan's skull is a voxel thick (0.065)
+VOXEL_SOURCE = 0.08
+
+# --- reconstruction ------------------------------------------------------------------------------------------
+WHOLE_VALUE = 1e-5  # the image terms in float32
+# goal 1e-3, through everything (9e-7); other devices may sign tiny TV differences otherwise
+WHOLE_GRADIENT = 1e-4
+SCALE_LAW = 1e-2  # 30 steps: rounding decides signs of L1 near its kink (1.1e-3); powers of two are exact
+# counts are divided in float64 but come out float32 (0 here); one last place would act as above
+GAIN_LAW = 1e-2
+CLOUD_VOLUME = 2e-3  # a voxel at the cutoff's edge (0.1 % of a peak) may fall on the other side

@@ -97,7 +97,8 @@ class Runtime:
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 built = cl.Program(self.context, kernel_source(program)).build(options=list(options))
         except cl.RuntimeError as error:
-            message = " ".join(str(error).split())[-600:]
+            message_lines = [line for line in str(error).splitlines() if "error:" in line]
+            message = " ".join((message_lines or str(error).splitlines())[:3])[:600]
             raise DeviceError(
                 f"kernel {program}.cl on {self.device.name}",
                 message,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tolerances import ACTIVATION_INVERSE, ACTIVATION_MARGIN, FLOAT32, FLOAT64
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Gaussians
@@ -15,11 +16,13 @@ def test_invert_is_the_inverse(make_cloud) -> None:
     rows = make_cloud(40, 81, scale=(0.02, 0.4))
     rows[10, :5] = [1e-9, 1e-5, 1e-2, 5.0, 80.0]
     np.testing.assert_allclose(
-        ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=1e-6
+        ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=FLOAT32
     )  # float32 quaternions
     raw = np.random.default_rng(82).normal(size=(11, 40))
     raw[6:10] /= np.linalg.norm(raw[6:10], axis=0)
-    np.testing.assert_allclose(ACTIVATION.invert(ACTIVATION.apply(raw)), raw, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(
+        ACTIVATION.invert(ACTIVATION.apply(raw)), raw, rtol=ACTIVATION_INVERSE, atol=ACTIVATION_INVERSE
+    )
 
 
 def test_any_raw_numbers_give_valid_parameters() -> None:
@@ -27,7 +30,7 @@ def test_any_raw_numbers_give_valid_parameters() -> None:
     rows = ACTIVATION.apply(raw)
     assert np.all((rows[3:6] >= 0.01) & (rows[3:6] <= 0.5))
     assert np.all(rows[10] > 0) and np.all(np.isfinite(rows))
-    np.testing.assert_allclose(np.linalg.norm(rows[6:10], axis=0), 1, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(rows[6:10], axis=0), 1, rtol=FLOAT64)
     np.testing.assert_array_equal(rows[:3], raw[:3])
 
 
@@ -38,17 +41,17 @@ def test_scales_at_or_past_their_bounds_stay_optimisable(make_cloud) -> None:
     raw = ACTIVATION.invert(rows)
     assert np.all(np.isfinite(raw)) and np.abs(raw[3:6]).max() < 10
     np.testing.assert_allclose(
-        ACTIVATION.apply(raw)[3:6], np.clip(rows[3:6], 0.01, 0.5), atol=1e-4 * 0.49 * 1.001
+        ACTIVATION.apply(raw)[3:6], np.clip(rows[3:6], 0.01, 0.5), rtol=0, atol=ACTIVATION_MARGIN * 0.49
     )
 
 
 def test_gaussians_and_rows_are_the_same_cloud(make_cloud) -> None:
     rows = make_cloud(7, 85)
     cloud = Gaussians.from_rows(rows)
-    np.testing.assert_allclose(cloud.rows(), rows, rtol=1e-6)
+    np.testing.assert_allclose(cloud.rows(), rows, rtol=FLOAT32)
     scaled = cloud.scaled(10.0, 0.1).rows()
-    np.testing.assert_allclose(scaled[:6], 10 * rows[:6], rtol=1e-12)
-    np.testing.assert_allclose(scaled[10], rows[10] / 10, rtol=1e-12)
+    np.testing.assert_allclose(scaled[:6], 10 * rows[:6], rtol=FLOAT64)
+    np.testing.assert_allclose(scaled[10], rows[10] / 10, rtol=FLOAT64)
     assert Gaussians.from_rows(np.zeros((11, 0))).rows().shape == (11, 0)
 
 

@@ -79,7 +79,7 @@ def test_masked_pixels_pull_at_nothing(any_rt) -> None:
 def test_a_frame_without_any_pixel_has_no_gradient(rt) -> None:
     rendered, measured = images((12, 16))
     value, gradient = on_device(rt, rendered, measured, np.zeros((12, 16)), 0.2)
-    assert value == pytest.approx(0, abs=1e-6)
+    assert value == pytest.approx(0, abs=IMAGE_VALUE)
     np.testing.assert_array_equal(gradient, 0)
 
 

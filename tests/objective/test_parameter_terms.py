@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import PARAMETER_GRADIENT, TWIN_GRADIENT
+from tolerances import FLOAT32, FLOAT64, PARAMETER_GRADIENT, TWIN_GRADIENT
 
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.objective import ParameterTerms, parameter_loss
@@ -28,7 +28,7 @@ def test_values_by_hand() -> None:
     rows = np.zeros((11, 2))
     rows[3:6, 0], rows[3:6, 1], rows[10] = [0.1, 0.2, 0.5], [0.05, 0.1, 0.1], [1.0, 3.0]
     value, _ = parameter_loss(rows, TERMS)
-    assert value == pytest.approx(0.3 * 2 + 0.7 * ((5 - 3) ** 2 + (0.08 - 0.05) ** 2) / 2, rel=1e-12)
+    assert value == pytest.approx(0.3 * 2 + 0.7 * ((5 - 3) ** 2 + (0.08 - 0.05) ** 2) / 2, rel=FLOAT64)
 
 
 def test_no_gaussian_costs_nothing() -> None:
@@ -50,7 +50,7 @@ def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_difference
     statistics = any_rt.zeros((2, stride))
     adam.activate(device_raw, parameters, count, stride)
     np.testing.assert_allclose(
-        any_rt.download(parameters)[:, :count], activation.apply(raw), rtol=2e-6, atol=1e-7
+        any_rt.download(parameters)[:, :count], activation.apply(raw), rtol=FLOAT32, atol=FLOAT32
     )
     adam.chain(
         device_raw,
@@ -88,5 +88,5 @@ def test_statistics_gather_norms_and_sightings(any_rt, make_cloud) -> None:
         weights = {"density_weight": 0.0, "shape_weight": 0.0, "shape_ratio": 10.0, "shape_floor": 0.0}
         adam.chain(device_raw, parameters, any_rt.upload(by), statistics, count, stride, **weights)
     found = any_rt.download(statistics)
-    np.testing.assert_allclose(found[0, :count], [15.0, 6.0, 30.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(found[0, :count], [15.0, 6.0, 30.0, 0.0], rtol=FLOAT32)
     np.testing.assert_array_equal(found[1, :count], [3, 3, 3, 0])

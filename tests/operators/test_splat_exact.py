@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import CUTOFF_EDGE_SIGMA, SPLAT_AFFINE, SPLAT_CLOUD, SPLAT_COMPACT, SPLAT_NEEDLE
+from tolerances import (
+    CUTOFF_EDGE_NEEDLE,
+    CUTOFF_EDGE_SIGMA,
+    SPLAT_AFFINE,
+    SPLAT_CLOUD,
+    SPLAT_COMPACT,
+    SPLAT_NEEDLE,
+)
 
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, SplatProjector
@@ -78,6 +85,28 @@ def test_single_gaussians_on_512_pixels(any_rt, one_cell, smallest_px, aspects, 
             rows = random_gaussian(rng, smallest_px, aspect)
             image = projector.project(rows, DeviceCells.upload(any_rt, one_cell(pose, SIDE)))
             assert error_of_peak(image, rows, pose) <= tolerance, rows[:, 0]
+
+
+def test_positions_keep_their_digits_far_from_pixel_0(any_rt, one_cell) -> None:
+    """Column 4000 in plain float32 would be off by 2e-4 pixels, 2e-4 of the peak of a splat as sharp as these."""
+    shape = (16, 4096)
+    geometry = ConeGeometry(5.0, 7.5, shape, (3.9 / 4096, 3.9 / 4096))
+    projector = SplatProjector(any_rt, *shape, cutoff_sigma=0.0)
+    rng = np.random.default_rng(12)
+    for y in (-1.2, -0.7, 0.9, 1.2):
+        pose = geometry.pose(rng.uniform(0, 2 * np.pi))
+        across = pose[6:9] / np.linalg.norm(pose[6:9])
+        rows = np.zeros((11, 1))
+        rows[:3, 0], rows[3:6, 0] = y * across, 0.6 * geometry.pixel_size_mm[0] / geometry.magnification
+        rows[6], rows[10] = 1.0, 1.0
+        rows = rows.astype(np.float32).astype(np.float64)
+        image = projector.project(rows, DeviceCells.upload(any_rt, one_cell(pose, 16)))
+        u = int(centre_on_detector(rows, pose)[1]) - 8
+        expected = splat_image(rows, part_of(pose, (0, u), 1), (16, 16))
+        assert expected.max() > 0.5 * np.sqrt(2 * np.pi) * rows[3, 0]
+        np.testing.assert_allclose(
+            image[:, u : u + 16], expected, rtol=0, atol=SPLAT_COMPACT * expected.max()
+        )
 
 
 SHAPES = [(61, 77), (17, 5), (1, 1), (1, 33), (40, 1)]
@@ -175,7 +204,10 @@ def test_needle_bounding_boxes_hold_their_ellipse(any_rt, one_cell, make_geometr
     ).T
     pose = LARGE.pose(0.0)
     image = render(any_rt, rows, one_cell(pose, SIDE), (SIDE, SIDE))
-    low, high = (splat_image(rows, pose, (SIDE, SIDE), DEFAULT_CUTOFF_SIGMA + e) for e in (-1e-3, 1e-3))
+    low, high = (
+        splat_image(rows, pose, (SIDE, SIDE), DEFAULT_CUTOFF_SIGMA + e)
+        for e in (-CUTOFF_EDGE_NEEDLE, CUTOFF_EDGE_NEEDLE)
+    )
     columns = np.flatnonzero(high.any(axis=0))
     assert columns.size > 150 and np.ptp(columns) > 300  # long, and thinner than a pixel
     slack = SPLAT_NEEDLE * high.max()

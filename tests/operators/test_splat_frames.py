@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import BRUTE_FORCE, MERGED_FRAME, MICRO_VIEWS_FINE, MICRO_VIEWS_ORDER, STANDING_PICTURE
+from tolerances import (
+    BRUTE_FORCE,
+    FLOAT64,
+    MERGED_FRAME,
+    MICRO_VIEWS_FINE,
+    MICRO_VIEWS_ORDER,
+    STANDING_PICTURE,
+)
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
@@ -64,7 +71,7 @@ def test_fused_equals_unfused(rt, make_cloud, orbit, axis, direction, strips, su
         render(rt, rows, table, cutoff_sigma=0.0), expected, rtol=0, atol=MERGED_FRAME * expected.max()
     )
     twin = splat_frame(rows, table, SHAPE)
-    np.testing.assert_allclose(twin, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(twin, expected, rtol=0, atol=FLOAT64)
 
 
 def test_fused_in_every_build(any_rt, make_cloud, orbit) -> None:

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import CUTOFF_EDGE_SIGMA, FINITE_DIFFERENCE_STEP, GRADIENT, VOXEL, VOXEL_BRICKS, VOXEL_NEEDLE
+from tolerances import (
+    CUTOFF_EDGE_NEEDLE,
+    CUTOFF_EDGE_SIGMA,
+    FINITE_DIFFERENCE_STEP,
+    FLOAT64,
+    GRADIENT,
+    VOXEL,
+    VOXEL_BRICKS,
+    VOXEL_NEEDLE,
+)
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
@@ -60,7 +69,7 @@ def test_sub_grid_has_the_voxels_of_its_grid() -> None:
     grid = GRIDS[0]
     part = sub_grid(grid, (2, 3, 5), (4, 6, 7))
     for axis, inner, first, count in zip(grid.axes_mm(), part.axes_mm(), (2, 3, 5), (4, 6, 7), strict=True):
-        np.testing.assert_allclose(inner, axis[first : first + count], atol=1e-14)
+        np.testing.assert_allclose(inner, axis[first : first + count], rtol=0, atol=FLOAT64)
 
 
 def test_no_gaussian_gives_an_empty_volume(any_rt) -> None:
@@ -76,7 +85,10 @@ def test_needles_keep_their_digits_and_their_boxes(any_rt) -> None:
         rows = np.array([[*middle, 0.4, 0.0004, 0.004, *(turn / np.linalg.norm(turn)), 1.5]]).T
         rows = rows.astype(np.float32).astype(np.float64)
         volume = voxelise(any_rt, rows, grid)
-        low, high = (voxel_field(rows, *grid.axes_mm(), DEFAULT_CUTOFF_SIGMA + e) for e in (-1e-2, 1e-2))
+        low, high = (
+            voxel_field(rows, *grid.axes_mm(), DEFAULT_CUTOFF_SIGMA + e)
+            for e in (-CUTOFF_EDGE_NEEDLE, CUTOFF_EDGE_NEEDLE)
+        )
         assert high.max() > 0.9
         assert np.all(volume >= low - VOXEL_NEEDLE * 1.5) and np.all(volume <= high + VOXEL_NEEDLE * 1.5)
 

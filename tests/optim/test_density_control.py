@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tolerances import FLOAT64
 
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.optim import DensityControl, Population, control_density, prune
@@ -50,10 +51,10 @@ def test_a_clone_shares_place_shape_and_mass(population) -> None:
     rows = ACTIVATION.apply(grown.raw)
     pair = np.flatnonzero(np.isclose(rows[2], -0.2))
     assert pair.size == 2
-    np.testing.assert_allclose(rows[:3, pair], np.array([[-0.2], [0.3], [-0.2]]) * np.ones(2), rtol=1e-9)
-    np.testing.assert_allclose(rows[3:6, pair], SMALL, rtol=1e-9)
-    np.testing.assert_allclose(rows[10, pair], 1.0, rtol=1e-9)  # half of 2 each
-    assert rows[10].sum() == pytest.approx(15.7, rel=1e-9)
+    np.testing.assert_allclose(rows[:3, pair], np.array([[-0.2], [0.3], [-0.2]]) * np.ones(2), rtol=FLOAT64)
+    np.testing.assert_allclose(rows[3:6, pair], SMALL, rtol=FLOAT64)
+    np.testing.assert_allclose(rows[10, pair], 1.0, rtol=FLOAT64)  # half of 2 each
+    assert rows[10].sum() == pytest.approx(15.7, rel=FLOAT64)
     moments = grown.moments[0, 0, pair]
     assert sorted(moments) == [0.0, 2.0]  # the old one keeps its moments, the new one has none
 
@@ -64,8 +65,8 @@ def test_a_split_gives_two_smaller_halves_from_within(population) -> None:
     rows = ACTIVATION.apply(grown.raw)
     children = np.flatnonzero(np.all(grown.moments == 0, axis=(0, 1)))
     assert children.size == 2
-    np.testing.assert_allclose(rows[3:6, children], LARGE / CONTROL.split_factor, rtol=1e-6)
-    np.testing.assert_allclose(rows[10, children], 2.0, rtol=1e-9)  # half of 4 each
+    np.testing.assert_allclose(rows[3:6, children], LARGE / CONTROL.split_factor, rtol=FLOAT64)
+    np.testing.assert_allclose(rows[10, children], 2.0, rtol=FLOAT64)  # half of 4 each
     assert not np.any(np.isclose(rows[10], 4.0))  # the parent is gone
     assert np.all(np.abs(rows[:3, children] - np.array([[0.0], [0.1], [0.2]])) < 5 * LARGE)
     assert np.ptp(rows[0, children]) > 0
@@ -87,7 +88,7 @@ def test_children_are_drawn_from_the_parent() -> None:
     covariance = np.cov(ACTIVATION.apply(grown.raw)[:3])
     expected = turn.as_matrix() @ np.diag(scale**2) @ turn.as_matrix().T
     np.testing.assert_allclose(
-        covariance, expected, atol=5 * 0.16 * np.sqrt(2 / (2 * count))
+        covariance, expected, rtol=0, atol=5 * 0.16 * np.sqrt(2 / (2 * count))
     )  # 5 standard errors
 
 
@@ -96,7 +97,7 @@ def test_rotate_is_scipys() -> None:
     quaternion, vector = rng.normal(size=(4, 9)), rng.normal(size=(3, 9))
     quaternion /= np.linalg.norm(quaternion, axis=0)
     expected = Rotation.from_quat(quaternion[[1, 2, 3, 0]].T).apply(vector.T).T
-    np.testing.assert_allclose(rotate(quaternion, vector), expected, atol=1e-13)
+    np.testing.assert_allclose(rotate(quaternion, vector), expected, rtol=0, atol=FLOAT64)
 
 
 @pytest.mark.parametrize("room", [0, 1, 2, 3])

@@ -1,0 +1,189 @@
+"""Whole reconstructions of a tiny scan: repeatable, independent of units and exposure, stoppable."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import CLOUD_VOLUME, FLOAT64, GAIN_LAW, SCALE_LAW
+
+from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
+from phyradgs_cl.detector import attenuation_to_counts, counts_to_attenuation
+from phyradgs_cl.errors import InputError, NumericalError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import voxelise
+from phyradgs_cl.optim import DensityControl
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors import splatting
+from phyradgs_cl.reconstructors.phyradgs import phyradgs
+from phyradgs_cl.reconstructors.r2 import r2
+from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+
+CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)
+OPTIONS = SplatOptions(
+    motion=Motion("micro-views", 4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
+)
+STEADY = replace(OPTIONS, control=DensityControl(every=0))
+
+
+def make_scan(half_size_mm: float = 1.0) -> Scan:
+    """Shepp–Logan, 6 frames of 24² over 20° each; attenuation goes as one over the size."""
+    pitch = 3.9 / 24 * half_size_mm
+    geometry = ConeGeometry(5 * half_size_mm, 7.5 * half_size_mm, (24, 24), (pitch, pitch))
+    source = AnalyticSource(shepp_logan(half_size_mm), geometry)
+    protocol = Protocol(views=6, exposure_deg=20.0)
+    return simulate(source, geometry, Grid.cube(16, 2 * half_size_mm), SimulationOptions(protocol))
+
+
+@pytest.fixture(scope="module")
+def scan() -> Scan:
+    return make_scan()
+
+
+def difference(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+def test_same_seed_same_bits(rt, scan) -> None:
+    one, two, other = (phyradgs(scan, OPTIONS, rt, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.volume, two.volume)
+    np.testing.assert_array_equal(one.gaussians.rows(), two.gaussians.rows())
+    assert [r["loss"] for r in one.record] == [r["loss"] for r in two.record]
+    assert one.gaussians.count > OPTIONS.gaussians  # density control has acted
+    assert difference(other.volume, one.volume) > 0.01
+
+
+def test_every_build_repeats_itself(any_rt, scan) -> None:
+    one, two = (phyradgs(scan, replace(OPTIONS, iterations=12), any_rt, seed=1) for _ in range(2))
+    np.testing.assert_array_equal(one.volume, two.volume)
+
+
+def test_lengths_times_a_power_of_two_change_no_bit(rt, scan) -> None:
+    plain, large = phyradgs(scan, OPTIONS, rt, seed=1), phyradgs(make_scan(1024.0), OPTIONS, rt, seed=1)
+    np.testing.assert_array_equal(large.volume * np.float32(1024), plain.volume)
+    np.testing.assert_allclose(large.gaussians.scale, plain.gaussians.scale * 1024, rtol=FLOAT64)
+    np.testing.assert_allclose(large.gaussians.density, plain.gaussians.density / 1024, rtol=FLOAT64)
+
+
+def test_lengths_times_1000_with_attenuation_by_1000(rt, scan) -> None:
+    plain, large = phyradgs(scan, STEADY, rt, seed=1), phyradgs(make_scan(1000.0), STEADY, rt, seed=1)
+    assert difference(large.volume * 1000, plain.volume) <= SCALE_LAW
+
+
+@pytest.mark.parametrize("gain", [2.0, 3.7])
+def test_more_counts_make_the_same_volume(rt, scan, gain) -> None:
+    """Counts × gain, flats included: line integrals and volume stay."""
+
+    def from_counts(flat: float) -> np.ndarray:
+        counts = np.concatenate([np.full((1, 24, 24), flat), attenuation_to_counts(scan.projections, flat)])
+        p, unusable = counts_to_attenuation(counts, np.array([1] + [0] * 6), "counts")
+        assert not unusable.any()
+        return phyradgs(replace(scan, projections=p), STEADY, rt, seed=1).volume
+
+    assert difference(from_counts(1e4 * gain), from_counts(1e4)) <= GAIN_LAW
+
+
+def test_it_gets_better(rt, scan) -> None:
+    """200 iterations halve the loss of the first ones, and the volume comes nearer to the phantom."""
+    truth = shepp_logan(1.0).voxelise(scan.grid, 3)
+    short, long = (phyradgs(scan, replace(STEADY, iterations=n), rt, seed=1) for n in (1, 200))
+    assert long.record[-1]["loss"] < 0.5 * short.record[-1]["loss"]
+    assert difference(long.volume, truth) < 0.8 * difference(short.volume, truth)
+
+
+def test_the_cloud_is_the_volume(rt, scan) -> None:
+    """Gaussians in mm and 1/mm, voxelised on the scan's own grid, are the volume that came along."""
+    result = phyradgs(scan, OPTIONS, rt, seed=1)
+    again = voxelise(rt, result.gaussians.rows(), scan.grid, cutoff_sigma=OPTIONS.cutoff_sigma)
+    np.testing.assert_allclose(again, result.volume, rtol=0, atol=CLOUD_VOLUME * result.volume.max())
+    assert result.grid == scan.grid and result.facts["interrupted_at"] is None
+    assert result.volume.min() >= 0 and result.facts["gaussians"] == result.gaussians.count
+
+
+@pytest.mark.parametrize("how", ["a report that raises", "a signal"])
+def test_ctrl_c_keeps_what_there_is_and_can_go_on(rt, scan, monkeypatch, how) -> None:
+    """Stopped after 8 of 30 iterations; resumed from there, the volume is that of an undisturbed run, bit for bit."""
+    monkeypatch.setattr(splatting, "REPORT_EVERY", 4)
+    seen: list[int] = []
+
+    def stop_at_8(progress: Progress) -> None:
+        seen.append(progress.iteration)
+        if progress.iteration == 8 and how == "a signal":
+            os.kill(os.getpid(), signal.SIGINT)
+        elif progress.iteration == 8:
+            raise KeyboardInterrupt
+
+    stopped = phyradgs(scan, OPTIONS, rt, seed=1, report=stop_at_8)
+    assert seen == [4, 8] and [r["iteration"] for r in stopped.record] == [4, 8]
+    assert stopped.facts["interrupted_at"] == 8
+    assert stopped.volume.shape == scan.grid.shape and np.all(np.isfinite(stopped.volume))
+    assert stopped.volume.max() > 0
+    whole = phyradgs(scan, OPTIONS, rt, seed=1)
+    assert whole.facts["interrupted_at"] is None and whole.state is None
+    assert np.any(whole.volume != stopped.volume)
+    resumed = phyradgs(scan, OPTIONS, rt, seed=1, resume=stopped.state)
+    np.testing.assert_array_equal(resumed.volume, whole.volume)
+
+
+def test_no_iteration_gives_the_first_cloud(rt, scan) -> None:
+    result = phyradgs(scan, replace(OPTIONS, iterations=0), rt, seed=1)
+    assert 0 < result.gaussians.count <= OPTIONS.gaussians
+    assert result.record == [] and result.volume.max() > 0
+
+
+def test_an_empty_scan_ends_in_an_empty_volume(rt, scan) -> None:
+    empty = replace(scan, projections=np.zeros_like(scan.projections))
+    result = phyradgs(empty, replace(STEADY, iterations=5), rt)
+    assert np.all(np.isfinite(result.volume))
+    assert result.volume.mean() < 0.05
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_numbers_that_overflow_are_an_error_and_no_volume(rt, scan) -> None:
+    wild = scan.projections.copy()
+    wild[0, 3, 3] = np.inf
+    with pytest.raises(NumericalError, match="projections"):
+        phyradgs(replace(scan, projections=wild), STEADY, rt)
+
+
+def test_masked_pixels_have_no_say(rt, scan) -> None:
+    mask = np.zeros((6, 24, 24), np.uint8)
+    mask[2, 5:9, 7:12] = 1
+    masked = replace(scan, pixel_mask=mask)
+    spoiled = scan.projections.copy()
+    spoiled[mask != 0] = 40.0
+    one, two = (phyradgs(s, OPTIONS, rt, seed=1) for s in (masked, replace(masked, projections=spoiled)))
+    np.testing.assert_array_equal(one.volume, two.volume)
+
+
+def test_r2_is_affine_and_static_unless_told(rt, scan) -> None:
+    exact = phyradgs(scan, replace(STEADY, iterations=5), rt, seed=1)
+    affine = r2(scan, replace(STEADY, iterations=5), rt, seed=1)
+    assert affine.facts["method"] == "r2" and affine.facts["options"]["affine"] is True
+    assert exact.facts["method"] == "phyradgs" and exact.facts["options"]["affine"] is False
+    assert 1e-4 < difference(affine.volume, exact.volume) < 0.2
+
+
+def test_motion_matters(rt, scan) -> None:
+    static, moving = (
+        phyradgs(scan, replace(STEADY, motion=motion), rt, seed=1) for motion in (Motion("static"), Motion())
+    )
+    assert difference(static.volume, moving.volume) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("change", "option"),
+    [
+        ({"iterations": -1}, "--iterations"),
+        ({"gaussians": -1}, "--gaussians"),
+        ({"motion": Motion("per-line")}, "--motion"),
+    ],
+)
+def test_impossible_options_are_named(change, option) -> None:
+    with pytest.raises(InputError, match=option):
+        SplatOptions(**change)

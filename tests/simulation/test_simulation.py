@@ -1,0 +1,178 @@
+"""The simulator: each line over its own window, sampled finely enough, with scaling, noise and refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import ANALYTIC_FRAME, FLOAT32, TIME_SAMPLING, VOXEL_SOURCE
+
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, make_protocol, pixel_centres
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import EllipsoidPhantom, shepp_logan
+from phyradgs_cl.simulation import (
+    AnalyticSource,
+    SimulationOptions,
+    VolumeSource,
+    default_time_samples,
+    line_groups,
+    simulate,
+)
+
+SHAPE = (14, 18)
+GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 14, 3.9 / 18))
+GRID = Grid.cube(16, 2.0)
+PHANTOM = shepp_logan(1.0)
+FLY = Protocol(views=3, exposure_deg=12.0, readout_ratio=0.5)
+
+
+def run(options: SimulationOptions, phantom: EllipsoidPhantom = PHANTOM, **more: object):
+    return simulate(AnalyticSource(phantom, GEOMETRY), GEOMETRY, GRID, options, **more)
+
+
+def integrals(angle_rad: float) -> np.ndarray:
+    pose = GEOMETRY.pose(angle_rad)
+    return PHANTOM.line_integrals(pose[:3], pixel_centres(pose, SHAPE))
+
+
+@pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
+@pytest.mark.parametrize("model", ["log", "intensity"])
+def test_every_line_averages_over_its_own_window(axis, direction, model) -> None:
+    """Angles written out: line r opens r/(H−1) of the readout late, and sees 12° from there on."""
+    samples, frame = 5, 1
+    options = SimulationOptions(FLY, axis, direction, model, time_samples=samples)
+    found = run(options).projections[frame]
+    lines = SHAPE[0] if axis == "rows" else SHAPE[1]
+    expected = np.zeros(SHAPE)
+    for line in range(lines):
+        order = line if direction > 0 else lines - 1 - line
+        delay_deg = order / (lines - 1) * 0.5 * 12.0
+        angles = np.deg2rad(frame * 120.0 + delay_deg + (np.arange(samples) + 0.5) / samples * 12.0)
+        stack = np.stack([integrals(a) for a in angles])
+        mean = stack.mean(axis=0) if model == "log" else -np.log(np.exp(-stack).mean(axis=0))
+        where = (line, slice(None)) if axis == "rows" else (slice(None), line)
+        expected[where] = mean[where]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=ANALYTIC_FRAME * expected.max())
+
+
+def test_stop_and_shoot_stands_at_the_middle_of_the_fly_scans_window() -> None:
+    still = run(SimulationOptions(replace(FLY, is_fly=False)))
+    assert not still.is_fly
+    for frame in range(3):
+        expected = integrals(np.deg2rad(frame * 120.0 + 12.0 * 1.5 / 2))
+        np.testing.assert_allclose(
+            still.projections[frame], expected, rtol=0, atol=ANALYTIC_FRAME * expected.max()
+        )
+
+
+@pytest.mark.parametrize("protocol", ["rapid", "standard"])
+@pytest.mark.parametrize("source", ["analytic", "voxels"])
+def test_default_time_samples_are_enough(rt, protocol, source) -> None:
+    """Four times the samples change a frame by less than the stated share (relative L2)."""
+    fly = replace(make_protocol(protocol), views=2)
+    if source == "analytic":
+        frames = AnalyticSource(PHANTOM, GEOMETRY)
+    else:
+        frames = VolumeSource(rt, PHANTOM.voxelise(GRID), GRID, GEOMETRY, "rows")
+    samples = default_time_samples(fly, GRID)
+    coarse, fine = (
+        simulate(frames, GEOMETRY, GRID, SimulationOptions(fly, time_samples=n)).projections
+        for n in (samples, 4 * samples)
+    )
+    error = np.linalg.norm(coarse - fine) / np.linalg.norm(fine)
+    assert 0 < error <= TIME_SAMPLING
+
+
+def test_default_time_samples_follow_arc_and_voxels() -> None:
+    fine = Grid.cube(256, 2.0)
+    rapid, standard = (default_time_samples(make_protocol(name), fine) for name in ("rapid", "standard"))
+    arc_voxels = np.deg2rad(14.4) * 128
+    assert rapid == int(np.ceil(2 * arc_voxels)) and standard == int(np.ceil(arc_voxels))
+    assert default_time_samples(make_protocol("rapid"), GRID) == 8
+    assert default_time_samples(Protocol(exposure_deg=300.0), fine) == 128
+    assert run(SimulationOptions(FLY)).provenance["time_samples"] == 8
+
+
+def test_voxels_and_closed_form_meet(rt) -> None:
+    grid = Grid.cube(64, 2.0)
+    source = VolumeSource(rt, PHANTOM.voxelise(grid, 3), grid, GEOMETRY, "columns")
+    options = SimulationOptions(FLY, "columns", time_samples=4)
+    voxels = simulate(source, GEOMETRY, grid, options).projections
+    exact = run(options).projections
+    assert np.linalg.norm(voxels - exact) <= VOXEL_SOURCE * np.linalg.norm(exact)
+
+
+def test_peak_scales_frames_and_reference_alike() -> None:
+    reference = PHANTOM.voxelise(GRID)
+    plain, peaked = (run(SimulationOptions(FLY, peak=p), reference=reference) for p in (0.0, 4.0))
+    factor = peaked.provenance["attenuation_factor"]
+    assert peaked.projections.max() == pytest.approx(4.0, rel=FLOAT32) and factor > 1
+    np.testing.assert_allclose(peaked.projections, plain.projections * factor, rtol=FLOAT32)
+    np.testing.assert_allclose(peaked.reference, reference * factor, rtol=FLOAT32)
+    np.testing.assert_array_equal(plain.reference, reference)
+
+
+def test_peak_of_nothing_is_refused() -> None:
+    with pytest.raises(InputError, match="--peak"):
+        run(SimulationOptions(FLY, peak=4.0), EllipsoidPhantom((), "nothing"))
+
+
+@pytest.mark.parametrize("noise", ["tigre", "beer"])
+def test_noise_has_a_seed_and_a_dose(noise) -> None:
+    clean = run(SimulationOptions(FLY)).projections
+    one, same, other = (
+        run(SimulationOptions(FLY, noise=noise, dose=1e4, seed=seed)).projections for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one, same)
+    assert np.any(one != other)
+    faint = run(SimulationOptions(FLY, noise=noise, dose=1e2, electronic_noise=0.0, seed=1)).projections
+    assert 0 < np.std(one - clean) < np.std(faint - clean) / 3
+
+
+def test_jitter_moves_the_true_gantry_and_is_recorded() -> None:
+    steady, shaken = (run(SimulationOptions(FLY, jitter_deg=j, seed=3)) for j in (0.0, 2.0))
+    assert np.abs(steady.projections - shaken.projections).max() > 1e-3
+    time_s = steady.frame_start_s[1] + np.linspace(0, steady.shutter.span_s, 5)
+    wander = shaken.trajectory.angle_rad(1, time_s) - steady.trajectory.angle_rad(1, time_s)
+    assert 0 < np.abs(wander).max() < np.deg2rad(10)
+    shaken.check_timing()  # the encoder covers every frame's window
+
+
+def test_line_groups_cover_every_line_once() -> None:
+    options = SimulationOptions(FLY, "columns", -1, time_samples=3)
+    tables = []
+
+    class Recorder:
+        def frame(self, cells, model, factor):
+            tables.append(cells)
+            return np.zeros(SHAPE, np.float32)
+
+    simulate(Recorder(), GEOMETRY, GRID, options)
+    groups = list(line_groups(tables[0]))
+    assert [(start, stop) for start, stop, _ in groups] == [(line, line + 1) for line in range(SHAPE[1])]
+    assert sorted(np.concatenate([members for _, _, members in groups])) == list(range(tables[0].count))
+
+
+def test_progress_is_reported_frame_by_frame() -> None:
+    seen: list[tuple[int, int]] = []
+    run(SimulationOptions(FLY), report=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize(
+    ("change", "option"),
+    [
+        ({"noise": "white"}, "--noise"),
+        ({"peak": -1.0}, "--peak"),
+        ({"peak": np.nan}, "--peak"),
+        ({"dose": 0.0}, "--dose"),
+        ({"electronic_noise": -1.0}, "--electronic-noise"),
+        ({"jitter_deg": np.inf}, "--jitter-deg"),
+        ({"time_samples": -1}, "--time-samples"),
+    ],
+)
+def test_impossible_options_are_named(change, option) -> None:
+    with pytest.raises(InputError, match=option):
+        SimulationOptions(**change)
