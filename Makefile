@@ -43,6 +43,9 @@ demo: $(VENV)/.installed-cpu
 	$(PHYRADGS) evaluate $(OUT)/phyradgs.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/phyradgs.json
 	@$(BIN)/python benchmarks/demo_table.py "fdk=$(OUT)/fdk.json" "phyradgs, static=$(OUT)/static.json" \
 		"phyradgs=$(OUT)/phyradgs.json"
+	@$(BIN)/python benchmarks/demo_picture.py $(OUT)/slices.png $(OUT)/scan.h5 "fdk=$(OUT)/fdk.h5" \
+		"phyradgs, static=$(OUT)/static.h5" "phyradgs=$(OUT)/phyradgs.h5"
+	@echo "pictures: $(OUT)/slices.png and one beside each volume"
 
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .

@@ -269,7 +269,7 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
             str(reference_path), f"shape {reference.shape}", f"shape {stored.volume.shape} of {volume_path}"
         )
     metrics = compare(stored.volume, reference)
-    title = f"{stored.provenance.get('method', 'volume')}: {metrics['psnr_db']:.2f} dB, SSIM {metrics['ssim']:.3f}"
+    title = f"{stored.provenance.get('method', 'volume')}: {volume_path.name}"
     slices_png(picture, stored.volume, reference, title)
     known = {
         key: stored.provenance[key] for key in ("method", "seconds", "gaussians") if key in stored.provenance
