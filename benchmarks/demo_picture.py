@@ -1,4 +1,6 @@
-"""One picture of several reconstructions beside the truth: python benchmarks/demo_picture.py OUT.png SCAN.h5 LABEL=VOLUME.h5 ...
+"""One picture of several reconstructions beside the truth.
+
+    python benchmarks/demo_picture.py OUT.png SCAN.h5 LABEL=VOLUME.h5 ...
 
 Two orthogonal slices through the middle, all at the truth's grey scale, PSNR in the titles.
 """

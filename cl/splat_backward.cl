@@ -56,7 +56,7 @@ __kernel void splat_backward(
             {
                 vf num, b, rq;
                 const vf uu = (float)u + V_IOTA;
-                const vf du = ((float)(u - whole[REC_U_WHOLE]) - rec[REC_U_REST]) + V_IOTA;
+                const vf du = ((float)(u - whole[REC_U_WHOLE]) + V_IOTA) - rec[REC_U_REST];
                 const vf value = splat_value(s, uu, du, &num, &b, &rq);
                 const vf e = num * rq;
                 const vf w = V_PICK(0.0f, V_LOAD(row + u) * value, e <= limit);

@@ -71,7 +71,7 @@ __kernel void splat_forward(
                 for (int u = u_lo; u <= u_hi; u += LANES) {
                     vf num, b, rq;
                     const vf uu = (float)u + V_IOTA;
-                    const vf du = ((float)(u - whole[REC_U_WHOLE]) - rec[REC_U_REST]) + V_IOTA;
+                    const vf du = ((float)(u - whole[REC_U_WHOLE]) + V_IOTA) - rec[REC_U_REST];
                     const vf value = splat_value(s, uu, du, &num, &b, &rq);
                     V_STORE(V_LOAD(row + u) + V_PICK(0.0f, value, num * rq <= limit), row + u);
                 }

@@ -56,7 +56,7 @@ __kernel void voxel_forward(
                 const float k = b * b + c * c;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
                 for (int x = x_lo; x <= x_hi; x += LANES) {
-                    const vf dx = ((float)(x - whole[VOX_WHOLE]) - rec[VOX_REST]) + V_IOTA;
+                    const vf dx = ((float)(x - whole[VOX_WHOLE]) + V_IOTA) - rec[VOX_REST];
                     const vf a = rec[VOX_U11] * dx + a0;
                     const vf q = a * a + k;
                     const vf value = rec[VOX_DENSITY] * exp2(MINUS_HALF_LOG2E * q);

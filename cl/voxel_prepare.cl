@@ -8,7 +8,8 @@ __kernel void voxel_prepare(
     __global const float *gaussians,      /* (11, stride) */
     __global const coefficient *matrix,   /* (12): rows give the voxel index x, y, z of a world point */
     const float4 pitch,                   /* voxel size x, y, z */
-    const int4 shape,                     /* voxels along x, y, z */
+    const int4 start,                     /* first voxel of the part that is made, x, y, z */
+    const int4 shape,                     /* its voxels along x, y, z */
     const int count, const int stride,
     const float cutoff2,
     __global float *records,              /* (stride, VOXEL_RECORD) */
@@ -36,9 +37,10 @@ __kernel void voxel_prepare(
     const vf u23 = -v3_dot(sz, sy) * (inv_det * inv_u11) * (inv_det * inv_u11) / u22;
     const vf u33 = inv_det * inv_u11 / u22;
     vf rest[3];
-    const vf whole[3] = {wide_split(wide_dot(matrix, mx, my, mz), rest),
-                         wide_split(wide_dot(matrix + 4, mx, my, mz), rest + 1),
-                         wide_split(wide_dot(matrix + 8, mx, my, mz), rest + 2)};
+    /* split in the whole grid's frame, so that a part has the bits of the whole */
+    const vf whole[3] = {wide_split(wide_dot(matrix, mx, my, mz), rest) - (float)start.x,
+                         wide_split(wide_dot(matrix + 4, mx, my, mz), rest + 1) - (float)start.y,
+                         wide_split(wide_dot(matrix + 8, mx, my, mz), rest + 2) - (float)start.z};
     const vf sigma[3] = {sqrt(v3_dot(sx, sx)) / pitch.x, sqrt(v3_dot(sy, sy)) / pitch.y, sqrt(v3_dot(sz, sz)) / pitch.z};
     const int sizes[3] = {shape.x, shape.y, shape.z};
 

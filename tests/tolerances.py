@@ -35,7 +35,6 @@ MICRO_VIEWS_ORDER = 8.0  # one micro-view (static) must be so much worse, or the
 # --- voxeliser and rays --------------------------------------------------------------------------------------
 VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
 # a brick counts voxels from its own corner: the float32 rest of a centre may round the other way
-VOXEL_BRICKS = 1e-6
 VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
 ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders

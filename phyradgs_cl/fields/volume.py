@@ -63,6 +63,14 @@ class Grid:
         )
         return z, y, x
 
+    def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
+        """The voxels [start, start + shape) (z, y, x) as a grid of their own."""
+        z, y, x = (
+            first + (s + (n - 1) / 2) * d
+            for first, s, n, d in zip(self.first_centre_mm, start, shape, self.voxel_size_mm, strict=True)
+        )
+        return Grid(shape, self.voxel_size_mm, (z, y, x))
+
     def scaled(self, factor: float) -> Grid:
         """The same voxels with every length multiplied by ``factor``."""
         dz, dy, dx = (d * factor for d in self.voxel_size_mm)

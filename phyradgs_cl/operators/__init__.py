@@ -7,7 +7,7 @@ from phyradgs_cl.operators.backproject import backproject
 from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.rays import RayProjector
 from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA, SplatProjector
-from phyradgs_cl.operators.voxelise import Voxeliser, sub_grid, voxelise
+from phyradgs_cl.operators.voxelise import Voxeliser, voxelise
 
 __all__ = [
     "DEFAULT_CUTOFF_SIGMA",
@@ -17,6 +17,5 @@ __all__ = [
     "SplatProjector",
     "Voxeliser",
     "backproject",
-    "sub_grid",
     "voxelise",
 ]

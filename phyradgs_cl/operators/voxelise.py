@@ -46,10 +46,15 @@ class Voxeliser:
         self._extents = rt.empty(1, np.int32)
         self._defines = {"IMAGE_GUARD": GUARD}
 
-    def forward(self, gaussians: DeviceGaussians, grid: Grid) -> DeviceArray:
-        """The field on ``grid`` (lengths in the Gaussians' unit) in the padded layout, until the next call."""
+    def forward(
+        self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
+    ) -> DeviceArray:
+        """The field on the voxels [start, start + shape) of ``grid``, in the padded layout, until the next call.
+
+        Lengths in the Gaussians' unit; ``start`` runs z, y, x. A part has the same bits as the whole.
+        """
         rt = self.rt
-        self._prepare(gaussians, grid)
+        self._prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         kernel = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines)
         nz, ny, _ = self.shape
@@ -106,7 +111,7 @@ class Voxeliser:
             group=rt.group(),
         )
 
-    def _prepare(self, gaussians: DeviceGaussians, grid: Grid) -> None:
+    def _prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
         rt, stride = self.rt, gaussians.stride
         if self._records.size < stride * RECORD_FLOATS:
             self._records = rt.empty(stride * RECORD_FLOATS)
@@ -118,6 +123,7 @@ class Voxeliser:
             gaussians.rows,
             split_coefficients(rt, index_matrix(grid)),
             _pitch4(grid),
+            np.array([*start[::-1], 0], np.int32),
             self._shape4,
             np.int32(gaussians.count),
             np.int32(stride),
@@ -153,23 +159,15 @@ def voxelise(
     nz, ny, nx = grid.shape
     slab = max(1, min(nz, brick_bytes // (4 * ny * pitch_of(nx))))
     volume = np.empty(grid.shape, np.float32)
+    gaussians = DeviceGaussians.upload(rt, rows)
     voxelisers: dict[int, Voxeliser] = {}
     for start in range(0, nz, slab):
-        depth = min(slab, nz - start)
-        part = sub_grid(grid, (start, 0, 0), (depth, ny, nx))
-        if depth not in voxelisers:
-            voxelisers[depth] = Voxeliser(rt, part.shape, cutoff_sigma=cutoff_sigma)
-        volume[start : start + depth] = voxelisers[depth].voxelise(rows, part)
+        shape = (min(slab, nz - start), ny, nx)
+        if shape[0] not in voxelisers:
+            voxelisers[shape[0]] = Voxeliser(rt, shape, cutoff_sigma=cutoff_sigma)
+        part = voxelisers[shape[0]].forward(gaussians, grid, (start, 0, 0))
+        volume[start : start + shape[0]] = unpad_rows(rt.download(part), shape)
     return volume
-
-
-def sub_grid(grid: Grid, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
-    """The voxels [start, start + shape) of a grid, as a grid."""
-    centre = [
-        first + (s + (n - 1) / 2) * d
-        for first, s, n, d in zip(grid.first_centre_mm, start, shape, grid.voxel_size_mm, strict=True)
-    ]
-    return Grid(shape, grid.voxel_size_mm, (centre[0], centre[1], centre[2]))
 
 
 def index_matrix(grid: Grid) -> np.ndarray:

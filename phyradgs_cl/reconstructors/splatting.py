@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
-from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser, sub_grid, voxelise
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser, voxelise
 from phyradgs_cl.operators.layout import pad_columns, pad_rows, stride_of
 from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
 from phyradgs_cl.reconstructors.fdk import fdk_volume, unmasked_frames
@@ -188,10 +188,10 @@ class SplatRun:
             int(self.rng.integers(n - edge + 1))
             for n, edge in zip(self.grid.shape, self.crop.shape, strict=True)
         ]
-        part = sub_grid(self.grid, (start[0], start[1], start[2]), self.crop.shape)
-        by_volume = self.tv.evaluate(self.crop.forward(self.gaussians, part))
+        volume = self.crop.forward(self.gaussians, self.grid, (start[0], start[1], start[2]))
+        by_volume = self.tv.evaluate(volume)
         weight = self.options.tv_weight
-        self.crop.backward(self.gaussians, part, by_volume, self.gradients, add=True, weight=weight)
+        self.crop.backward(self.gaussians, self.grid, by_volume, self.gradients, add=True, weight=weight)
 
     def _checked_loss(self) -> float:
         loss = self.loss.value()

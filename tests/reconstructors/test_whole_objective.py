@@ -16,7 +16,6 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import ParameterTerms, image_loss, parameter_loss, total_variation
-from phyradgs_cl.operators import sub_grid
 from phyradgs_cl.operators.twins.splat import splat_frame, voxel_field
 from phyradgs_cl.optim import DensityControl, Population
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
@@ -74,7 +73,7 @@ def test_gradient_of_everything(rt, make_cloud, finite_differences, axis) -> Non
     rng = np.random.default_rng(SEED)  # draws as the loop does: the frame, then the corner of the crop
     frame = int(rng.permutation(3)[-1])
     start = [int(rng.integers(n - 6 + 1)) for n in GRID.shape]
-    crop = sub_grid(grid, (start[0], start[1], start[2]), (6, 6, 6))
+    crop = grid.part((start[0], start[1], start[2]), (6, 6, 6))
     table = internal(OPTIONS.motion.cells(scan, frame))
     measured = scan.projections[frame].astype(float) / UNIT.line_integral
     mask = (scan.pixel_mask == 0).astype(float)
