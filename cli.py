@@ -199,7 +199,7 @@ def simulate_command(
             start_deg=start_deg,
         ),
         readout_axis=readout.value if readout else described.readout_axis,
-        readout_direction=readout_direction or described.readout_direction,
+        readout_direction=described.readout_direction if readout_direction is None else readout_direction,
         detector_model=detector_model.value,
         peak=peak,
         noise=noise.value,
@@ -399,6 +399,10 @@ def run(arguments: list[str]) -> int:
     except PhyradgsError as error:
         typer.echo(f"phyradgs: {error}", err=True)
         return error.exit_code
+    except MemoryError as error:
+        text = " ".join(str(error).split())
+        typer.echo(f"phyradgs: not enough memory: {text}; use a smaller problem", err=True)
+        return 2
     except _CLICK_ERROR as error:
         text = " ".join(str(error.format_message()).split())  # type: ignore[attr-defined]
         typer.echo(f"phyradgs: {text or 'no command; see phyradgs --help'}", err=True)

@@ -23,6 +23,12 @@ def at_least(culprit: str, value: float, minimum: float) -> None:
         raise InputError(culprit, repr(value), f"a finite number, at least {minimum}")
 
 
+def within(culprit: str, value: float, lowest: float, highest: float) -> None:
+    """Raise InputError unless the scalar `value` is finite and between two bounds, both included."""
+    if not (_is_number(value) and math.isfinite(value) and lowest <= value <= highest):
+        raise InputError(culprit, repr(value), f"a number from {lowest} to {highest}")
+
+
 def one_of(culprit: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError unless `value` is among `allowed`, which the message lists."""
     choices = list(allowed)

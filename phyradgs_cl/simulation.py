@@ -9,10 +9,11 @@ from typing import Protocol as Interface
 import numpy as np
 from skimage.transform import resize_local_mean
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.detector import average, beer_lambert_noise, tigre_noise
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector
 from phyradgs_cl.phantoms import EllipsoidPhantom, load_volume, make_phantom
@@ -58,8 +59,8 @@ class SimulationOptions:
             raise InputError("--dose", str(self.dose), "photons a pixel, above 0")
         if not (np.isfinite(self.jitter_deg) and self.jitter_deg >= 0):
             raise InputError("--jitter-deg", str(self.jitter_deg), "an angle of at least 0°")
-        if self.time_samples < 0:
-            raise InputError("--time-samples", str(self.time_samples), "at least 1, or 0 to choose")
+        checks.within("--time-samples", self.time_samples, 0, 10_000)
+        checks.within("--seed", self.seed, 0, 2**63)
 
 
 def simulate(
@@ -98,6 +99,10 @@ def simulate(
     frames = np.empty((protocol.views, *geometry.detector_shape), np.float32)
     for frame, cells in enumerate(tables):
         frames[frame] = source.frame(cells, options.detector_model, factor)
+        if not np.all(np.isfinite(frames[frame])):
+            raise NumericalError(
+                f"frame {frame}", "line integrals that are not finite", "a smaller geometry or attenuation"
+            )
         report(frame + 1, protocol.views)
     return Scan(
         projections=_with_noise(frames, options, rng),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__
+from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Protocol, Scan, make_protocol
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
@@ -44,6 +44,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
 
 SPLAT_METHODS = ("phyradgs", "r2")
+LARGEST_GRID, LARGEST_DETECTOR = 4096, 32_000
 log = logging.getLogger(__name__)
 
 
@@ -73,6 +74,7 @@ def load_scanner_for(job: SimulationJob) -> Scanner:
     scanner = load_scanner(job.scanner, resource("data"))
     geometry = scanner.geometry
     if job.detector is not None:
+        checks.within("--detector", job.detector, 1, LARGEST_DETECTOR)
         rows, columns = geometry.detector_shape
         other = max(1, round(job.detector * rows / columns))
         geometry = with_detector_count(geometry, other, job.detector)
@@ -98,6 +100,8 @@ def run_simulation(
     report: Callable[[int, int], None],
 ) -> Scan:
     """Simulates and writes a scan file; everything is checked before any work."""
+    if job.volume is not None:
+        _refuse_overwriting("-o", job.output, job.volume)
     check_writable(job.output)
     scene = _scene(job, scanner, options, rt)
     scan = simulate(
@@ -117,11 +121,13 @@ def run_simulation(
 
 def _scene(job: SimulationJob, scanner: Scanner, options: SimulationOptions, rt: Runtime) -> Scene:
     axis = options.readout_axis
+    if job.size is not None:
+        checks.within("--size", job.size, 1, LARGEST_GRID)
     if job.volume is not None and job.phantom is not None:
         raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
     if job.volume is not None:
         return volume_scene(rt, str(job.volume), scanner.geometry, scanner.grid, job.size, axis)
-    size = job.size or max(scanner.grid.shape)
+    size = max(scanner.grid.shape) if job.size is None else job.size
     return phantom_scene(rt, job.phantom or "foot", scanner.geometry, scanner.grid, size, axis, options.seed)
 
 
@@ -150,8 +156,7 @@ def run_reconstruction(
     """
     options = method_options(job.method, job.preset, job.changes)
     check_writable(job.output)
-    if Path(job.output).resolve() == Path(job.scan).resolve():
-        raise InputError("-o", f"the scan file {job.output} itself", "another file for the volume")
+    _refuse_overwriting("-o", job.output, job.scan)
     scan = load_scan(job.scan)
     scan.check_timing()
     if scan.detector_model == "intensity":
@@ -259,6 +264,9 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume and writes the picture of slices."""
+    _refuse_overwriting("--picture", picture, volume_path, reference_path)
+    if picture.suffix.lower() != ".png":
+        raise InputError("--picture", str(picture), "a file name that ends in .png")
     check_writable(picture)
     stored = read_volume(volume_path)
     reference, grid = load_reference(reference_path)
@@ -281,6 +289,13 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
         "reference": str(reference_path),
         "picture": str(picture),
     }
+
+
+def _refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
+    """An output that is one of the inputs would destroy it."""
+    for path in inputs:
+        if Path(output).resolve() == Path(path).resolve():
+            raise InputError(option, f"the input file {path} itself", "another file to write")
 
 
 def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.scan import Scan
@@ -26,9 +27,8 @@ class Motion:
     def __post_init__(self) -> None:
         if self.name not in MOTIONS:
             raise InputError("motion", repr(self.name), f"one of {', '.join(MOTIONS)}")
-        if self.strips < 1 or self.sub_intervals < 1:
-            found = f"{self.strips} × {self.sub_intervals}"
-            raise InputError("strips × sub-intervals", found, "two counts of at least 1")
+        checks.within("strips", self.strips, 1, 10_000)
+        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """The time cells of one frame; a scan that is not a fly-scan has one pose a frame in every model."""

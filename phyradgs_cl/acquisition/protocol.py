@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
@@ -27,8 +28,10 @@ class Protocol:
     is_fly: bool = True
 
     def __post_init__(self) -> None:
-        if self.views < 1:
-            raise InputError("views", str(self.views), "at least 1 frame")
+        checks.within("views", self.views, 1, 100_000)
+        checks.within("start angle (degrees)", self.start_deg, -1e6, 1e6)
+        checks.within("exposure arc (degrees)", self.exposure_deg, 0, 3600)
+        checks.within("readout ratio", self.readout_ratio, 0, 1000)
         if not (np.isfinite(self.exposure_deg) and self.exposure_deg >= 0):
             raise InputError("exposure arc", f"{self.exposure_deg}°", "an angle of at least 0°")
         if not (np.isfinite(self.readout_ratio) and self.readout_ratio >= 0):

@@ -91,6 +91,13 @@ OPTIONS = {
         "--strips",
     ),
     "no strips": (["reconstruct", "{scan}", "--strips", "0"], "strips"),
+    "far too many strips": (["reconstruct", "{scan}", "--strips", "1000000000"], "strips"),
+    "far too many views": (["simulate", "--views", "1000000000"], "views"),
+    "far too large": (["simulate", "--size", "100000", "--detector", "8"], "--size"),
+    "size of nothing": (["simulate", "--size", "0", "--detector", "8"], "--size"),
+    "negative seed of a scan": (["simulate", "--seed", "-1", "--size", "8", "--detector", "8"], "--seed"),
+    "start at NaN": (["simulate", "--start-deg", "nan", "--size", "8", "--detector", "8"], "start"),
+    "direction 0": (["simulate", "--readout-direction", "0", "--size", "8", "--detector", "8"], "direction"),
     "negative iterations": (["reconstruct", "{scan}", "--iterations", "-5"], "--iterations"),
     "iterations of fdk": (["reconstruct", "{scan}", "--method", "fdk", "--iterations", "5"], "iterations"),
     "micro-views of fdk": (
@@ -182,3 +189,13 @@ def _expect_refusal(cli, capfd, folder, arguments, culprit):
     assert "Traceback" not in captured.err
     assert output.read_bytes() == b"an older result"
     assert sorted(p.name for p in folder.iterdir()) == before
+
+
+def test_inputs_are_never_overwritten_by_a_picture(cli, good_scan, tmp_path, capfd):
+    volume = tmp_path / "volume.h5"
+    assert cli.run(["reconstruct", str(good_scan), "-o", str(volume), "--method", "fdk"]) == 0
+    before = volume.read_bytes()
+    capfd.readouterr()
+    assert cli.run(["evaluate", str(volume), "--reference", str(good_scan), "--picture", str(volume)]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert volume.read_bytes() == before
