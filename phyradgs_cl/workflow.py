@@ -37,13 +37,18 @@ from phyradgs_cl.io import (
 )
 from phyradgs_cl.metrics import psnr, slices_png, ssim
 from phyradgs_cl.phantoms import load_volume
-from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, method_options, reconstruct
-from phyradgs_cl.reconstructors.result import SplatState
+from phyradgs_cl.reconstructors import (
+    METHODS,
+    ProgressReport,
+    Reconstruction,
+    State,
+    method_options,
+    reconstruct,
+)
 from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
 
-SPLAT_METHODS = ("phyradgs", "r2")
 LARGEST_GRID, LARGEST_DETECTOR = 4096, 32_000
 log = logging.getLogger(__name__)
 
@@ -208,43 +213,21 @@ def _fingerprint(scan_hash: str, job: ReconstructionJob, options: object) -> str
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _resumed(job: ReconstructionJob, fingerprint: str) -> SplatState:
-    if job.method not in SPLAT_METHODS:
+def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
+    resumable = [name for name, method in METHODS.items() if method.is_resumable]
+    if job.method not in resumable:
         raise InputError(
-            "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(SPLAT_METHODS)}"
+            "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(resumable)}"
         )
-    path = checkpoint_path(job.output)
-    arrays = read_checkpoint(path, fingerprint)
-    missing = {"raw", "moments", "statistics", "iteration", "queue", "rng"} - set(arrays)
-    if missing:
-        raise InputError(
-            str(path), f"no {', '.join(sorted(missing))}", "a whole checkpoint", "start without --resume"
-        )
-    return SplatState(
-        arrays["raw"],
-        arrays["moments"],
-        arrays["statistics"],
-        int(arrays["iteration"]),
-        [int(f) for f in arrays["queue"]],
-        str(arrays["rng"]),
-    )
+    return read_checkpoint(checkpoint_path(job.output), fingerprint)
 
 
 def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
     path = checkpoint_path(job.output)
     if result.state is None:
         path.unlink(missing_ok=True)
-        return
-    state = result.state
-    arrays = {
-        "raw": state.raw,
-        "moments": state.moments,
-        "statistics": state.statistics,
-        "iteration": np.array(state.iteration),
-        "queue": np.array(state.queue, np.int64),
-        "rng": np.array(state.rng),
-    }
-    write_checkpoint(path, arrays, fingerprint)
+    else:
+        write_checkpoint(path, dict(result.state), fingerprint)
 
 
 # --- evaluate -----------------------------------------------------------------------------------------------

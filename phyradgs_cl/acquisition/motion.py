@@ -10,14 +10,14 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.errors import InputError
 
-MOTIONS = ("static", "static-start", "micro-views", "per-line")
+MOTIONS = ("static", "static-start", "micro-views", "per-row")
 
 
 @dataclass(frozen=True)
 class Motion:
     """A named motion model; ``strips`` (M) and ``sub_intervals`` (N) matter to micro-views only.
 
-    ``per-line`` takes every line at its own N exact times; it is what the simulator uses.
+    ``per-row`` takes every line at its own N exact times; it is what the simulator uses.
     """
 
     name: str = "micro-views"

@@ -1,7 +1,7 @@
 """Methods: one file each, one signature for all, ``(scan, options, rt, seed, report) → Reconstruction``."""
 
 from phyradgs_cl.reconstructors.registry import METHODS, Method, method_options, reconstruct
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress
 
 __all__ = [
     "METHODS",
@@ -9,6 +9,7 @@ __all__ = [
     "Progress",
     "ProgressReport",
     "Reconstruction",
+    "State",
     "ignore_progress",
     "method_options",
     "reconstruct",

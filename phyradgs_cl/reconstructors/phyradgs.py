@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, SplatState, ignore_progress
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splatting import reconstruct_splats
 from phyradgs_cl.runtime import Runtime
@@ -16,7 +16,7 @@ def phyradgs(
     *,
     seed: int = 0,
     report: ProgressReport = ignore_progress,
-    resume: SplatState | None = None,
+    resume: State | None = None,
 ) -> Reconstruction:
     """Reconstructs a scan with M×N micro-views a frame; ``options.motion`` static is the paper's "w/o ST"."""
     return reconstruct_splats(scan, options, rt, seed, report, "phyradgs", resume)

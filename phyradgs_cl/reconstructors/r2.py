@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, SplatState, ignore_progress
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splatting import reconstruct_splats
 from phyradgs_cl.runtime import Runtime
@@ -18,7 +18,7 @@ def r2(
     *,
     seed: int = 0,
     report: ProgressReport = ignore_progress,
-    resume: SplatState | None = None,
+    resume: State | None = None,
 ) -> Reconstruction:
     """Reconstructs a scan with R2-Gaussian's splat; micro-views as motion are the paper's "R2 w/ ST"."""
     return reconstruct_splats(scan, replace(options, affine=True), rt, seed, report, "r2", resume)

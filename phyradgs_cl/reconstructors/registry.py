@@ -19,16 +19,17 @@ from phyradgs_cl.runtime import Runtime
 
 @dataclass(frozen=True)
 class Method:
-    """A reconstruction method: how to run it, and its option presets (the first is the default)."""
+    """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
+    is_resumable: bool = True
 
 
 METHODS = {
     "phyradgs": Method(phyradgs, PRESETS),
     "r2": Method(r2, {"published": R2_PUBLISHED}),
-    "fdk": Method(fdk, {"ram-lak": FdkOptions()}),
+    "fdk": Method(fdk, {"ram-lak": FdkOptions()}, is_resumable=False),
 }
 
 

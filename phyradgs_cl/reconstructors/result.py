@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
 
 
-@dataclass(frozen=True, eq=False)
-class SplatState:
-    """An interrupted splatting run: raw (11, G), moments (2, 11, G), statistics (2, G) float32, and where it was."""
-
-    raw: np.ndarray
-    moments: np.ndarray
-    statistics: np.ndarray
-    iteration: int
-    queue: list[int]
-    rng: str
+State = Mapping[str, np.ndarray]
+"""What an interrupted run needs to go on, as named arrays: each method knows its own names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +29,19 @@ class Reconstruction:
     gaussians: Gaussians | None = None
     record: list[dict[str, float]] = field(default_factory=list)
     facts: dict[str, object] = field(default_factory=dict)
-    state: SplatState | None = None
+    state: State | None = None
 
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of a running method."""
+    """One report of a running method: ``loss`` is what ``quantity`` names; 0 Gaussians where there are none."""
 
     iteration: int
     iterations: int
     loss: float
     gaussians: int
     seconds: float
+    quantity: str = "loss"
 
 
 ProgressReport = Callable[[Progress], None]
@@ -55,3 +49,13 @@ ProgressReport = Callable[[Progress], None]
 
 def ignore_progress(progress: Progress) -> None:
     """The default report: none."""
+
+
+def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
+    """The arrays of an interrupted run by name; raises InputError for a state that lacks one."""
+    missing = sorted(set(names) - set(state))
+    if missing:
+        raise InputError(
+            "checkpoint", f"no {', '.join(missing)}", "a whole checkpoint", "start without --resume"
+        )
+    return [state[name] for name in names]

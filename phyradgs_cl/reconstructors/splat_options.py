@@ -47,8 +47,8 @@ class SplatOptions:
             raise InputError("--iterations", str(self.iterations), "at least 0")
         if self.gaussians < 0:
             raise InputError("--gaussians", str(self.gaussians), "at least 1, or 0 to choose from the grid")
-        if self.motion.name == "per-line":
-            raise InputError("--motion", "'per-line'", "static, static-start or micro-views")
+        if self.motion.name == "per-row":
+            raise InputError("--motion", "'per-row'", "static, static-start or micro-views")
 
     def activation(self, grid: Grid) -> Activation:
         """Bounds of the scales on ``grid`` (in internal units)."""

@@ -24,7 +24,7 @@ from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
 from phyradgs_cl.reconstructors.fdk import fdk_volume, unmasked_frames
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, SplatState
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
@@ -51,7 +51,7 @@ def reconstruct_splats(
     seed: int,
     report: ProgressReport,
     method: str,
-    resume: SplatState | None,
+    resume: State | None,
 ) -> Reconstruction:
     """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``.
 
@@ -206,22 +206,28 @@ class SplatRun:
 
     # --- stop and go on ---------------------------------------------------------------------------------
 
-    def state(self) -> SplatState:
+    def state(self) -> dict[str, np.ndarray]:
         """Everything that the next iteration depends on."""
-        statistics = self.rt.download(self.statistics)[:, : self.gaussians.count]
         population = self._population()
-        rng = json.dumps(self.rng.bit_generator.state)
-        return SplatState(
-            population.raw, population.moments, statistics, self.iteration, list(self._queue), rng
-        )
+        return {
+            "raw": population.raw,
+            "moments": population.moments,
+            "statistics": self.rt.download(self.statistics)[:, : self.gaussians.count],
+            "iteration": np.array(self.iteration),
+            "queue": np.array(self._queue, np.int64),
+            "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+        }
 
-    def restore(self, state: SplatState) -> None:
-        self._load(Population(state.raw, state.moments))
+    def restore(self, state: State) -> None:
+        """The inverse of ``state``: raw (11, G), moments (2, 11, G), statistics (2, G), and where the run was."""
+        names = ("raw", "moments", "statistics", "iteration", "queue", "rng")
+        raw, moments, statistics, iteration, queue, rng = state_arrays(state, names)
+        self._load(Population(raw, moments))
         padded = np.zeros((2, self.gaussians.stride), np.float32)
-        padded[:, : self.gaussians.count] = state.statistics
+        padded[:, : self.gaussians.count] = statistics
         self.rt.write(self.statistics, padded)
-        self.iteration, self._queue = state.iteration, list(state.queue)
-        self.rng.bit_generator.state = json.loads(state.rng)
+        self.iteration, self._queue = int(iteration), [int(f) for f in queue]
+        self.rng.bit_generator.state = json.loads(str(rng))
 
     # --- the population -----------------------------------------------------------------------------------
 

@@ -133,7 +133,7 @@ def scan(is_fly: bool) -> Scan:
         (Motion("static"), 1, 1),
         (Motion("static-start"), 1, 1),
         (Motion("micro-views", 4, 3), 12, 1),
-        (Motion("per-line", sub_intervals=3), 30, 1),
+        (Motion("per-row", sub_intervals=3), 30, 1),
     ],
 )
 def test_motion_models_of_moving_and_standing_scans(motion, fly_count, standing_count) -> None:

@@ -181,7 +181,7 @@ def test_motion_matters(rt, scan) -> None:
     [
         ({"iterations": -1}, "--iterations"),
         ({"gaussians": -1}, "--gaussians"),
-        ({"motion": Motion("per-line")}, "--motion"),
+        ({"motion": Motion("per-row")}, "--motion"),
     ],
 )
 def test_impossible_options_are_named(change, option) -> None:
