@@ -58,6 +58,7 @@ TWIN_GRADIENT = 1e-6  # float64 formula against central differences with a step 
 SSIM_REFERENCE = 1e-12  # the same float64 formula as scikit-image's, mean over the image
 TV_VALUE = 1e-5
 TV_GRADIENT = 1e-7  # a sum of six signs times a weight
+TV_MAP = 2e-5  # some steps on numbers of order 1 in float32; unit vectors near flat places amplify rounding
 PARAMETER_GRADIENT = 1e-5  # of the largest: float32 ratio of scales, squared
 
 # --- optimiser -----------------------------------------------------------------------------------------------
@@ -84,3 +85,8 @@ SCALE_LAW = 1e-2  # 30 steps: rounding decides signs of L1 near its kink (1.1e-3
 # counts are divided in float64 but come out float32 (0 here); one last place would act as above
 GAIN_LAW = 1e-2
 CLOUD_VOLUME = 2e-3  # a voxel at the cutoff's edge (0.1 % of a peak) may fall on the other side
+
+# --- iterative methods ---------------------------------------------------------------------------------------
+ITERATIVE_TWIN = 1e-4  # of the largest voxel: a few passes in float32 against float64 with the explicit matrix
+KRYLOV = 1e-3  # relative, of CGLS against LSQR: float32 directions lose orthogonality
+CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum

@@ -1,0 +1,49 @@
+/* Proximal map of the isotropic total variation by fast gradient projection on the dual (Beck and Teboulle, IEEE
+   Trans. Image Process. 18 (2009) 2419). Volumes (nz, ny, nx) without padding; the dual has three planes, one an axis,
+   with forward differences that end at the last voxel. A work-item takes one voxel. Twin: objective/tv_prox.py. */
+
+__kernel void tv_primal(
+    __global const float *observed, __global const float *moved, /* (nz, ny, nx); (3, nz, ny, nx): along x, y, z */
+    const int4 shape, const float4 axis_weight, const float weight, const int nonnegative,
+    __global float *volume)
+{
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
+    if (x >= shape.x)
+        return;
+    const size_t row = (size_t)shape.x, slice = row * shape.y, plane = slice * shape.z;
+    const size_t at = z * slice + y * row + x;
+    __global const float *ry = moved + plane, *rz = moved + 2 * plane;
+    float divergence = axis_weight.x * ((x > 0 ? moved[at - 1] : 0.0f) - moved[at]);
+    divergence += axis_weight.y * ((y > 0 ? ry[at - row] : 0.0f) - ry[at]);
+    divergence += axis_weight.z * ((z > 0 ? rz[at - slice] : 0.0f) - rz[at]);
+    const float value = observed[at] - weight * divergence;
+    volume[at] = nonnegative ? fmax(value, 0.0f) : value;
+}
+
+__kernel void tv_dual(
+    __global const float *volume, const int4 shape, const float4 axis_weight,
+    const float step,                 /* one over the Lipschitz constant times the weight */
+    const float momentum,
+    __global float *dual, __global float *moved)
+{
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
+    if (x >= shape.x)
+        return;
+    const size_t row = (size_t)shape.x, slice = row * shape.y, plane = slice * shape.z;
+    const size_t at = z * slice + y * row + x;
+    const float here = volume[at];
+    const float gx = x + 1 < shape.x ? axis_weight.x * (volume[at + 1] - here) : 0.0f;
+    const float gy = y + 1 < shape.y ? axis_weight.y * (volume[at + row] - here) : 0.0f;
+    const float gz = z + 1 < shape.z ? axis_weight.z * (volume[at + slice] - here) : 0.0f;
+    const float qx = moved[at] + step * gx;
+    const float qy = moved[at + plane] + step * gy;
+    const float qz = moved[at + 2 * plane] + step * gz;
+    const float shrink = 1.0f / fmax(1.0f, sqrt(qx * qx + qy * qy + qz * qz));
+    const float px = qx * shrink, py = qy * shrink, pz = qz * shrink;
+    moved[at] = px + momentum * (px - dual[at]);
+    moved[at + plane] = py + momentum * (py - dual[at + plane]);
+    moved[at + 2 * plane] = pz + momentum * (pz - dual[at + 2 * plane]);
+    dual[at] = px;
+    dual[at + plane] = py;
+    dual[at + 2 * plane] = pz;
+}

@@ -1,0 +1,86 @@
+"""CGLS: conjugate gradients on the normal equations (Hestenes and Stiefel, J. Res. NBS 49 (1952) 409)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.iterative import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.result import (
+    ProgressReport,
+    Reconstruction,
+    State,
+    ignore_progress,
+    state_arrays,
+)
+from phyradgs_cl.reconstructors.system import System, inner, norm
+from phyradgs_cl.runtime import Runtime
+
+
+@dataclass(frozen=True)
+class CglsOptions(IterativeOptions):
+    """CGLS is linear in the measurement: there is no ``nonnegative``."""
+
+    iterations: int = 60
+    nonnegative: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nonnegative:
+            raise InputError("nonnegative", "true", "false for --method cgls", "use sirt or fista-tv")
+
+
+def cgls(
+    scan: Scan,
+    options: CglsOptions,
+    rt: Runtime,
+    *,
+    seed: int = 0,
+    report: ProgressReport = ignore_progress,
+    resume: State | None = None,
+) -> Reconstruction:
+    """The least-squares volume of a scan in 1/mm, as far as the iterations get. CGLS draws nothing from ``seed``."""
+    return run_iterations("cgls", Cgls, scan, options, rt, report, resume)
+
+
+class Cgls:
+    """min ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0; the residual that is reported is the new one."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self.volume = np.zeros(system.operator.volume_shape, np.float32)
+        self.finished: str | None = None
+        self.residual = system.measured.astype(np.float32)
+        self.direction = system.operator.adjoint(self.residual)
+        self.gamma = inner(self.direction, self.direction)
+
+    def step(self) -> float:
+        projected = self.system.forward(self.direction)
+        energy = inner(projected, projected)
+        if self.gamma == 0 or energy == 0:
+            self.finished = "exact solution"
+            return norm(self.residual)
+        alpha = np.float32(self.gamma / energy)
+        self.volume = self.volume + alpha * self.direction
+        self.residual = self.residual - alpha * projected
+        gradient = self.system.operator.adjoint(self.residual)
+        gamma = inner(gradient, gradient)
+        self.direction = gradient + np.float32(gamma / self.gamma) * self.direction
+        self.gamma = gamma
+        return norm(self.residual)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {
+            "volume": self.volume,
+            "residual": self.residual,
+            "direction": self.direction,
+            "gamma": np.array(self.gamma),
+        }
+
+    def restore(self, state: State) -> None:
+        names = ["volume", "residual", "direction", "gamma"]
+        self.volume, self.residual, self.direction, gamma = state_arrays(state, names)
+        self.gamma = float(gamma)

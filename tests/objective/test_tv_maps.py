@@ -1,0 +1,89 @@
+"""The TV maps of the voxel methods: kernels against twins, twins against definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import TV_MAP, TWIN_GRADIENT
+
+from phyradgs_cl.objective import TvDescent, TvProx
+from phyradgs_cl.objective.tv_descent import tv_descent, tv_gradient
+from phyradgs_cl.objective.tv_prox import isotropic_tv, tv_prox
+
+SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 17), (8, 1, 5), (6, 7, 1), (1, 1, 1)]
+SKEWED = (1.0, 0.5, 0.25)
+
+
+def volume_of(shape: tuple[int, int, int], seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32).astype(float)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("nonnegative", [True, False])
+def test_proximal_kernel_is_its_twin(any_rt, shape, nonnegative) -> None:
+    volume = volume_of(shape)
+    prox = TvProx(any_rt, shape, SKEWED)
+    found = prox(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
+    expected = tv_prox(volume, 0.3, 12, nonnegative=nonnegative, axis_weights=SKEWED)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TV_MAP)
+
+
+def test_the_map_is_the_minimum_of_its_objective() -> None:
+    volume = volume_of((4, 5, 6))
+    weight = 0.4
+
+    def objective(x: np.ndarray) -> float:
+        return 0.5 * float(((x - volume) ** 2).sum()) + weight * isotropic_tv(x, SKEWED)
+
+    best = tv_prox(volume, weight, 3000, nonnegative=True, axis_weights=SKEWED)
+    assert best.min() >= 0
+    lowest = objective(best)
+    rng = np.random.default_rng(0)
+    for length in (1e-1, 1e-2, 1e-3):
+        for _ in range(20):
+            other = np.maximum(best + length * rng.normal(size=volume.shape), 0)
+            assert objective(other) >= lowest - 1e-6
+    assert objective(np.maximum(volume, 0)) > lowest + 1
+
+
+def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
+    volume = volume_of((5, 6, 7)).astype(np.float32)
+    goal = tv_prox(volume, 0.4, 4000, nonnegative=False)
+    prox = TvProx(rt, volume.shape)
+    errors = [np.abs(prox(volume, 0.4, 8, nonnegative=False) - goal).max() for _ in range(6)]
+    assert errors[-1] < 0.4 * errors[0]
+    other = TvProx(rt, volume.shape)
+    other.dual = prox.dual
+    once, again = (p(volume, 0.4, 8, nonnegative=False) for p in (prox, other))
+    np.testing.assert_array_equal(once, again)
+
+
+def test_no_weight_only_clips(rt) -> None:
+    volume = volume_of((3, 4, 5)).astype(np.float32)
+    prox = TvProx(rt, volume.shape)
+    np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=True), np.maximum(volume, 0))
+    np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=False), volume)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_descent_kernel_is_its_twin(any_rt, shape) -> None:
+    volume = volume_of(shape)
+    descent = TvDescent(any_rt, shape)
+    np.testing.assert_allclose(descent.gradient(volume), tv_gradient(volume), rtol=0, atol=TV_MAP)
+    np.testing.assert_allclose(descent(volume, 0.05, 5), tv_descent(volume, 0.05, 5), rtol=0, atol=TV_MAP)
+
+
+def test_descent_twin_is_differentiated_right(finite_differences) -> None:
+    volume = volume_of((3, 4, 5))
+
+    def value(x: np.ndarray) -> float:
+        steps = [np.diff(x, axis=a, prepend=x.take([0], axis=a)) for a in range(3)]
+        return float(np.sqrt(sum(s * s for s in steps)).sum())
+
+    expected = finite_differences(value, volume)
+    np.testing.assert_allclose(tv_gradient(volume), expected, rtol=0, atol=TWIN_GRADIENT)
+
+
+def test_a_flat_volume_stays(rt) -> None:
+    flat = np.full((4, 5, 6), 2.5, np.float32)
+    np.testing.assert_array_equal(TvDescent(rt, flat.shape)(flat, 0.1, 3), flat)

@@ -1,0 +1,353 @@
+"""The iterative methods on small systems: their own twins, their limits, their laws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+from scipy.sparse.linalg import lsqr
+from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
+
+from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics import psnr
+from phyradgs_cl.objective import TvDescent, TvProx
+from phyradgs_cl.objective.tv_descent import tv_gradient
+from phyradgs_cl.objective.tv_prox import isotropic_tv, tv_prox
+from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors.asd_pocs import AsdPocs, AsdPocsOptions
+from phyradgs_cl.reconstructors.cgls import Cgls
+from phyradgs_cl.reconstructors.fista_tv import FistaTv, FistaTvOptions
+from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.reconstructors.sart import OS_SART, Sart, SartOptions, spread_order
+from phyradgs_cl.reconstructors.sirt import Sirt, SirtOptions
+from phyradgs_cl.reconstructors.system import System, norm
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+
+ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")
+VOLUME, FRAMES = (3, 4, 4), (6, 4, 5)
+
+
+class MatrixOperator:
+    """A linear operator with an explicit float64 matrix (rays, voxels)."""
+
+    def __init__(
+        self, matrix: np.ndarray, volume_shape: tuple[int, int, int], frame: tuple[int, int]
+    ) -> None:
+        self.matrix, self.volume_shape = matrix, volume_shape
+        self.frames_shape = (matrix.shape[0] // (frame[0] * frame[1]), *frame)
+
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        return (self.matrix @ volume.ravel()).reshape(self.frames_shape)
+
+    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+        return (self.matrix.T @ frames.ravel()).reshape(self.volume_shape)
+
+    def subset(self, frames: Sequence[int]) -> MatrixOperator:
+        rows = self.matrix.reshape(self.frames_shape[0], -1, self.matrix.shape[1])[list(frames)]
+        return MatrixOperator(rows.reshape(-1, rows.shape[-1]), self.volume_shape, self.frames_shape[1:])
+
+
+def dense_system(noise: float = 0.0, seed: int = 0) -> tuple[System, np.ndarray, np.ndarray]:
+    """A sparse-ish non-negative system of full rank, its matrix and its true volume."""
+    rng = np.random.default_rng(seed)
+    rays, voxels = int(np.prod(FRAMES)), int(np.prod(VOLUME))
+    matrix = rng.uniform(0, 1, (rays, voxels)) * (rng.uniform(size=(rays, voxels)) < 0.3)
+    truth = rng.uniform(0, 1, VOLUME)
+    operator = MatrixOperator(matrix, VOLUME, FRAMES[1:])
+    measured = operator.forward(truth) + noise * rng.normal(size=FRAMES)
+    return System(operator, measured), matrix, truth
+
+
+def weights_of(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = matrix.sum(1), matrix.sum(0)
+    return (
+        np.divide(1, rows, out=np.zeros_like(rows), where=rows > 0),
+        np.divide(1, columns, out=np.zeros_like(columns), where=columns > 0),
+    )
+
+
+def sart_pass(x: np.ndarray, system: System, groups: list[list[int]], relaxation: float) -> np.ndarray:
+    """Float64 twin of one pass, by the definition."""
+    for group in groups:
+        subset = system.subset(group)
+        matrix = subset.operator.matrix
+        rows, columns = weights_of(matrix)
+        x = x + relaxation * columns * (matrix.T @ (rows * (subset.measured.ravel() - matrix @ x)))
+        x = np.maximum(x, 0)
+    return x
+
+
+@pytest.mark.parametrize("options", [SartOptions(relaxation=0.8), replace(OS_SART, frames_per_subset=4)])
+def test_sart_is_its_definition(options) -> None:
+    system, _, _ = dense_system(noise=0.1)
+    algorithm = Sart(system, options, seed=0)
+    order, size = spread_order(FRAMES[0]), options.frames_per_subset
+    groups = [order[i : i + size] for i in range(0, len(order), size)]
+    x, relaxation = np.zeros(int(np.prod(VOLUME))), options.relaxation
+    for _ in range(4):
+        algorithm.step()
+        x = sart_pass(x, system, groups, relaxation)
+        relaxation *= options.relaxation_reduction
+    np.testing.assert_allclose(algorithm.volume.ravel(), x, rtol=0, atol=ITERATIVE_TWIN)
+
+
+def test_sirt_is_its_definition() -> None:
+    system, matrix, _ = dense_system(noise=0.1)
+    algorithm = Sirt(system, SirtOptions(relaxation=1.5))
+    rows, columns = weights_of(matrix)
+    x = np.zeros(matrix.shape[1])
+    for _ in range(5):
+        algorithm.step()
+        x = np.maximum(x + 1.5 * columns * (matrix.T @ (rows * (system.measured.ravel() - matrix @ x))), 0)
+    np.testing.assert_allclose(algorithm.volume.ravel(), x, rtol=0, atol=ITERATIVE_TWIN)
+
+
+def test_asd_pocs_follows_the_published_steps(rt) -> None:
+    """TIGRE's loop in float64: a pass, its length, TV steps of a fixed length, the reduction of that length."""
+    system, matrix, _ = dense_system(noise=0.2)
+    options = AsdPocsOptions(tv_share=0.05, tv_steps=7, tv_ratio=0.3, relaxation_reduction=0.9)
+    epsilon = 0.1
+    algorithm = AsdPocs(system, options, 0, TvDescent(rt, VOLUME), epsilon)
+    groups = [[f] for f in spread_order(FRAMES[0])]
+    x, step, relaxation, reductions = np.zeros(matrix.shape[1]), None, 1.0, 0
+    for _ in range(4):
+        algorithm.step()
+        before = x
+        x = sart_pass(x, system, groups, relaxation)
+        moved = np.linalg.norm(x - before)
+        residual = np.linalg.norm(system.measured.ravel() - matrix @ x)
+        step = options.tv_share * moved if step is None else step
+        start = x
+        for _ in range(options.tv_steps):
+            gradient = tv_gradient(x.reshape(VOLUME)).ravel()
+            x = x - step * gradient / np.linalg.norm(gradient)
+        if np.linalg.norm(x - start) > options.tv_ratio * moved and residual > epsilon:
+            step, reductions = step * options.tv_reduction, reductions + 1
+        relaxation *= options.relaxation_reduction
+    assert 0 < reductions < 5
+    assert algorithm.tv_step == pytest.approx(step, rel=1e-4)
+    np.testing.assert_allclose(algorithm.volume.ravel(), x, rtol=0, atol=ITERATIVE_TWIN)
+
+
+def test_asd_pocs_ends_when_data_and_tv_pull_against_each_other(rt) -> None:
+    system, _, _ = dense_system(noise=0.2)
+    options = AsdPocsOptions(tv_share=0.3, tv_steps=3)
+    algorithm = AsdPocs(system, options, 0, TvDescent(rt, VOLUME), epsilon=1e9)
+    for _ in range(200):
+        algorithm.step()
+        if algorithm.finished:
+            return
+    pytest.fail("never in balance")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_cgls_reaches_lsqr(noise) -> None:
+    system, matrix, _ = dense_system(noise)
+    algorithm = Cgls(system)
+    for _ in range(2 * matrix.shape[1]):
+        algorithm.step()
+    expected = lsqr(matrix, system.measured.ravel(), atol=1e-12, btol=1e-12, iter_lim=1000)[0]
+    assert norm(algorithm.volume.ravel() - expected) <= KRYLOV * norm(expected)
+
+
+def test_cgls_of_nothing_is_finished_at_once() -> None:
+    system, _, _ = dense_system()
+    algorithm = Cgls(replace(system, measured=np.zeros(FRAMES)))
+    assert algorithm.step() == 0
+    assert algorithm.finished == "exact solution"
+    assert not algorithm.volume.any()
+
+
+def test_fista_without_tv_is_non_negative_least_squares(rt) -> None:
+    system, matrix, _ = dense_system(noise=1.0)
+    algorithm = FistaTv(system, FistaTvOptions(tv_weight=0.0), TvProx(rt, VOLUME))
+    for _ in range(600):
+        residual = algorithm.step()
+    expected, rest = nnls(matrix, system.measured.ravel())
+    assert (expected == 0).any(), "the bound must matter"
+    assert residual == pytest.approx(rest, rel=CONVERGED)
+    np.testing.assert_allclose(algorithm.volume.ravel(), expected, rtol=0, atol=0.01)
+
+
+def test_fista_reaches_the_minimum_of_its_objective(rt) -> None:
+    system, matrix, _ = dense_system(noise=0.5)
+    options = FistaTvOptions(tv_weight=0.02, tv_iterations=20)
+    algorithm = FistaTv(system, options, TvProx(rt, VOLUME))
+    weight = options.tv_weight * np.abs(matrix.T @ system.measured.ravel()).max()
+    assert algorithm.tv_weight == pytest.approx(weight, rel=FLOAT32)
+
+    def objective(x: np.ndarray) -> float:
+        rest = system.measured.ravel() - matrix @ x.ravel()
+        return 0.5 * float(rest @ rest) + weight * isotropic_tv(x)
+
+    for _ in range(300):
+        algorithm.step()
+    # plain proximal gradients in float64, with the exact norm and long inner solutions
+    curvature = np.linalg.norm(matrix, 2) ** 2
+    x = np.zeros(VOLUME)
+    for _ in range(1500):
+        gradient = (matrix.T @ (matrix @ x.ravel() - system.measured.ravel())).reshape(VOLUME)
+        x = tv_prox(x - gradient / curvature, weight / curvature, 30, nonnegative=True)
+    assert isotropic_tv(x) > 0
+    assert objective(algorithm.volume) == pytest.approx(objective(x), rel=CONVERGED)
+    assert objective(x) < 0.9 * objective(np.full(VOLUME, x.mean()))
+
+
+def algorithms(rt, system: System) -> dict[str, Callable[[], object]]:
+    """One of each, with options under which data consistency is the only goal."""
+    free = AsdPocsOptions(tv_steps=0)
+    return {
+        "sart": lambda: Sart(system, SartOptions(), 0),
+        "os-sart": lambda: Sart(system, replace(OS_SART, frames_per_subset=2), 0),
+        "sirt": lambda: Sirt(system, SirtOptions()),
+        "cgls": lambda: Cgls(system),
+        "asd-pocs": lambda: AsdPocs(system, free, 0, TvDescent(rt, VOLUME), 0.0),
+        "fista-tv": lambda: FistaTv(system, FistaTvOptions(tv_weight=0.0), TvProx(rt, VOLUME)),
+    }
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_residual_falls_on_consistent_data(rt, method) -> None:
+    system, _, _ = dense_system()
+    algorithm = algorithms(rt, system)[method]()
+    residuals = [algorithm.step() for _ in range(25)]
+    assert all(b < a for a, b in zip(residuals, residuals[1:], strict=False)), residuals
+    assert residuals[-1] < 0.2 * residuals[0]
+
+
+def test_frames_next_to_each_other_in_a_pass_are_far_apart() -> None:
+    for count in (1, 2, 3, 4, 6, 25, 50, 90):
+        order = spread_order(count)
+        assert sorted(order) == list(range(count))
+        if count >= 25:
+            steps = np.abs(np.diff(order))
+            assert np.minimum(steps, count - steps).min() > count / 4
+
+
+# --- on a scan -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fly_scan(rt) -> Scan:
+    """A small noisy fly-scan whose motion matters: 12 frames of 30° over a whole turn."""
+    geometry = ConeGeometry(5.0, 7.0, (24, 24), (4 / 24, 4 / 24))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(16, 2.0), 16, "rows", 0)
+    protocol = make_protocol("rapid", views=12, exposure_deg=30.0)
+    options = SimulationOptions(protocol=protocol, noise="beer", dose=1e5, peak=3.0)
+    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
+
+
+def run(rt, scan: Scan, method: str, **changes: object):
+    return reconstruct(scan, method, rt, method_options(method, None, {"iterations": 8, **changes}))
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_knowing_the_motion_helps(rt, fly_scan, method) -> None:
+    peak = float(fly_scan.reference.max())
+    iterations = {"sirt": 30, "fista-tv": 40, "cgls": 6}.get(method, 8)
+    values = {
+        motion: psnr(
+            run(rt, fly_scan, method, motion=motion, iterations=iterations).volume, fly_scan.reference, peak
+        )
+        for motion in ("static", "micro-views", "per-row")
+    }
+    assert values["micro-views"] > values["static"] + 0.3, values
+    assert values["per-row"] > values["static"] + 0.3, values
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_record_and_facts(rt, fly_scan, method) -> None:
+    seen: list[Progress] = []
+    options = method_options(method, None, {"iterations": 5})
+    result = reconstruct(fly_scan, method, rt, options, report=seen.append)
+    assert result.volume.shape == fly_scan.grid.shape
+    assert [line["iteration"] for line in result.record] == [1, 2, 3, 4, 5]
+    assert [p.loss for p in seen] == [line["residual"] for line in result.record]
+    assert all(line["residual"] > 0 and line["change"] > 0 for line in result.record)
+    assert result.facts["method"] == method
+    assert result.facts["stopped_by"] == "iterations"
+    assert result.state is None
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_an_interrupted_run_goes_on_with_the_same_bits(rt, fly_scan, method) -> None:
+    changes = (
+        {"iterations": 6} if method in ("sirt", "cgls", "fista-tv") else {"iterations": 6, "order": "random"}
+    )
+    options = method_options(method, None, changes)
+
+    def stop(progress: Progress) -> None:
+        if progress.iteration == 3:
+            raise KeyboardInterrupt
+
+    whole = reconstruct(fly_scan, method, rt, options, seed=3)
+    part = reconstruct(fly_scan, method, rt, options, seed=3, report=stop)
+    assert part.facts["interrupted_at"] == 3
+    rest = reconstruct(fly_scan, method, rt, options, seed=3, resume=part.state)
+    np.testing.assert_array_equal(rest.volume, whole.volume)
+    assert rest.record[0]["iteration"] == 4
+    with pytest.raises(InputError, match="checkpoint"):
+        reconstruct(fly_scan, method, rt, options, resume={"iteration": np.array(3)})
+
+
+def test_a_small_change_ends_the_run(rt, fly_scan) -> None:
+    result = run(rt, fly_scan, "sirt", iterations=200, tolerance=0.02)
+    assert result.facts["stopped_by"] == "tolerance"
+    assert result.record[-1]["change"] < 0.02 <= result.record[-2]["change"]
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_masked_pixels_do_not_count(rt, fly_scan, method) -> None:
+    mask = np.zeros(fly_scan.projections.shape[1:], np.uint8)
+    mask[5:9, 11] = 1
+    mask[17] = 1
+    volumes = []
+    for garbage in (0.0, 50.0):
+        frames = fly_scan.projections.copy()
+        frames[:, mask != 0] = garbage
+        volumes.append(run(rt, replace(fly_scan, projections=frames, pixel_mask=mask), method).volume)
+    np.testing.assert_array_equal(*volumes)
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_units_do_not_matter(rt, fly_scan, method) -> None:
+    """Lengths × 8 and attenuation ÷ 8 give the same picture; so do counts × 2 in the volume × 2."""
+    geometry = ConeGeometry(40.0, 56.0, (24, 24), (32 / 24, 32 / 24))
+    trajectory = replace(fly_scan.trajectory, geometry=geometry)
+    larger = replace(fly_scan, geometry=geometry, trajectory=trajectory, grid=fly_scan.grid.scaled(8.0))
+    doubled = replace(fly_scan, projections=2 * fly_scan.projections)
+    volume = run(rt, fly_scan, method).volume
+    scale = np.abs(volume).max()
+    assert np.abs(8 * run(rt, larger, method).volume - volume).max() <= 1e-3 * scale
+    assert np.abs(run(rt, doubled, method).volume / 2 - volume).max() <= 1e-3 * scale
+
+
+@pytest.mark.parametrize(
+    ("method", "changes", "culprit"),
+    [
+        ("sart", {"relaxation": 3.0}, "relaxation"),
+        ("sart", {"order": "sideways"}, "order"),
+        ("os-sart", {"frames_per_subset": 0}, "frames_per_subset"),
+        ("sirt", {"relaxation": -1.0}, "relaxation"),
+        ("cgls", {"nonnegative": True}, "nonnegative"),
+        ("cgls", {"iterations": -1}, "iterations"),
+        ("asd-pocs", {"tv_share": -0.1}, "tv_share"),
+        ("fista-tv", {"tv_weight": float("nan")}, "tv_weight"),
+        ("fista-tv", {"tolerance": 2.0}, "tolerance"),
+        ("sirt", {"tv_weight": 0.1}, "tv_weight"),
+    ],
+)
+def test_bad_options_are_named(method, changes, culprit) -> None:
+    with pytest.raises(InputError, match=culprit):
+        method_options(method, None, changes)
+
+
+def test_every_iterative_method_is_registered() -> None:
+    assert set(ITERATIVE) <= set(METHODS)
+    for name in ITERATIVE:
+        assert method_options(name).motion == Motion("static")
