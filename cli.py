@@ -3,42 +3,60 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
-import time
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from phyradgs_cl import __version__
-from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.reconstructors import METHODS, Progress
+from phyradgs_cl.errors import OutputError, PhyradgsError
+from phyradgs_cl.progress import Ticker
+from phyradgs_cl.reconstructors import METHODS
+from phyradgs_cl.reconstructors.interrupt import InterruptedAfterwards
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device, list_devices
 from phyradgs_cl.runtime.context import default_lanes
+from phyradgs_cl.settings import device_wish, file_parser, offset_pair, run_settings
 from phyradgs_cl.simulation import SimulationOptions
 from phyradgs_cl.workflow import (
     ReconstructionJob,
     SimulationJob,
     load_scanner_for,
     make_scan_protocol,
+    refuse_jitter,
     run_evaluation,
     run_reconstruction,
     run_simulation,
     summary,
 )
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 INTERRUPTED = 130
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
+
+class Interrupted(Exception):
+    """Ctrl-C before there was any output, on its way past Typer."""
+
+
+class Commands(TyperGroup):
+    """The commands. Typer would end Ctrl-C without a word; here it is handed on under another name."""
+
+    def invoke(self, ctx: typer.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except InterruptedAfterwards:
+            raise typer.Exit(INTERRUPTED) from None
+        except KeyboardInterrupt:
+            raise Interrupted from None
+
+
 app = typer.Typer(
     name="phyradgs",
-    no_args_is_help=True,
+    cls=Commands,
     add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -83,6 +101,18 @@ class MotionName(str, Enum):
     static = "static"
     static_start = "static-start"
     micro_views = "micro-views"
+    per_row = "per-row"
+
+
+def file_option(*names: str, help: str, show_default: bool | str = True) -> Any:
+    """An option that takes a file name."""
+    parser = file_parser(names[-1])
+    return typer.Option(*names, parser=parser, metavar="FILE", help=help, show_default=show_default)
+
+
+def file_argument(name: str, help: str) -> Any:
+    """An argument that is a file name."""
+    return typer.Argument(parser=file_parser(name), help=help)
 
 
 Device = Annotated[
@@ -93,7 +123,8 @@ Device = Annotated[
     ),
 ]
 Output = Annotated[
-    Path, typer.Option("--output", "-o", help="File to write; an existing one is replaced whole.")
+    Path,
+    file_option("--output", "-o", help="File to write; an existing one is replaced whole."),
 ]
 
 
@@ -107,13 +138,15 @@ def simulate_command(
         PhantomName | None, typer.Option(help="Built-in phantom.", show_default="foot, without --volume")
     ] = None,
     volume: Annotated[
-        Path | None, typer.Option(help="HDF5 file with a dataset /volume (z, y, x), or one of our volumes.")
+        Path | None,
+        file_option("--volume", help="HDF5 file with a dataset /volume (z, y, x), or one of our volumes."),
     ] = None,
     scanner: Annotated[str, typer.Option(help="Scanner by name (r2, carm) or a TOML file.")] = "r2",
     protocol: Annotated[
         ProtocolName,
         typer.Option(
-            help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot, 25 mid-window poses."
+            help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
+            "rapid, or of the fly-scan that the options below describe."
         ),
     ] = ProtocolName.rapid,
     views: Annotated[int | None, typer.Option(help="Frames in the turn.", show_default="protocol's")] = None,
@@ -150,11 +183,12 @@ def simulate_command(
         float, typer.Option(help="Standard deviation of electronic noise, counts.")
     ] = 10.0,
     jitter_deg: Annotated[
-        float,
+        float | None,
         typer.Option(
-            help="Wander of the gantry about constant speed (std, degrees), written to the encoder table."
+            help="Wander of the gantry about constant speed (std, degrees), written to the encoder table.",
+            show_default="0",
         ),
-    ] = 0.0,
+    ] = None,
     detector: Annotated[
         int | None,
         typer.Option(
@@ -179,13 +213,16 @@ def simulate_command(
     device: Device = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
+    readout_axis = readout.value if readout else None
+    refuse_jitter(protocol.value, jitter_deg)
+    wish = device_wish(device)
     job = SimulationJob(
         output,
         phantom.value if phantom else None,
         volume,
         scanner,
         detector,
-        _pair("--detector-offset", detector_offset),
+        offset_pair("--detector-offset", detector_offset),
         size,
     )
     described = load_scanner_for(job)
@@ -198,25 +235,21 @@ def simulate_command(
             readout_ratio=readout_ratio,
             start_deg=start_deg,
         ),
-        readout_axis=readout.value if readout else described.readout_axis,
+        readout_axis=readout_axis or described.readout_axis,
         readout_direction=described.readout_direction if readout_direction is None else readout_direction,
         detector_model=detector_model.value,
         peak=peak,
         noise=noise.value,
         dose=dose,
         electronic_noise=electronic_noise,
-        jitter_deg=jitter_deg,
+        jitter_deg=0.0 if jitter_deg is None else jitter_deg,
         time_samples=time_samples,
         seed=seed,
     )
     with Ticker("frame") as ticker:
-        scan = run_simulation(
-            job, described, options, Runtime(device), lambda done, total: ticker.show(done, total)
-        )
+        scan = run_simulation(job, described, options, Runtime(wish), ticker.show)
     frames, rows, columns = scan.projections.shape
-    typer.echo(
-        f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}"
-    )
+    say(f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}")
 
 
 @app.command(
@@ -225,20 +258,22 @@ def simulate_command(
     "Ctrl-C keeps what there is and leaves a checkpoint; --resume goes on from it.",
 )
 def reconstruct_command(
-    scan: Annotated[Path, typer.Argument(help="Scan file (HDF5, NXtomo).")],
+    scan: Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")],
     output: Output,
     method: Annotated[
         MethodName | None,  # type: ignore[valid-type]
         typer.Option(
-            help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic.",
+            help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
+            "the others are iterative on voxels.",
             show_default="phyradgs",
         ),
     ] = None,
     motion: Annotated[
         MotionName | None,
         typer.Option(
-            help="How frames see the moving gantry: frozen at mid-window (static), at the start, or M×N micro-views.",
-            show_default="micro-views for phyradgs, static for r2 and fdk",
+            help="How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
+            "or every line at its own times (per-row); not every method has all of them.",
+            show_default="micro-views for phyradgs, else static",
         ),
     ] = None,
     strips: Annotated[
@@ -248,7 +283,11 @@ def reconstruct_command(
         int | None, typer.Option(help="Sub-intervals N of an exposure (motion blur).", show_default="5")
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(help="Iterations, one frame each.", show_default="preset's: 3000")
+        int | None,
+        typer.Option(
+            help="Iterations: one frame each for splats, all frames for voxels.",
+            show_default="preset's: 3000 for splats",
+        ),
     ] = None,
     gaussians: Annotated[
         int | None, typer.Option(help="Gaussians at the start.", show_default="preset's: from the grid")
@@ -264,9 +303,10 @@ def reconstruct_command(
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(
+        file_option(
+            "--config",
             help="TOML file with any of these options (underscores for dashes) and the preset's constants; "
-            "the command line wins."
+            "the command line wins.",
         ),
     ] = None,
     resume: Annotated[
@@ -275,7 +315,6 @@ def reconstruct_command(
     device: Device = None,
 ) -> None:
     """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
-    settings = _read_config(config)
     given = {
         "method": method.value if method else None,  # type: ignore[attr-defined]
         "motion": motion.value if motion else None,
@@ -287,108 +326,85 @@ def reconstruct_command(
         "preset": preset,
         "device": device,
     }
-    settings.update({key: value for key, value in given.items() if value is not None})
-    wish = settings.pop("device", None)
+    settings = run_settings(config, given)
     job = ReconstructionJob(
         scan,
         output,
-        method=str(settings.pop("method", "phyradgs")),
-        seed=_seed(settings.pop("seed", 0)),
-        preset=settings.pop("preset", None),
-        changes=settings,
+        method=settings.method,
+        seed=settings.seed,
+        preset=settings.preset,
+        changes=settings.changes,
         resume=resume,
+        config=config,
     )
     with Ticker("iteration") as ticker:
-        result, metrics = run_reconstruction(job, lambda: Runtime(wish), ticker.progress)
+        result, metrics = run_reconstruction(job, lambda: Runtime(settings.device), ticker.progress)
     interrupted = result.facts.get("interrupted_at")
-    typer.echo(f"{output}: {job.method}, {result.facts['seconds']:.1f} s" + _metrics_text(metrics))
+    say(f"{output}: {job.method}, {result.facts['seconds']:.1f} s" + _metrics_text(metrics))
     if interrupted is not None:
-        typer.echo(
-            f"interrupted after iteration {interrupted}: repeat the command with --resume to go on", err=True
-        )
+        complain(f"interrupted after iteration {interrupted}: repeat the command with --resume to go on")
         raise typer.Exit(INTERRUPTED)
 
 
 @app.command("evaluate", epilog="Example: phyradgs evaluate volume.h5 --reference scan.h5 --json")
 def evaluate_command(
-    volume: Annotated[Path, typer.Argument(help="Volume file.")],
-    reference: Annotated[Path, typer.Option(help="Scan with a known truth, or a volume on the same grid.")],
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file.")],
+    reference: Annotated[
+        Path,
+        file_option("--reference", help="Scan with a known truth, or a volume on the same grid."),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     picture: Annotated[
         Path | None,
-        typer.Option(help="PNG of slices: result, truth, difference.", show_default="VOLUME with .png"),
+        file_option(
+            "--picture",
+            help="PNG of slices: result, truth, difference.",
+            show_default="VOLUME with .png",
+        ),
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
     facts = run_evaluation(volume, reference, picture or volume.with_suffix(".png"))
     if as_json:
-        typer.echo(json.dumps(facts))
+        say(json.dumps(facts))
     else:
-        typer.echo(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   picture {facts['picture']}")
+        say(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   picture {facts['picture']}")
 
 
 @app.command("info", epilog="Example: phyradgs info scan.h5")
-def info_command(file: Annotated[Path, typer.Argument(help="Scan or volume file.")]) -> None:
+def info_command(
+    file: Annotated[Path, file_argument("FILE", "Scan or volume file.")],
+) -> None:
     """Say what a file holds."""
     for key, value in summary(file).items():
-        typer.echo(f"{key.replace('_', ' '):24s} {value}")
+        say(f"{key.replace('_', ' '):24s} {value}")
 
 
 @app.command("devices", epilog="Example: phyradgs devices --device cpu")
 def devices_command(device: Device = None) -> None:
     """List OpenCL devices and say which one is taken, and why."""
-    chosen, reason = choose_device(device)
+    chosen, reason = choose_device(device_wish(device))
     for d in list_devices():
         mark = "*" if d.index == chosen.index else " "
         never = "" if d.by_default else ", only when asked for"
-        typer.echo(
+        say(
             f"{mark} {d.index}: {d.name} ({d.kind}; {d.platform}), {d.compute_units} units, vector width {default_lanes(d)} "
             f"of {d.vector_width}, {d.memory_bytes / 2**30:.1f} GiB, at most {d.largest_allocation_bytes / 2**30:.1f} GiB "
             f"at once, float64 {'yes' if d.has_fp64 else 'no'}{never}"
         )
-        typer.echo(f"     {d.version}")
-    typer.echo(f"takes {chosen.index}: {reason}")
+        say(f"     {d.version}")
+    say(f"takes {chosen.index}: {reason}")
 
 
 @app.callback(invoke_without_command=True)
-def root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+def root(
+    ctx: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False
+) -> None:
     if version:
-        typer.echo(f"phyradgs-cl {__version__}")
+        say(f"phyradgs-cl {__version__}")
         raise typer.Exit
-
-
-class Ticker:
-    """Progress on stderr: one line rewritten on a terminal, a line every ten seconds elsewhere."""
-
-    def __init__(self, noun: str) -> None:
-        self.noun = noun
-        self.is_terminal = sys.stderr.isatty()
-        self.started = self.last = time.monotonic()
-        self.first: int | None = None
-        self.is_open = False
-
-    def __enter__(self) -> Ticker:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.is_open:
-            typer.echo("", err=True)
-
-    def progress(self, p: Progress) -> None:
-        self.show(p.iteration, p.iterations, f"  loss {p.loss:.5f}  {p.gaussians} Gaussians")
-
-    def show(self, done: int, total: int, more: str = "") -> None:
-        now = time.monotonic()
-        if self.first is None:
-            self.first, self.started = done, now
-        if done < total and now - self.last < (0.2 if self.is_terminal else 10.0):
-            return
-        self.last = now
-        rate = (done - self.first) / (now - self.started) if now > self.started and done > self.first else 0.0
-        left = f"  {rate:.1f}/s  ETA {_clock((total - done) / rate)}" if rate else ""
-        line = f"{self.noun} {done}/{total}{more}{left}"
-        typer.echo(f"\r\x1b[K{line}" if self.is_terminal else line, err=True, nl=not self.is_terminal)
-        self.is_open = self.is_terminal
+    if ctx.invoked_subcommand is None:
+        say(ctx.get_help())
 
 
 def run(arguments: list[str]) -> int:
@@ -397,53 +413,43 @@ def run(arguments: list[str]) -> int:
         status = app(arguments, standalone_mode=False)
         return status if isinstance(status, int) else 0
     except PhyradgsError as error:
-        typer.echo(f"phyradgs: {error}", err=True)
-        return error.exit_code
+        return complain(str(error), error.exit_code)
     except MemoryError as error:
-        text = " ".join(str(error).split())
-        typer.echo(f"phyradgs: not enough memory: {text}; use a smaller problem", err=True)
-        return 2
+        return complain(f"not enough memory: {error}; use a smaller problem")
     except _CLICK_ERROR as error:
-        text = " ".join(str(error.format_message()).split())  # type: ignore[attr-defined]
-        typer.echo(f"phyradgs: {text or 'no command; see phyradgs --help'}", err=True)
-        return 2
-    except (KeyboardInterrupt, typer.Abort):
-        typer.echo("phyradgs: interrupted, nothing written", err=True)
-        return INTERRUPTED
+        return complain(str(error.format_message()))  # type: ignore[attr-defined]
+    except OSError as error:  # one that no reader or writer has named
+        return complain(f"{error.filename or 'operating system'}: {error.strerror or error}")
+    except (Interrupted, KeyboardInterrupt, typer.Abort):
+        return complain("interrupted, nothing written", INTERRUPTED)
 
 
-def _read_config(path: Path | None) -> dict[str, Any]:
-    if path is None:
-        return {}
+def say(text: str) -> None:
+    """One result on stdout."""
     try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
+        typer.echo(text)
+    except BrokenPipeError:  # Typer ends quietly, as `| head` wants it
+        raise
     except OSError as error:
-        raise InputError(f"--config {path}", error.strerror or str(error), "a TOML file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"--config {path}", f"not TOML ({error})", "a TOML file") from error
+        _give_up_stdout()
+        found = error.strerror or str(error)
+        raise OutputError("standard output", found, "somewhere with room to write to") from error
 
 
-def _seed(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise InputError("seed", repr(value), "a whole number of at least 0")
-    return value
+def complain(text: str, status: int = 2) -> int:
+    """One line on stderr; the exit status to end with."""
+    with suppress(OSError):  # nobody is left to be told
+        typer.echo("phyradgs: " + " ".join(text.split()), err=True)
+    return status
 
 
-def _pair(option: str, text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        v, u = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(option, repr(text), "two numbers V,U in mm", "write for example 0,12.5") from None
-    return v, u
+def _give_up_stdout() -> None:
+    """What could not be written would be tried again at the interpreter's end, with a traceback."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _metrics_text(metrics: dict[str, float]) -> str:
     return f", PSNR {metrics['psnr_db']:.2f} dB, SSIM {metrics['ssim']:.4f}" if metrics else ""
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(int(seconds + 0.5), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

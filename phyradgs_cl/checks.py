@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl.errors import InputError
 
+_LONGEST_SHOWN = 80
+
 
 def positive(culprit: str, value: float) -> None:
     """Raise InputError unless the scalar `value` is finite and above zero."""
-    if not (_is_number(value) and math.isfinite(value) and value > 0):
-        raise InputError(culprit, repr(value), "a finite number above 0")
+    if not (_is_finite(value) and value > 0):
+        raise InputError(culprit, shown(value), "a finite number above 0")
 
 
 def at_least(culprit: str, value: float, minimum: float) -> None:
     """Raise InputError unless the scalar `value` is finite and not below `minimum`."""
-    if not (_is_number(value) and math.isfinite(value) and value >= minimum):
-        raise InputError(culprit, repr(value), f"a finite number, at least {minimum}")
+    if not (_is_finite(value) and value >= minimum):
+        raise InputError(culprit, shown(value), f"a finite number, at least {minimum}")
 
 
 def within(culprit: str, value: float, lowest: float, highest: float) -> None:
     """Raise InputError unless the scalar `value` is finite and between two bounds, both included."""
-    if not (_is_number(value) and math.isfinite(value) and lowest <= value <= highest):
-        raise InputError(culprit, repr(value), f"a number from {lowest} to {highest}")
+    if not (_is_finite(value) and lowest <= value <= highest):
+        raise InputError(culprit, shown(value), f"a number from {lowest} to {highest}")
+
+
+def fields_within(prefix: str, options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Check every number of `options` that `ranges` names (lowest, highest), those inside tuples one by one."""
+    for name, (lowest, highest) in ranges.items():
+        value = getattr(options, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            within(prefix + name, number, lowest, highest)
 
 
 def one_of(culprit: str, value: object, allowed: Iterable[object]) -> None:
@@ -54,5 +64,16 @@ def shape(culprit: str, array: ArrayLike, expected: Sequence[int | None]) -> Non
         raise InputError(culprit, f"shape {found}", f"shape ({wanted})")
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+def shown(value: object) -> str:
+    """A value met where another was expected, short enough for a line."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python refuses to print whole numbers of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
+
+
+def _is_finite(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    return isinstance(value, int) or math.isfinite(value)  # isfinite fails on whole numbers beyond floats

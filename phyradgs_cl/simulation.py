@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol as Interface
@@ -27,6 +28,10 @@ class FrameSource(Interface):
 
 
 NOISES = ("none", "tigre", "beer")
+# Far beyond any scanner, and far from where float32 or a sampler would overflow.
+LARGEST_PEAK, LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
+SMALLEST_DOSE, LARGEST_DOSE = 1e-3, 1e12
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -52,13 +57,10 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         if self.noise not in NOISES:
             raise InputError("--noise", repr(self.noise), f"one of {', '.join(NOISES)}")
-        for option, value in (("--peak", self.peak), ("--electronic-noise", self.electronic_noise)):
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(option, str(value), "a finite number of at least 0")
-        if not (np.isfinite(self.dose) and self.dose > 0):
-            raise InputError("--dose", str(self.dose), "photons a pixel, above 0")
-        if not (np.isfinite(self.jitter_deg) and self.jitter_deg >= 0):
-            raise InputError("--jitter-deg", str(self.jitter_deg), "an angle of at least 0°")
+        checks.within("--peak", self.peak, 0, LARGEST_PEAK)
+        checks.within("--electronic-noise (counts)", self.electronic_noise, 0, LARGEST_ELECTRONIC_NOISE)
+        checks.within("--dose (photons a pixel)", self.dose, SMALLEST_DOSE, LARGEST_DOSE)
+        checks.within("--jitter-deg", self.jitter_deg, 0, 360)
         checks.within("--time-samples", self.time_samples, 0, 10_000)
         checks.within("--seed", self.seed, 0, 2**63)
 
@@ -104,6 +106,8 @@ def simulate(
                 f"frame {frame}", "line integrals that are not finite", "a smaller geometry or attenuation"
             )
         report(frame + 1, protocol.views)
+    if frames.max() <= 0:
+        log.warning("no ray meets anything that attenuates: all %d frames are empty", protocol.views)
     return Scan(
         projections=_with_noise(frames, options, rng),
         geometry=geometry,

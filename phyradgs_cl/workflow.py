@@ -7,6 +7,7 @@ import json
 import logging
 import platform
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import __version__, checks
-from phyradgs_cl.acquisition import Protocol, Scan, make_protocol
+from phyradgs_cl.acquisition import PROTOCOLS, Protocol, Scan, make_protocol
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -35,7 +36,7 @@ from phyradgs_cl.io import (
     write_scan,
     write_volume,
 )
-from phyradgs_cl.metrics import psnr, slices_png, ssim
+from phyradgs_cl.metrics import compare, slices_png
 from phyradgs_cl.phantoms import load_volume
 from phyradgs_cl.reconstructors import (
     METHODS,
@@ -45,6 +46,7 @@ from phyradgs_cl.reconstructors import (
     method_options,
     reconstruct,
 )
+from phyradgs_cl.reconstructors.interrupt import InterruptedAfterwards, finish_despite_interrupt
 from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
@@ -97,6 +99,14 @@ def make_scan_protocol(name: str, scanner: Scanner, **changes: float | int | Non
     return make_protocol(name, **changes)
 
 
+def refuse_jitter(protocol: str, jitter_deg: float | None) -> None:
+    """A gantry that stands does not wander. Arc and readout say which fly-scan's mid-window poses it stands at."""
+    if jitter_deg and not PROTOCOLS[protocol].is_fly:
+        remedy = "leave it out, or choose a fly-scan"
+        raise InputError("--jitter-deg", f"{jitter_deg} with --protocol {protocol}", "0", remedy)
+
+
+@np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line
 def run_simulation(
     job: SimulationJob,
     scanner: Scanner,
@@ -107,6 +117,8 @@ def run_simulation(
     """Simulates and writes a scan file; everything is checked before any work."""
     if job.volume is not None:
         _refuse_overwriting("-o", job.output, job.volume)
+    if job.scanner.endswith(".toml"):
+        _refuse_overwriting("-o", job.output, Path(job.scanner))
     check_writable(job.output)
     scene = _scene(job, scanner, options, rt)
     scan = simulate(
@@ -120,7 +132,8 @@ def run_simulation(
     )
     scan.provenance.update(program=f"phyradgs-cl {__version__}", simulated=scene.title, seed=options.seed)
     scan.provenance.update(noise=options.noise, dose=options.dose, electronic_noise=options.electronic_noise)
-    write_scan(job.output, scan)
+    with finish_despite_interrupt():
+        write_scan(job.output, scan)
     return scan
 
 
@@ -150,8 +163,10 @@ class ReconstructionJob:
     changes: Mapping[str, Any] | None = None
     seed: int = 0
     resume: bool = False
+    config: Path | None = None
 
 
+@np.errstate(all="ignore")
 def run_reconstruction(
     job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
 ) -> tuple[Reconstruction, dict[str, float]]:
@@ -161,13 +176,16 @@ def run_reconstruction(
     """
     options = method_options(job.method, job.preset, job.changes)
     check_writable(job.output)
-    _refuse_overwriting("-o", job.output, job.scan)
+    _refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
     scan = load_scan(job.scan)
     scan.check_timing()
     if scan.detector_model == "intensity":
         log.warning(
             "%s averages intensity over an exposure; reconstruction averages line integrals", job.scan
         )
+    if (largest := float(scan.projections.max())) <= 0:
+        found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
+        log.warning("%s: %s: there is no object in it, or the sign is wrong", job.scan, found)
     rt = make_runtime()
     scan_hash = sha256_of(job.scan)
     fingerprint = _fingerprint(scan_hash, job, options)
@@ -176,8 +194,10 @@ def run_reconstruction(
         extra["resume"] = _resumed(job, fingerprint)
     result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=report, **extra)
     metrics = compare(result.volume, scan.reference) if scan.reference is not None else {}
-    _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
-    _keep_checkpoint(job, result, fingerprint)
+    known = [InterruptedAfterwards] if result.state is not None else []  # told already, in the result
+    with suppress(*known), finish_despite_interrupt():
+        _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
+        _keep_checkpoint(job, result, fingerprint)
     return result, metrics
 
 
@@ -233,18 +253,7 @@ def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint
 # --- evaluate -----------------------------------------------------------------------------------------------
 
 
-def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """3D PSNR (dB) and SSIM against a reference (z, y, x), with the range that was used: the reference's maximum."""
-    peak = float(reference.max())
-    if peak <= 0:
-        raise InputError("reference", f"a maximum of {peak:g}", "a volume with something in it")
-    return {
-        "psnr_db": psnr(volume, reference, peak),
-        "ssim": ssim(volume, reference, peak),
-        "data_range": peak,
-    }
-
-
+@np.errstate(all="ignore")
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume and writes the picture of slices."""
     _refuse_overwriting("--picture", picture, volume_path, reference_path)
@@ -261,7 +270,8 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
         )
     metrics = compare(stored.volume, reference)
     title = f"{stored.provenance.get('method', 'volume')}: {volume_path.name}"
-    slices_png(picture, stored.volume, reference, title)
+    with finish_despite_interrupt():
+        slices_png(picture, stored.volume, reference, title)
     known = {
         key: stored.provenance[key] for key in ("method", "seconds", "gaussians") if key in stored.provenance
     }

@@ -22,7 +22,7 @@ FLOORS: tuple[frozenset[str], ...] = (
     frozenset({"phantoms", "detector", "metrics", "io", "runtime"}),
     frozenset({"operators", "objective", "optim"}),
     frozenset({"simulation", "reconstructors"}),
-    frozenset({"workflow"}),
+    frozenset({"workflow", "bench", "settings", "progress"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

@@ -76,12 +76,21 @@ def _located(name: str, data_dir: Path) -> Path:
         if not Path(name).is_file():
             raise InputError(name, "no such file", "a scanner file (TOML)", "check the path")
         return Path(name)
-    names = sorted(path.stem for path in Path(data_dir).glob("*.toml"))
+    names = sorted(path.stem for path in Path(data_dir).glob("*.toml") if _describes_scanner(path))
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1)
         remedy = f"did you mean {close[0]!r}?" if close else "or give the path of a .toml file"
         raise InputError("scanner", repr(name), f"one of {', '.join(names)}" if names else "a path", remedy)
     return Path(data_dir) / f"{name}.toml"
+
+
+def _describes_scanner(path: Path) -> bool:
+    """Whether a TOML file has what every scanner has; other files may lie beside the scanners."""
+    try:
+        with open(path, "rb") as file:
+            return "source" in tomllib.load(file)
+    except (OSError, ValueError):
+        return False
 
 
 def _scanner(path: Path, content: dict[str, object]) -> Scanner:

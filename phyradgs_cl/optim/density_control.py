@@ -10,13 +10,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.fields import gaussians as g
+
+_RANGES = {
+    "every": (0, 1_000_000_000),
+    "start_iteration": (0, 1_000_000_000),
+    "stop_fraction": (0, 1),
+    "threshold": (0, 1e6),
+    "split_scale": (0, 1e3),
+    "split_factor": (1, 1e3),
+    "prune_density": (0, 1e6),
+    "max_gaussians": (1, 100_000_000),
+}
 
 
 @dataclass(frozen=True)
 class DensityControl:
-    """When and what to clone, split and prune; lengths in half-sides of the volume, fractions of the run."""
+    """When and what to clone, split and prune; lengths in half-sides of the volume, fractions of the run.
+
+    ``every`` counts iterations from round to round; 0 leaves the population as it starts.
+    """
 
     every: int = 100
     start_iteration: int = 500
@@ -26,6 +41,9 @@ class DensityControl:
     split_factor: float = 1.6
     prune_density: float = 1e-5
     max_gaussians: int = 500_000
+
+    def __post_init__(self) -> None:
+        checks.fields_within("control.", self, _RANGES)
 
     def is_due(self, iteration: int, iterations: int) -> bool:
         """Whether to act after ``iteration`` (counted from 1)."""

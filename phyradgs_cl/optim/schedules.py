@@ -6,6 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
+
+# A rate of 0 has no decay; 1e-12 moves nothing in float32.
+_RANGES = {name: (1e-12, 10) for name in ("position", "scale", "rotation", "density")}
+
 
 @dataclass(frozen=True)
 class Rates:
@@ -19,6 +24,9 @@ class Rates:
     scale: tuple[float, float] = (2e-2, 2e-3)
     rotation: tuple[float, float] = (1e-2, 1e-3)
     density: tuple[float, float] = (6e-2, 6e-3)
+
+    def __post_init__(self) -> None:
+        checks.fields_within("rates.", self, _RANGES)
 
     def at(self, progress: float) -> np.ndarray:
         """Rates (11,) a parameter row at ``progress`` (0 to 1) through the run."""

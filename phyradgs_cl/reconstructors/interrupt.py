@@ -36,3 +36,23 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
         yield request
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class InterruptedAfterwards(KeyboardInterrupt):
+    """Ctrl-C that came during work which was finished all the same."""
+
+
+@contextmanager
+def finish_despite_interrupt() -> Iterator[None]:
+    """While open, SIGINT waits, however often it comes; then InterruptedAfterwards. For short work, as writing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: asked.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked and before is not signal.SIG_IGN:
+        raise InterruptedAfterwards

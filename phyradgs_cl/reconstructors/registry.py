@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import MOTIONS, Motion, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+from phyradgs_cl.reconstructors.asd_pocs import AsdPocsOptions, asd_pocs
+from phyradgs_cl.reconstructors.cgls import CglsOptions, cgls
+from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, fdk
+from phyradgs_cl.reconstructors.fista_tv import FistaTvOptions, fista_tv
 from phyradgs_cl.reconstructors.phyradgs import phyradgs
 from phyradgs_cl.reconstructors.r2 import r2
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors.sart import OS_SART, SartOptions, os_sart, sart
+from phyradgs_cl.reconstructors.sirt import SirtOptions, sirt
 from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
 from phyradgs_cl.runtime import Runtime
+
+_MOTION_KEYS = ("motion", "strips", "sub_intervals")
+_MODELS_WITH = {"strips": ("micro-views",), "sub_intervals": ("micro-views", "per-row")}
 
 
 @dataclass(frozen=True)
@@ -29,7 +39,13 @@ class Method:
 METHODS = {
     "phyradgs": Method(phyradgs, PRESETS),
     "r2": Method(r2, {"published": R2_PUBLISHED}),
-    "fdk": Method(fdk, {"ram-lak": FdkOptions()}, is_resumable=False),
+    "sart": Method(sart, {"default": SartOptions()}),
+    "os-sart": Method(os_sart, {"default": OS_SART}),
+    "sirt": Method(sirt, {"default": SirtOptions()}),
+    "cgls": Method(cgls, {"default": CglsOptions()}),
+    "asd-pocs": Method(asd_pocs, {"default": AsdPocsOptions()}),
+    "fista-tv": Method(fista_tv, {"default": FistaTvOptions()}),
+    "fdk": Method(fdk, FDK_PRESETS, is_resumable=False),
 }
 
 
@@ -39,17 +55,15 @@ def method_options(method: str, preset: str | None = None, changes: Mapping[str,
     ``motion``, ``strips`` and ``sub_intervals`` change the motion model together. Raises InputError for a name
     that the method does not have, so that no option is accepted and ignored.
     """
-    if method not in METHODS:
-        raise InputError("--method", repr(method), f"one of {', '.join(METHODS)}")
+    if not isinstance(method, str) or method not in METHODS:
+        raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
     presets = METHODS[method].presets
-    name = preset or next(iter(presets))
-    if name not in presets:
-        raise InputError("--preset", repr(name), f"one of {', '.join(presets)} for --method {method}")
+    name = next(iter(presets)) if preset is None else preset
+    if not isinstance(name, str) or name not in presets:
+        raise InputError("--preset", checks.shown(name), f"one of {', '.join(presets)} for --method {method}")
     changes = dict(changes or {})
     base = presets[name]
-    motion = _motion(
-        method, base.motion, {k: changes.pop(k, None) for k in ("motion", "strips", "sub_intervals")}
-    )
+    motion = _motion(method, base.motion, {key: changes.pop(key, None) for key in _MOTION_KEYS})
     return _changed(replace(base, motion=motion), changes, f"--method {method}")
 
 
@@ -68,46 +82,82 @@ def reconstruct(
     return METHODS[method].run(scan, chosen, rt, seed=seed, report=report, **extra)
 
 
+def motions_of(method: str) -> tuple[str, ...]:
+    """The motion models that a method takes: those that its options accept."""
+    base = next(iter(METHODS[method].presets.values()))
+    return tuple(name for name in MOTIONS if _accepts(base, replace(base.motion, name=name)))
+
+
+def _accepts(options: Any, motion: Motion) -> bool:
+    try:
+        replace(options, motion=motion)
+    except InputError:
+        return False
+    return True
+
+
 def _motion(method: str, base: Motion, given: dict[str, Any]) -> Motion:
-    name = given["motion"] or base.name
-    counts = {k: v for k, v in given.items() if k != "motion" and v is not None}
-    if counts and name != "micro-views":
-        option = "--" + next(iter(counts)).replace("_", "-")
-        raise InputError(
-            option, f"--motion {name} for --method {method}", "--motion micro-views, which alone has strips"
-        )
+    """``base`` with the name and the counts that are given, of which the model must have each."""
+    names = motions_of(method)
+    name = base.name if given["motion"] is None else given["motion"]
+    if name not in names:
+        raise InputError("--motion", checks.shown(name), f"one of {', '.join(names)} for --method {method}")
+    counts = {key: value for key, value in given.items() if key != "motion" and value is not None}
+    for key, value in counts.items():
+        option = "--" + key.replace("_", "-")
+        if name not in _MODELS_WITH[key]:
+            having = " or ".join(n for n in _MODELS_WITH[key] if n in names)
+            expected = f"--motion {having}" if having else "a method with a motion that has them"
+            raise InputError(
+                option, f"--motion {name} for --method {method}", expected, f"leave {option} out"
+            )
+        counts[key] = _converted(getattr(base, key), value, option)
     return replace(base, name=name, **counts)
 
 
 def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
+    """``options`` with ``changes`` by name; ``culprit`` is the method, or the table that they belong to."""
     known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
-            close = get_close_matches(key, known, n=1)
+            names = [*known, *(_MOTION_KEYS if hasattr(options, "motion") else ())]
+            close = get_close_matches(key, names, n=1)
             remedy = f"did you mean {close[0]!r}?" if close else "leave it out"
-            raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(known) or "none", remedy)
+            raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
         values[key] = _converted(known[key], value, f"{culprit}: option {key}")
     return replace(options, **values)
 
 
 def _converted(current: Any, value: Any, culprit: str) -> Any:
-    """``value`` as the type of the present value: numbers, pairs, nested tables."""
+    """``value`` as the type of the present value: numbers, words, tuples, nested tables."""
     if is_dataclass(current):
         if not isinstance(value, Mapping):
-            raise InputError(culprit, repr(value), "a table")
+            raise InputError(culprit, checks.shown(value), "a table")
         return _changed(current, value, culprit)
     if isinstance(current, tuple):
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
-            raise InputError(culprit, repr(value), f"a list of {len(current)} numbers")
+            raise InputError(culprit, checks.shown(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, culprit) for c, v in zip(current, value, strict=True))
-    if isinstance(current, bool):
-        if not isinstance(value, bool):
-            raise InputError(culprit, repr(value), "true or false")
-        return value
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if isinstance(current, int) and not (is_number and value == int(value)):
-        raise InputError(culprit, repr(value), "a whole number")
-    if isinstance(current, float) and not is_number:
-        raise InputError(culprit, repr(value), "a number")
+    expected, fits = _EXPECTED[type(current)]
+    if not fits(value):
+        raise InputError(culprit, checks.shown(value), expected)
     return type(current)(value)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether ``value`` is a finite number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # whole numbers have no bounds
+        return False
+
+
+_EXPECTED: dict[type, tuple[str, Callable[[Any], bool]]] = {
+    bool: ("true or false", lambda value: isinstance(value, bool)),
+    str: ("a word", lambda value: isinstance(value, str)),
+    int: ("a whole number", lambda value: _is_number(value) and value == int(value)),
+    float: ("a finite number", _is_number),
+}

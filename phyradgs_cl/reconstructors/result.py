@@ -10,7 +10,6 @@ import numpy as np
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
 
-
 State = Mapping[str, np.ndarray]
 """What an interrupted run needs to go on, as named arrays: each method knows its own names."""
 

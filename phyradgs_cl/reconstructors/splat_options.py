@@ -4,11 +4,31 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
+
+_WEIGHT = (0, 1e6)
+_RANGES = {
+    "ssim_weight": _WEIGHT,
+    "tv_weight": _WEIGHT,
+    "tv_edge": (1, 4096),
+    "density_weight": _WEIGHT,
+    "shape_weight": _WEIGHT,
+    "shape_ratio": (1, 1e6),
+    "shape_floor": (0, 10),
+    "parameter_terms_from": (0, 1_000_000_000),
+    "cutoff_sigma": (0, 100),  # 0 cuts nothing off
+    "initial_threshold": (0, 1e6),
+    "initial_density": (1e-6, 1e3),
+    "initial_scale": (1e-6, 1e3),
+    "scale_min": (1e-9, 10),
+    "scale_min_voxels": (0, 100),
+    "scale_max": (1e-6, 100),
+}
 
 
 @dataclass(frozen=True)
@@ -43,10 +63,11 @@ class SplatOptions:
     control: DensityControl = DensityControl()
 
     def __post_init__(self) -> None:
-        if self.iterations < 0:
-            raise InputError("--iterations", str(self.iterations), "at least 0")
-        if self.gaussians < 0:
-            raise InputError("--gaussians", str(self.gaussians), "at least 1, or 0 to choose from the grid")
+        checks.within("--iterations", self.iterations, 0, 1_000_000_000)
+        checks.within("--gaussians (0 chooses from the grid)", self.gaussians, 0, 100_000_000)
+        checks.fields_within("", self, _RANGES)
+        if self.scale_max <= self.scale_min:
+            raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
         if self.motion.name == "per-row":
             raise InputError("--motion", "'per-row'", "static, static-start or micro-views")
 

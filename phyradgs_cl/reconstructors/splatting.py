@@ -8,6 +8,7 @@ constants mean the same for every scan; both are undone on the way out.
 from __future__ import annotations
 
 import json
+import logging
 import time
 from dataclasses import dataclass
 
@@ -29,6 +30,7 @@ from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 REPORT_EVERY = 50
+log = logging.getLogger(__name__)
 _REFERENCE_PERCENTILE = 99.9
 
 
@@ -63,6 +65,7 @@ def reconstruct_splats(
     grid = scan.grid.scaled(1 / scale.length_mm)
     rng = np.random.default_rng(seed)
     population = first_population(fdk / scale.density_per_mm, grid, options, rng)
+    first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
     if resume is not None:
         run.restore(resume)
@@ -77,6 +80,8 @@ def reconstruct_splats(
         "seed": seed,
         "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm,
+        "gaussians_asked": options.gaussians_for(grid),
+        "gaussians_first": first_count,
         "gaussians": cloud.count,
         "seconds": time.perf_counter() - started,
         "interrupted_at": run.interrupted_at,
@@ -321,16 +326,24 @@ def first_population(
 ) -> Population:
     """The raw parameters of the initial cloud, drawn from an FDK volume in internal units."""
     activation = options.activation(grid)
+    asked = options.gaussians_for(grid)
     cloud = initial_cloud(
         volume,
         grid,
-        options.gaussians_for(grid),
+        asked,
         threshold=options.initial_threshold,
         density_share=options.initial_density,
         scale_bounds=(activation.scale_min, activation.scale_max),
         scale_factor=options.initial_scale,
         rng=rng,
     )
+    if options.gaussians and cloud.count < asked:
+        log.warning(
+            "%d Gaussians asked for, %d voxels of the first volume attenuate enough: starting with %d",
+            asked,
+            cloud.count,
+            cloud.count,
+        )
     raw = activation.invert(cloud.rows())
     half = np.array(grid.size_mm[::-1]) / 2
     box = np.stack([np.array(grid.offset_mm[::-1]) - half, np.array(grid.offset_mm[::-1]) + half])

@@ -1,6 +1,9 @@
 """Bad input: one line that names the culprit, exit status 2, nothing written, an existing output untouched."""
 
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -80,6 +83,7 @@ def test_damaged_scans(cli, good_scan, tmp_path, capfd, name):
     _expect_refusal(cli, capfd, tmp_path, ["reconstruct", str(scan), "--iterations", "2"], culprit)
 
 
+TINY = ["--size", "8", "--detector", "8"]
 OPTIONS = {
     "no such scan": (["reconstruct", "{tmp}/none.h5"], "none.h5"),
     "not HDF5": (["reconstruct", "{text}"], "text.h5"),
@@ -124,6 +128,43 @@ OPTIONS = {
         "direction",
     ),
     "a word for a number": (["simulate", "--views", "many"], "--views"),
+    "jitter of a standing gantry": (
+        ["simulate", "--protocol", "static", "--jitter-deg", "0.1"],
+        "--jitter-deg",
+    ),
+    "views that are no whole number": (["simulate", "--views", "1e23"], "--views"),
+    "seed of a scan beyond 64 bits": (["simulate", "--seed", "9" * 30, *TINY], "--seed"),
+    "endless seed": (["reconstruct", "{scan}", "--seed", "9" * 400], "--seed"),
+    "endless detector": (["simulate", "--detector", "9" * 400], "--detector"),
+    "endless size": (["simulate", "--size", "9" * 400, "--detector", "8"], "--size"),
+    "endless strips": (["reconstruct", "{scan}", "--strips", "9" * 400], "strips"),
+    "a number too long to read": (["simulate", "--views", "9" * 5000], "--views"),
+    "offset at infinity": (["simulate", "--detector-offset", "0,inf"], "--detector-offset"),
+    "no file name": (["reconstruct", "", "--method", "fdk"], "SCAN"),
+    "no volume name": (["simulate", "--volume", ""], "--volume"),
+    "no config name": (["reconstruct", "{scan}", "--config", ""], "--config"),
+    "no device name": (["reconstruct", "{scan}", "--device", ""], "--device"),
+    "blank device name": (["simulate", "--device", " ", *TINY], "--device"),
+    "no preset name": (["reconstruct", "{scan}", "--preset", ""], "--preset"),
+    "strips of fdk": (["reconstruct", "{scan}", "--method", "fdk", "--strips", "4"], "--strips"),
+    "exact line times of splats": (["reconstruct", "{scan}", "--motion", "per-row"], "--motion"),
+    "seed that is no number": (["reconstruct", "{scan}", "--seed", "1.5"], "--seed"),
+    "scanner that is a configuration": (["simulate", "--scanner", "demo"], "scanner"),
+}
+ABSURD_VALUES = {
+    "--dose": ("1e300", "1e13", "nan", "inf", "-1", "0"),
+    "--electronic-noise": ("1e300", "1e10", "nan", "inf", "-1"),
+    "--jitter-deg": ("1e300", "361", "nan", "inf", "-1"),
+    "--peak": ("1e300", "1e5", "nan", "inf", "-1"),
+    "--exposure-deg": ("1e300", "nan", "inf", "-1"),
+    "--start-deg": ("1e300", "-1e300", "1e7", "nan", "inf"),
+    "--readout-ratio": ("1e300", "nan", "inf", "-1"),
+    "--detector-offset": ("1e300,0", "0,-1e7", "nan,0", "0", "1,2,3"),
+    "--detector": ("99999999999999999999", "-1", "0"),
+    "--views": ("99999999999999999999", "-1", "0"),
+    "--size": ("99999999999999999999", "-1", "0"),
+    "--time-samples": ("99999999999999999999", "-1"),
+    "--seed": ("99999999999999999999", "-1"),
 }
 
 
@@ -136,6 +177,14 @@ def test_wrong_options(cli, good_scan, tmp_path, capfd, name):
     _expect_refusal(cli, capfd, tmp_path, filled, culprit)
 
 
+@pytest.mark.parametrize("option", ABSURD_VALUES)
+def test_absurd_numbers_of_a_simulation(cli, tmp_path, capfd, option):
+    word = option.strip("-").split("-")[0]
+    for value in ABSURD_VALUES[option]:
+        arguments = ["simulate", "--noise", "beer", *TINY, f"{option}={value}"]
+        _expect_refusal(cli, capfd, tmp_path, arguments, word)
+
+
 CONFIGS = {
     "unknown key": ("iteration = 5", "iteration"),
     "text for a number": ("iterations = 'many'", "iterations"),
@@ -143,6 +192,37 @@ CONFIGS = {
     "number for a table": ("rates = 3", "rates"),
     "short pair": ("[rates]\nposition = [1e-3]", "position"),
     "boolean weight": ("tv_weight = true", "tv_weight"),
+    "NaN weight": ("tv_weight = nan", "tv_weight"),
+    "infinite iterations": ("iterations = inf", "iterations"),
+    "NaN iterations": ("iterations = nan", "iterations"),
+    "negative weight": ("ssim_weight = -0.5", "ssim_weight"),
+    "huge weight": ("density_weight = 1e300", "density_weight"),
+    "rate of nothing": ("[rates]\nscale = [0, 0]", "rates.scale"),
+    "NaN rate": ("[rates]\nposition = [nan, 1e-4]", "position"),
+    "negative threshold": ("[control]\nthreshold = -1", "control.threshold"),
+    "negative period": ("[control]\nevery = -1", "control.every"),
+    "half a period": ("[control]\nevery = 0.5", "every"),
+    "unknown key of a table": ("[control]\nevry = 3", "did you mean 'every'?"),
+    "scales the wrong way round": ("scale_min = 0.5\nscale_max = 0.1", "scale_max"),
+    "list of presets": ("preset = ['default']", "preset"),
+    "list of devices": ("device = [0]", "device"),
+    "negative device": ("device = -1", "device"),
+    "empty device": ("device = ''", "device"),
+    "boolean device": ("device = true", "device"),
+    "list of methods": ("method = ['fdk']", "method"),
+    "number for a method": ("method = 3", "method"),
+    "list of motions": ("motion = ['static']", "motion"),
+    "number for a motion": ("motion = 3", "motion"),
+    "half a strip": ("strips = 2.5", "strips"),
+    "boolean strips": ("strips = true", "strips"),
+    "boolean seed": ("seed = true", "seed"),
+    "huge seed": ("seed = 1e300", "seed"),
+    "date for a seed": ("seed = 2024-01-01", "seed"),
+    "dash for an underscore": ("sub-intervals = 3", "did you mean 'sub_intervals'?"),
+    "key that lacks a letter": ("strip = 3", "did you mean 'strips'?"),
+    "digits without end": (f"iterations = {'9' * 5000}", "config"),
+    "hexadecimal digits without end": (f"iterations = 0x{'f' * 5000}", "iterations"),
+    "tables without end": ("a = " + "[" * 20_000, "config"),
 }
 
 
@@ -174,6 +254,53 @@ def test_the_scan_is_never_overwritten_by_its_volume(cli, good_scan, tmp_path, c
     assert cli.run(["reconstruct", str(scan), "-o", str(scan), "--method", "fdk"]) == 2
     assert capfd.readouterr().err.count("\n") == 1
     assert scan.read_bytes() == before
+
+
+def test_the_configuration_is_never_overwritten(cli, good_scan, tmp_path, capfd):
+    config = tmp_path / "run.toml"
+    config.write_text("method = 'fdk'\n")
+    assert cli.run(["reconstruct", str(good_scan), "--config", str(config), "-o", str(config)]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert config.read_text() == "method = 'fdk'\n"
+
+
+def test_the_scanner_is_never_overwritten(cli, tmp_path, capfd):
+    scanner = tmp_path / "own.toml"
+    shutil.copy(Path(cli.__file__).parent / "data" / "r2.toml", scanner)
+    before = scanner.read_bytes()
+    assert cli.run(["simulate", "--scanner", str(scanner), "-o", str(scanner), *TINY]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert scanner.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", [["simulate", *TINY], ["reconstruct", "scan.h5"]])
+def test_an_output_without_a_name_is_said_so(cli, capfd, command):
+    assert cli.run([*command, "-o", ""]) == 2
+    assert capfd.readouterr().err == "phyradgs: -o: found ''; expected a file name; name a file\n"
+
+
+def test_only_scanners_are_offered_for_a_misspelt_scanner(cli, tmp_path, capfd):
+    for name in ("demos", "r3"):
+        assert cli.run(["simulate", "--scanner", name, "-o", str(tmp_path / "scan.h5")]) == 2
+        line = capfd.readouterr().err
+        assert "r2" in line
+        assert "demo'" not in line.replace(f"{name}'", "")
+        assert "demo," not in line
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_behind_stdout_is_one_line(good_scan):
+    for command in (["info", str(good_scan)], ["devices"], ["--version"], []):
+        with open("/dev/full", "w") as full:
+            done = subprocess.run(
+                [sys.executable, "-m", "phyradgs_cl", *command],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        assert done.returncode == 2
+        assert done.stderr.startswith("phyradgs: standard output: ")
+        assert done.stderr.count("\n") == 1
 
 
 def _expect_refusal(cli, capfd, folder, arguments, culprit):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -132,6 +133,66 @@ def test_the_command_line_wins_over_the_config_file(cli, scan, tmp_path):
     assert options["gaussians"] == 50
     assert options["motion"]["name"] == "static"
     assert options["rates"]["position"] == [1e-3, 1e-4]
+
+
+def test_without_a_command_the_help_is_printed_as_it_is(cli, capsys):
+    assert cli.run([]) == 0
+    captured = capsys.readouterr()
+    assert "Usage:" in captured.out
+    assert len(captured.out.splitlines()) > 10
+    assert captured.err == ""
+
+
+def test_numbers_of_a_config_may_be_written_as_whole_floats(cli, scan, tmp_path):
+    config, output = tmp_path / "run.toml", tmp_path / "volume.h5"
+    config.write_text("device = 0\nseed = 3.0\nstrips = 2.0\nsub_intervals = 3\niterations = 2.0\n")
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config)]) == 0
+    with h5py.File(output) as file:
+        facts = json.loads(file["entry/provenance/json"][()])
+    assert facts["options"]["motion"] == {"name": "micro-views", "strips": 2, "sub_intervals": 3}
+    assert (facts["seed"], facts["options"]["iterations"]) == (3, 2)
+
+
+def test_more_gaussians_than_voxels_are_said_and_kept(cli, scan, tmp_path, caplog):
+    output = tmp_path / "volume.h5"
+    asked = ["--iterations", "1", "--gaussians", "100000"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), *asked]) == 0
+    with h5py.File(output) as file:
+        facts = json.loads(file["entry/provenance/json"][()])
+    assert facts["gaussians_asked"] == 100_000
+    assert 0 < facts["gaussians_first"] < 16**3
+    assert [r.getMessage() for r in caplog.records if "asked for" in r.getMessage()] == [
+        f"100000 Gaussians asked for, {facts['gaussians_first']} voxels of the first volume attenuate enough: "
+        f"starting with {facts['gaussians_first']}"
+    ]
+
+
+def test_beams_that_miss_and_scans_without_an_object_are_said(cli, tmp_path, caplog):
+    path = tmp_path / "scan.h5"
+    assert cli.run([*SIMULATE, "--detector-offset", "500,500", "-o", str(path)]) == 0
+    assert [r.getMessage() for r in caplog.records] == [
+        "no ray meets anything that attenuates: all 6 frames are empty"
+    ]
+    for value in (0.0, -1.0):
+        with h5py.File(path, "r+") as file:
+            file["entry/instrument/detector/data"][...] = value
+        caplog.clear()
+        assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "v.h5"), "--method", "fdk"]) == 0
+        told = [r.getMessage() for r in caplog.records if "no line integral is above 0" in r.getMessage()]
+        assert len(told) == 1
+        assert f"the largest is {value:g}" in told[0]
+
+
+@pytest.mark.parametrize("method", ["fdk", "phyradgs"])
+def test_overflow_is_one_line_without_numpys_warnings(cli, scan, tmp_path, capfd, recwarn, method):
+    path = tmp_path / "scan.h5"
+    shutil.copy(scan, path)
+    with h5py.File(path, "r+") as file:
+        file["entry/instrument/detector/data"][...] = 3e38
+    capfd.readouterr()
+    assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "v.h5"), "--method", method]) in (2, 3)
+    assert capfd.readouterr().err.count("\n") == 1
+    assert not recwarn.list
 
 
 def test_volume_files_are_simulated_at_their_own_resolution(cli, tmp_path):

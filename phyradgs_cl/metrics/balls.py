@@ -1,0 +1,76 @@
+"""Balls of known place and size in a volume: what the shape metrics are measured on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl.checks import finite, positive, shape
+from phyradgs_cl.fields import Grid
+
+Array = NDArray[np.float64]
+
+# Balls are looked at out to this multiple of their radius: enough surroundings to know the level outside.
+REACH = 1.75
+# Below this radius a ball is a handful of voxels: its shape is the voxels' own.
+SMALLEST_RADIUS_VOXELS = 2.5
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A homogeneous ball in homogeneous surroundings (out to ``REACH`` radii).
+
+    Args:
+        centre_mm: (x, y, z).
+        radius_mm: radius.
+
+    Raises:
+        InputError: a centre that is not finite or not three numbers, a radius that is not positive.
+    """
+
+    centre_mm: tuple[float, float, float]
+    radius_mm: float
+
+    def __post_init__(self) -> None:
+        shape("ball centre", self.centre_mm, (3,))
+        finite("ball centre", self.centre_mm)
+        positive("ball radius", self.radius_mm)
+
+
+def resolved(balls: Sequence[Ball], grid: Grid) -> list[Ball]:
+    """The balls that are large enough on ``grid`` to have a shape, and lie in it with their surroundings."""
+    least_mm = SMALLEST_RADIUS_VOXELS * max(grid.voxel_size_mm)
+    return [ball for ball in balls if ball.radius_mm >= least_mm and _is_inside(ball, grid)]
+
+
+def surroundings(volume: NDArray[np.floating], grid: Grid, ball: Ball) -> tuple[Array, Array]:
+    """Distances (n,) in mm from the ball's centre and values (n,) of all voxels within ``REACH`` radii."""
+    reach_mm = REACH * ball.radius_mm
+    picks, offsets = [], []
+    for axis_mm, centre_mm in zip(grid.axes_mm(), ball.centre_mm[::-1], strict=True):
+        pick = np.flatnonzero(np.abs(axis_mm - centre_mm) <= reach_mm)
+        picks.append(pick)
+        offsets.append(axis_mm[pick] - centre_mm)
+    z, y, x = np.meshgrid(*offsets, indexing="ij", sparse=True)
+    distance = np.sqrt(x * x + y * y + z * z).ravel()
+    values = volume[np.ix_(*picks)].astype(np.float64).ravel()
+    near = distance <= reach_mm
+    return distance[near], values[near]
+
+
+def levels(distance_mm: Array, values: Array, radius_mm: float) -> tuple[float, float]:
+    """Values inside and outside, as medians away from the edge; NaN where there is no voxel to ask."""
+    inside = values[distance_mm < 0.6 * radius_mm]
+    outside = values[distance_mm > 1.4 * radius_mm]
+    if inside.size == 0 or outside.size == 0:
+        return np.nan, np.nan
+    return float(np.median(inside)), float(np.median(outside))
+
+
+def _is_inside(ball: Ball, grid: Grid) -> bool:
+    reach_mm = REACH * ball.radius_mm
+    sides = zip(grid.offset_mm, grid.size_mm, ball.centre_mm[::-1], strict=True)
+    return all(abs(centre - offset) + reach_mm <= side / 2 for offset, side, centre in sides)

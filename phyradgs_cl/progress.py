@@ -1,0 +1,67 @@
+"""How far a command is, on stderr: one line rewritten on a terminal, a line every ten seconds elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import suppress
+
+import typer
+
+from phyradgs_cl.reconstructors import Progress
+
+_TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0
+
+
+class Ticker:
+    """Counts ``noun``s done; says rate and time left. As a context it ends the line that it rewrites."""
+
+    def __init__(self, noun: str) -> None:
+        self.noun = noun
+        self.is_terminal = sys.stderr is not None and sys.stderr.isatty()
+        self.started = self.last = time.monotonic()
+        self.first: int | None = None
+        self.is_open = False
+
+    def __enter__(self) -> Ticker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.is_open:
+            _say("")
+
+    def progress(self, p: Progress) -> None:
+        """The report of a reconstruction."""
+        cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
+        self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
+
+    def show(self, done: int, total: int, more: str = "") -> None:
+        """Says ``done`` of ``total`` and ``more``, unless it has just said something."""
+        now = time.monotonic()
+        if self.first is None:
+            self.first, self.started = done, now
+        every_s = _TERMINAL_EVERY_S if self.is_terminal else _ELSEWHERE_EVERY_S
+        if done < total and now - self.last < every_s:
+            return
+        self.last = now
+        line = f"{self.noun} {done}/{total}{more}{self._rate(done, total, now)}"
+        _say(f"\r\x1b[K{line}" if self.is_terminal else line, ends_line=not self.is_terminal)
+        self.is_open = self.is_terminal
+
+    def _rate(self, done: int, total: int, now: float) -> str:
+        since_first = done - (self.first or 0)
+        if now <= self.started or since_first <= 0:
+            return ""
+        per_second = since_first / (now - self.started)
+        return f"  {per_second:.1f}/s  ETA {clock((total - done) / per_second)}"
+
+
+def clock(seconds: float) -> str:
+    """Seconds as minutes:seconds, or hours:minutes:seconds."""
+    minutes, rest = divmod(int(seconds + 0.5), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
+
+
+def _say(text: str, ends_line: bool = True) -> None:
+    with suppress(OSError):  # a full disk or a closed pipe behind stderr is no reason to stop
+        typer.echo(text, err=True, nl=ends_line)

@@ -1,0 +1,112 @@
+"""What a run is asked to do: the configuration file, the command line that wins over it, and words into values."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+LARGEST_SEED = 2**63
+LARGEST_OFFSET_MM = 1e6
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked."""
+
+    method: str
+    preset: str | None
+    seed: int
+    device: str | None
+    changes: Mapping[str, Any]
+
+
+def run_settings(config: Path | None, given: Mapping[str, object]) -> RunSettings:
+    """The settings of a configuration file, with those of ``given`` that are not None in their place."""
+    settings = read_config(config)
+    culprits = {key: f"--config {config}: {key}" for key in settings}
+    for key, value in given.items():
+        if value is not None:
+            settings[key] = value
+            culprits[key] = "--" + key.replace("_", "-")
+    method = _word(settings, "method", culprits)
+    preset = _word(settings, "preset", culprits)
+    device = settings.pop("device", None)
+    if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
+        device = str(device)  # in TOML an index is a number
+    seed = _seed(settings.pop("seed", 0), culprits.get("seed", "--seed"))
+    wish = device_wish(device, culprits.get("device", "--device"))
+    return RunSettings("phyradgs" if method is None else method, preset, seed, wish, settings)
+
+
+def read_config(path: Path | None) -> dict[str, Any]:
+    """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
+    if path is None:
+        return {}
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except OSError as error:
+        raise InputError(f"--config {path}", error.strerror or str(error), "a TOML file") from error
+    except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
+        raise InputError(f"--config {path}", f"not TOML ({error})", "a TOML file") from error
+
+
+def device_wish(value: object, culprit: str = "--device") -> str | None:
+    """The device asked for, or None; an empty wish would otherwise pass for none, or for any."""
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value.strip():
+        remedy = "see 'phyradgs devices', or leave it out for the best device"
+        raise InputError(culprit, checks.shown(value), "an index, cpu, gpu or part of a name", remedy)
+    return value
+
+
+def file_parser(culprit: str) -> Callable[[str], Path]:
+    """Reads the file name given for ``culprit``; an empty one would pass for the current folder."""
+
+    def file(text: str) -> Path:
+        if not text.strip():
+            raise InputError(culprit, repr(text), "a file name", "name a file")
+        return Path(text)
+
+    return file
+
+
+def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:
+    """Two lengths "V,U" in mm."""
+    if text is None:
+        return None
+    try:
+        v_mm, u_mm = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(option, repr(text), "two numbers V,U in mm", "write for example 0,12.5") from None
+    if not all(math.isfinite(x) and abs(x) <= LARGEST_OFFSET_MM for x in (v_mm, u_mm)):
+        raise InputError(option, repr(text), f"two lengths of at most {LARGEST_OFFSET_MM:g} mm")
+    return v_mm, u_mm
+
+
+def _word(settings: dict[str, Any], key: str, culprits: Mapping[str, str]) -> str | None:
+    value = settings.pop(key, None)
+    if value is not None and not isinstance(value, str):
+        raise InputError(culprits[key], checks.shown(value), "a word in quotation marks")
+    return value
+
+
+def _seed(value: object, culprit: str) -> int:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_SEED:
+        raise InputError(culprit, checks.shown(value), f"a whole number from 0 to {LARGEST_SEED}")
+    return value

@@ -1,0 +1,55 @@
+"""What is said on the way: the quantity by its name, Gaussians where there are any, time left."""
+
+import pytest
+
+from phyradgs_cl import progress
+from phyradgs_cl.progress import Ticker, clock
+from phyradgs_cl.reconstructors import Progress
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """A clock in the test's hands: now[0] seconds."""
+    seconds = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: seconds[0])
+    return seconds
+
+
+def test_a_loss_comes_with_its_gaussians(capsys):
+    Ticker("iteration").progress(Progress(50, 50, 0.125, 300, 1.0))
+    assert capsys.readouterr().err == "iteration 50/50  loss 0.12500  300 Gaussians\n"
+
+
+def test_a_residual_comes_without(capsys):
+    Ticker("iteration").progress(Progress(3, 3, 0.5, 0, 1.0, quantity="residual"))
+    assert capsys.readouterr().err == "iteration 3/3  residual 0.50000\n"
+
+
+def test_rate_and_time_left_count_from_the_first_report(capsys, now):
+    ticker = Ticker("frame")
+    now[0] = 20.0
+    ticker.show(10, 100)
+    now[0] = 40.0
+    ticker.show(30, 100)
+    assert capsys.readouterr().err == "frame 10/100\nframe 30/100  1.0/s  ETA 1:10\n"
+
+
+def test_a_file_gets_a_line_every_ten_seconds_and_the_last(capsys, now):
+    ticker = Ticker("frame")
+    for second in range(31):
+        now[0] = float(second)
+        ticker.show(second, 30)
+    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["10/30", "20/30", "30/30"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.2, "0:00"), (59.6, "1:00"), (125, "2:05"), (3600, "1:00:00")]
+)
+def test_times_read_as_clocks(seconds, text):
+    assert clock(seconds) == text
+
+
+def test_no_stderr_is_no_trouble(monkeypatch):
+    monkeypatch.setattr("sys.stderr", None)
+    with Ticker("frame") as ticker:
+        ticker.show(1, 1)

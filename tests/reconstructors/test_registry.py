@@ -1,0 +1,156 @@
+"""Options by name: converted, checked, and refused with the names that would have been right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors import METHODS, method_options
+from phyradgs_cl.reconstructors.registry import motions_of
+
+ABSURD = {
+    "NaN": float("nan"),
+    "infinite": float("inf"),
+    "huge": 1e300,
+    "far below 0": -1e300,
+    "too long for a float": 10**400,
+    "too long to print": 10**5000,
+    "boolean": True,
+    "word": "many",
+    "list": [[1]],
+}
+
+
+def numeric_options(options: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """(names from the outside in, present value) of every number and tuple of numbers in an options class."""
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if field.name == "motion" or isinstance(value, bool):
+            continue
+        if is_dataclass(value):
+            yield from numeric_options(value, (*path, field.name))
+        elif isinstance(value, int | float | tuple):
+            yield (*path, field.name), value
+
+
+def nested(path: tuple[str, ...], value: object) -> dict[str, Any]:
+    """``value`` as a configuration file would give it: {"rates": {"position": value}}."""
+    for name in reversed(path):
+        value = {name: value}
+    assert isinstance(value, dict)
+    return value
+
+
+def number_cases() -> list[Any]:
+    cases = []
+    for method, entry in METHODS.items():
+        for path, value in numeric_options(next(iter(entry.presets.values()))):
+            cases.append(pytest.param(method, path, value, id=f"{method} {'.'.join(path)}"))
+    return cases
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_preset_is_taken_as_it_is(method) -> None:
+    for name, options in METHODS[method].presets.items():
+        assert method_options(method, name) == options
+
+
+@pytest.mark.parametrize(("method", "path", "current"), number_cases())
+def test_every_number_has_a_checked_range(method, path, current) -> None:
+    for name, absurd in ABSURD.items():
+        value = [absurd] * len(current) if isinstance(current, tuple) else absurd
+        with pytest.raises(InputError) as refusal:
+            method_options(method, None, nested(path, value))
+        assert path[-1] in str(refusal.value), name
+        assert len(str(refusal.value)) < 700, name
+
+
+@pytest.mark.parametrize(("method", "path", "current"), number_cases())
+def test_every_number_can_be_given_as_it_stands(method, path, current) -> None:
+    value = list(current) if isinstance(current, tuple) else float(current)
+    assert method_options(method, None, nested(path, value)) == method_options(method)
+
+
+def test_whole_floats_are_whole_numbers() -> None:
+    options = method_options("phyradgs", None, {"strips": 2.0, "sub_intervals": 3.0, "iterations": 40.0})
+    assert (options.motion.strips, options.motion.sub_intervals, options.iterations) == (2, 3, 40)
+    assert isinstance(options.motion.strips, int)
+
+
+def test_no_rounds_of_density_control_can_be_asked_for() -> None:
+    assert not method_options("phyradgs", None, {"control": {"every": 0}}).control.is_due(600, 2000)
+
+
+@pytest.mark.parametrize("changes", [{"strips": 2.5}, {"strips": True}, {"strips": [2]}, {"strips": "two"}])
+def test_counts_of_motion_are_whole_numbers(changes) -> None:
+    with pytest.raises(InputError, match="--strips: .*whole number"):
+        method_options("phyradgs", None, changes)
+
+
+@pytest.mark.parametrize("wrong", [["default"], 3, {"a": 1}, True, ""])
+def test_names_are_words(wrong) -> None:
+    for change in ({"preset": wrong}, {"changes": {"motion": wrong}}):
+        with pytest.raises(InputError, match=f"--{'preset' if 'preset' in change else 'motion'}"):
+            method_options("phyradgs", **change)
+    with pytest.raises(InputError, match="--method"):
+        method_options(wrong)
+
+
+@pytest.mark.parametrize(
+    ("key", "meant"),
+    [
+        ("sub-intervals", "sub_intervals"),
+        ("strip", "strips"),
+        ("motions", "motion"),
+        ("iteration", "iterations"),
+        ("tv-weight", "tv_weight"),
+    ],
+)
+def test_unknown_options_are_told_what_was_meant(key, meant) -> None:
+    with pytest.raises(InputError) as refusal:
+        method_options("phyradgs", None, {key: 3})
+    assert f"did you mean '{meant}'?" in str(refusal.value)
+    for name in ("motion", "strips", "sub_intervals", "gaussians"):
+        assert name in refusal.value.expected
+
+
+def test_unknown_options_of_a_table_name_the_table_and_what_it_has() -> None:
+    with pytest.raises(InputError, match="option control: option threshhold") as refusal:
+        method_options("phyradgs", None, {"control": {"threshhold": 1.0}})
+    assert "'threshold'" in refusal.value.remedy
+    assert "strips" not in refusal.value.expected
+
+
+def test_splats_have_no_exact_line_times_and_fdk_no_micro_views() -> None:
+    for method in ("phyradgs", "r2"):
+        assert motions_of(method) == ("static", "static-start", "micro-views")
+    assert "micro-views" not in motions_of("fdk")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_errors_about_motion_offer_what_the_method_has(method) -> None:
+    own = motions_of(method)
+    for name in own:
+        assert method_options(method, None, {"motion": name}).motion.name == name
+    with pytest.raises(InputError) as refusal:
+        method_options(method, None, {"motion": "wobble"})
+    assert refusal.value.expected == f"one of {', '.join(own)} for --method {method}"
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("key", ["strips", "sub_intervals"])
+def test_counts_belong_to_the_motions_that_have_them(method, key) -> None:
+    having = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}}[key]
+    for name in motions_of(method):
+        changes = {"motion": name, key: 3}
+        if name in having:
+            assert getattr(method_options(method, None, changes).motion, key) == 3
+            continue
+        with pytest.raises(InputError, match=f"--{key.replace('_', '-')}: ") as refusal:
+            method_options(method, None, changes)
+        for other in having - set(motions_of(method)):
+            assert other not in refusal.value.expected
