@@ -298,7 +298,8 @@ def reconstruct_command(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="Constants: default, paper or released (phyradgs); published (r2).", show_default="default"
+            help="Constants: default, paper or released (phyradgs); published (r2); the window of fdk.",
+            show_default="the method's first",
         ),
     ] = None,
     config: Annotated[
@@ -307,6 +308,15 @@ def reconstruct_command(
             "--config",
             help="TOML file with any of these options (underscores for dashes) and the preset's constants; "
             "the command line wins.",
+        ),
+    ] = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any option of the method by name, as in the file: --set tv_weight=0.002 --set order=random. "
+            "Docs: methods.md.",
         ),
     ] = None,
     resume: Annotated[
@@ -326,7 +336,7 @@ def reconstruct_command(
         "preset": preset,
         "device": device,
     }
-    settings = run_settings(config, given)
+    settings = run_settings(config, given, assignments or [])
     job = ReconstructionJob(
         scan,
         output,

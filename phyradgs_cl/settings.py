@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,10 +34,15 @@ class RunSettings:
     changes: Mapping[str, Any]
 
 
-def run_settings(config: Path | None, given: Mapping[str, object]) -> RunSettings:
-    """The settings of a configuration file, with those of ``given`` that are not None in their place."""
+def run_settings(
+    config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
+) -> RunSettings:
+    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None."""
     settings = read_config(config)
     culprits = {key: f"--config {config}: {key}" for key in settings}
+    for text in assignments:
+        merge(settings, assignment(text))
+        culprits[text.split("=")[0].split(".")[0].strip()] = f"--set {text}"
     for key, value in given.items():
         if value is not None:
             settings[key] = value
@@ -61,6 +68,26 @@ def read_config(path: Path | None) -> dict[str, Any]:
         raise InputError(f"--config {path}", error.strerror or str(error), "a TOML file") from error
     except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
         raise InputError(f"--config {path}", f"not TOML ({error})", "a TOML file") from error
+
+
+def assignment(text: str) -> dict[str, Any]:
+    """NAME=VALUE as a line of TOML; a value that is not TOML is a word, so that order=random needs no quotes."""
+    name, sign, value = text.partition("=")
+    if not (sign and name.strip()):
+        raise InputError("--set", repr(text), "NAME=VALUE", "write for example tv_weight=0.002")
+    for line in (f"{name} = {value}", f"{name} = {json.dumps(value.strip())}"):
+        with suppress(ValueError, RecursionError):
+            return tomllib.loads(line)
+    raise InputError("--set", repr(text), "NAME=VALUE with a name such as tv_weight or rates.position")
+
+
+def merge(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    """Puts ``changes`` into ``settings``, table into table."""
+    for key, value in changes.items():
+        if isinstance(value, Mapping) and isinstance(settings.get(key), dict):
+            merge(settings[key], value)
+        else:
+            settings[key] = value
 
 
 def device_wish(value: object, culprit: str = "--device") -> str | None:

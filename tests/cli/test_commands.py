@@ -258,3 +258,24 @@ def test_the_module_runs_outside_the_repository(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stdout.startswith("phyradgs-cl ")
+
+
+def test_assignments_win_over_the_file_and_switches_over_both(cli, scan, tmp_path):
+    config, output = tmp_path / "run.toml", tmp_path / "volume.h5"
+    config.write_text("method = 'sart'\niterations = 7\nrelaxation = 0.1\norder = 'ordered'\n")
+    given = ["--set", "relaxation=0.5", "--set", "order=random", "--set", "iterations=5", "--iterations", "2"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config), *given]) == 0
+    with h5py.File(output) as file:
+        options = json.loads(file["entry/provenance/json"][()])["options"]
+    assert (options["relaxation"], options["order"], options["iterations"]) == (0.5, "random", 2)
+
+
+def test_an_assignment_reaches_into_a_table_of_the_file(cli, scan, tmp_path):
+    config, output = tmp_path / "run.toml", tmp_path / "volume.h5"
+    config.write_text("iterations = 2\n[rates]\nposition = [1e-3, 1e-4]\ndensity = [1e-2, 1e-3]\n")
+    given = ["--config", str(config), "--set", "rates.position=[2e-3, 2e-4]"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), *given]) == 0
+    with h5py.File(output) as file:
+        rates = json.loads(file["entry/provenance/json"][()])["options"]["rates"]
+    assert rates["position"] == [2e-3, 2e-4]
+    assert rates["density"] == [1e-2, 1e-3]
