@@ -1,11 +1,29 @@
-/* Voxel-driven backprojection with FDK's distance weight: bilinear in the filtered projection.
-   A work-item takes LANES voxels along x and walks the views. */
+/* Voxel-driven backprojection with FDK's distance weight: bilinear in the filtered projections, zero outside them.
+   All kernels add to the volume. Twins: operators/twins/backproject.py.
+     backproject          any pose; a work-item takes LANES voxels along x and walks the views
+     backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
+     backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes one voxel */
 #include "common/lanes.h"
+
+/* Element by element into a register: through an array in memory the wide load waits for all narrow stores. */
+#if LANES == 1
+#define GATHER(p, i) ((p)[i])
+#elif LANES == 4
+#define GATHER(p, i) ((vf)((p)[(i).s0], (p)[(i).s1], (p)[(i).s2], (p)[(i).s3]))
+#else
+#define GATHER_4(p, i, a, b, c, d) (p)[(i).a], (p)[(i).b], (p)[(i).c], (p)[(i).d]
+#if LANES == 8
+#define GATHER(p, i) ((vf)(GATHER_4(p, i, s0, s1, s2, s3), GATHER_4(p, i, s4, s5, s6, s7)))
+#else
+#define GATHER(p, i) ((vf)(GATHER_4(p, i, s0, s1, s2, s3), GATHER_4(p, i, s4, s5, s6, s7), \
+                           GATHER_4(p, i, s8, s9, sa, sb), GATHER_4(p, i, sc, sd, se, sf)))
+#endif
+#endif
 
 __kernel void backproject(
     __global const float *projections, /* views of (guard, (rows, pitch)) */
     __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */
-    __global const float *weights,     /* (views,): angular share times (DSO / DSD)^2 */
+    __global const float *weights,     /* (views,) */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int volume_pitch,
     __global float *volume)
@@ -14,32 +32,148 @@ __kernel void backproject(
     if (first >= shape.x)
         return;
     const vf x = (vf)(first) + V_IOTA;
+    const int next_row = rows > 1 ? image_pitch : 0, next = width > 1 ? 1 : 0;
     vf sum = (vf)(0.0f);
     for (int f = 0; f < views; ++f) {
-        __global const float *m = matrices + f * 12;
+        __global const float *m = matrices + (size_t)f * 12;
         __global const float *image = projections + f * image_step + IMAGE_GUARD;
         const vf depth = m[8] * x + (m[9] * y + m[10] * z + m[11]);
         const vf inv = 1.0f / depth;
         const vf u = (m[0] * x + (m[1] * y + m[2] * z + m[3])) * inv;
         const vf v = (m[4] * x + (m[5] * y + m[6] * z + m[7])) * inv;
         const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (depth > 0.0f);
+        /* picked before they become integers: outside they may be too large for one */
         const vf us = V_PICK(0.0f, u, inside), vs = V_PICK(0.0f, v, inside);
-        const vf uf = min(floor(us), (float)max(width - 2, 0)), vff = min(floor(vs), (float)max(rows - 2, 0));
-        const vf wu = us - uf, wv = vs - vff;
-        int at[LANES];
-        float low[LANES], high[LANES], below[LANES], above[LANES];
-        VI_STORE(V_INT(vff) * image_pitch + V_INT(uf), at);
-        const int next_row = rows > 1 ? image_pitch : 0, next = width > 1 ? 1 : 0;
-        for (int lane = 0; lane < LANES; ++lane) {
-            __global const float *p = image + at[lane];
-            low[lane] = p[0];
-            high[lane] = p[next];
-            below[lane] = p[next_row];
-            above[lane] = p[next_row + next];
-        }
-        const vf lower = V_LOAD(low) + wu * (V_LOAD(high) - V_LOAD(low));
-        const vf upper = V_LOAD(below) + wu * (V_LOAD(above) - V_LOAD(below));
+        const vi column = min(V_INT(us), max(width - 2, 0)), row = min(V_INT(vs), max(rows - 2, 0));
+        const vf wu = us - V_FLOAT(column), wv = vs - V_FLOAT(row);
+        const vi at = row * image_pitch + column;
+        const vf low = GATHER(image, at), high = GATHER(image + next, at);
+        const vf below = GATHER(image + next_row, at), above = GATHER(image + next_row + next, at);
+        const vf lower = low + wu * (high - low);
+        const vf upper = below + wu * (above - below);
         sum += V_PICK(0.0f, weights[f] * inv * inv * (lower + wv * (upper - lower)), inside);
     }
-    V_STORE(sum, volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * volume_pitch + first);
+    __global float *target = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * volume_pitch + first;
+    /* the last vector may reach into the guard, where it must leave zeros */
+    V_STORE(V_LOAD(target) + V_PICK(0.0f, sum, x < (float)shape.x), target);
+}
+
+#ifdef COLUMN_ROWS
+/* Along z the detector column and the depth stay and v is linear: two columns are blended once for all voxels.
+   Images are transposed: (columns, pitch) with v along a row. The host sees to it that a block of voxels along z
+   meets at most COLUMN_ROWS rows. */
+__kernel void backproject_upright(
+    __global const float *projections, __global const float *matrices, __global const float *weights,
+    const int views, const int rows, const int width, const int image_pitch, const long image_step,
+    const int4 shape, const int volume_pitch, const int block, /* voxels along z a work-item, <= BLOCK_VOXELS */
+    __global float *volume)
+{
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), first = (int)get_global_id(2) * block;
+    if (x >= shape.x)
+        return;
+    const int count = min(block, shape.z - first);
+    float sum[BLOCK_VOXELS], blended[COLUMN_ROWS + 2 * LANES];
+    for (int z = 0; z < count; ++z)
+        sum[z] = 0.0f;
+    for (int f = 0; f < views; ++f) {
+        __global const float *m = matrices + (size_t)f * 12;
+        const float depth = m[8] * x + (m[9] * y + m[11]);
+        const float inv = 1.0f / depth;
+        const float u = (m[0] * x + (m[1] * y + m[3])) * inv;
+        if (!(u >= 0.0f && u <= (float)(width - 1) && depth > 0.0f))
+            continue;
+        const float step = m[6] * inv, start = (m[4] * x + (m[5] * y + m[6] * first + m[7])) * inv;
+        const float at_low = -start / step, at_high = ((float)(rows - 1) - start) / step; /* z at both edges */
+        const int z_start = (int)clamp(ceil(fmin(at_low, at_high)), 0.0f, (float)count);
+        const int z_stop = (int)clamp(floor(fmax(at_low, at_high)), -1.0f, (float)(count - 1)) + 1;
+        if (z_start >= z_stop)
+            continue;
+        const float v_start = start + step * z_start, v_last = start + step * (z_stop - 1);
+        const int base = clamp((int)fmin(v_start, v_last), 0, max(rows - 2, 0));
+        const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is the guard's zeros */
+        const int column = min((int)u, max(width - 2, 0));
+        const float wu = u - column, weight = weights[f] * inv * inv;
+        const float high = weight * wu, low = weight - high;
+        __global const float *a = projections + f * image_step + IMAGE_GUARD + (size_t)column * image_pitch;
+        __global const float *b = a + (width > 1 ? image_pitch : 0);
+        for (int v = base; v < stop; v += LANES)
+            V_STORE(low * V_LOAD(a + v) + high * V_LOAD(b + v), blended + (v - base));
+        const float shift = start - base;
+        for (int z = z_start; z < z_stop; ++z) {
+            const float v = shift + step * z;
+            const int row = (int)v; /* rounding may leave v a hair below 0, where the cast still gives 0 */
+            sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
+        }
+    }
+    __global float *target = volume + IMAGE_GUARD + (size_t)y * volume_pitch + x;
+    for (int z = 0; z < count; ++z)
+        target[(size_t)(first + z) * shape.y * volume_pitch] += sum[z];
+}
+#endif
+
+#define LINE_STEPS 6
+#define LEAST_SPEED 0.1f
+
+inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
+{
+    *depth = m[8] * x + m[9] * y + m[10] * z + m[11];
+    return (m[4] * x + m[5] * y + m[6] * z + m[7]) / *depth;
+}
+
+inline float line_sample(__global const float *line, const float u, const int width)
+{
+    if (!(u >= 0.0f && u <= (float)(width - 1)))
+        return 0.0f;
+    const int column = min((int)u, max(width - 2, 0));
+    return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
+}
+
+/* A voxel is seen by the line that is open where it stands: v(pose of line r) = r, solved by Newton's method on the
+   piecewise linear v between lines. */
+__kernel void backproject_lines(
+    __global const float *projections, /* views of (guard, (lines, pitch)) */
+    __global const float *matrices,    /* (views, lines, 12) */
+    __global const float *weights,     /* (views,) */
+    const int views, const int lines, const int width, const int image_pitch, const long image_step,
+    const int4 shape, const int volume_pitch,
+    const int filtered_across, /* 1 where the ramp filter ran across lines: readout along columns */
+    __global float *volume)
+{
+    const int xi = (int)get_global_id(0);
+    if (xi >= shape.x)
+        return;
+    const float x = (float)xi, y = (float)get_global_id(1), z = (float)get_global_id(2);
+    const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0;
+    float sum = 0.0f;
+    for (int f = 0; f < views; ++f) {
+        __global const float *table = matrices + (size_t)f * lines * 12;
+        __global const float *m = table;
+        int line = last / 2;
+        float t = 0.0f, speed = 1.0f, depth = 1.0f, next_depth = 1.0f;
+        for (int k = 0; k < LINE_STEPS; ++k) {
+            m = table + (size_t)line * 12;
+            const float v = line_position(m, x, y, z, &depth), next_v = line_position(m + step, x, y, z, &next_depth);
+            if (!(depth > 0.0f && next_depth > 0.0f))
+                break;
+            speed = fmax(1.0f - (next_v - v), LEAST_SPEED);
+            t = (v - (float)line) / speed;
+            const int better = (int)clamp(floor((float)line + t), 0.0f, (float)last);
+            if (better == line)
+                break;
+            line = k + 1 < LINE_STEPS ? better : line;
+        }
+        const float position = (float)line + t;
+        if (!(depth > 0.0f && next_depth > 0.0f && position >= 0.0f && position <= (float)(lines - 1)))
+            continue;
+        __global const float *n = m + step;
+        __global const float *pixels = projections + f * image_step + IMAGE_GUARD + (size_t)line * image_pitch;
+        const float u = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth;
+        const float next_u = (n[0] * x + n[1] * y + n[2] * z + n[3]) / next_depth;
+        const float here = line_sample(pixels, u, width);
+        const float there = line_sample(pixels + (step ? image_pitch : 0), next_u, width);
+        const float middle = depth + t * (next_depth - depth);
+        const float scale = filtered_across ? speed * speed : speed;
+        sum += weights[f] / (middle * middle * scale) * (here + t * (there - here));
+    }
+    volume[IMAGE_GUARD + ((size_t)get_global_id(2) * shape.y + get_global_id(1)) * volume_pitch + xi] += sum;
 }

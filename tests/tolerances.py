@@ -37,6 +37,8 @@ VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
 # a brick counts voxels from its own corner: the float32 rest of a centre may round the other way
 VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
+# of the peak: a voxel has few samples, whose positions (1e-5 of a voxel, 200 away from the source) do not average out
+RAYS_BACK = 3e-5  # measured 1.2e-5
 ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders
 # Joseph's bilinear samples smooth: second order in voxel over σ. 48 voxels over 4, σ ≥ 0.12 are σ ≥ 1.4 voxels.
 DISCRETISATION_GAUSSIANS = 0.05
@@ -47,6 +49,8 @@ DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.
 # --- FDK -----------------------------------------------------------------------------------------------------
 BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1
 FDK_MEAN = 0.02  # mean inside a sphere: 90 views, 32³ voxels, a cone of ±10°, samples of the edge
+FDK_PARTIAL = 0.012  # the same at 120 views, displaced and short (0.0075); wrong weights leave 0.024 to 0.4
+FDK_LINES = 1.08  # error of a rolling scan over that of a gantry at rest (0.99 to 1.05)
 FDK_SHEPP_LOGAN = 0.04  # of a brain at 0.2 in a skull at 1, averaged over some voxels near the mid-plane
 FDK_SCALE = 1e-4  # frames are equal to float32 rounding; the ramp filter amplifies it
 RAMP = 1e-5  # float32 result of a float64 FFT

@@ -3,8 +3,9 @@
 Each knows its domain, its range and its transpose, and no algorithm.
 """
 
-from phyradgs_cl.operators.backproject import backproject
+from phyradgs_cl.operators.backproject import backproject, backproject_lines
 from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
+from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
 from phyradgs_cl.operators.rays import RayProjector
 from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA, SplatProjector
 from phyradgs_cl.operators.voxelise import Voxeliser, voxelise
@@ -13,9 +14,12 @@ __all__ = [
     "DEFAULT_CUTOFF_SIGMA",
     "DeviceCells",
     "DeviceGaussians",
+    "LinearOperator",
+    "RayOperator",
     "RayProjector",
     "SplatProjector",
     "Voxeliser",
     "backproject",
+    "backproject_lines",
     "voxelise",
 ]

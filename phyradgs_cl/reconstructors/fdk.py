@@ -1,35 +1,58 @@
-"""FDK (Feldkamp, Davis and Kress 1984): cosine weight, ramp filter, distance-weighted backprojection."""
+"""FDK (Feldkamp, Davis and Kress 1984): ray weights, ramp filter, distance-weighted backprojection."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 
-from phyradgs_cl.acquisition import Motion, Scan, pixel_centres
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import backproject
+from phyradgs_cl.operators import backproject, backproject_lines
+from phyradgs_cl.reconstructors import fdk_weights as weights
+from phyradgs_cl.reconstructors.fdk_arc import view_arc
+from phyradgs_cl.reconstructors.fdk_filters import WINDOWS, ramp_filter
+from phyradgs_cl.reconstructors.fdk_views import (
+    RayWeight,
+    pose_of_pixels,
+    ray_weight,
+    view_angles,
+    warn_if_incomplete,
+    widened,
+)
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.runtime import Runtime
+
+_SAME_POSE = 1e-9  # of the largest length: views whose poses differ by a turn alone share their weights
+_BLOCK_BYTES = 1 << 26  # rows that are filtered at one time
 
 
 @dataclass(frozen=True)
 class FdkOptions:
-    """FDK knows one pose a frame: ``motion`` is static (mid-window) or static-start (the frame's first pose)."""
+    """``window`` is the ramp filter's (see ``WINDOWS``).
 
+    ``motion``: static (one pose a frame, mid-window), static-start (the frame's first pose) or per-row (every line
+    at the middle of its own exposure).
+    """
+
+    window: str = "ram-lak"
     motion: Motion = Motion("static")
 
     def __post_init__(self) -> None:
-        if self.motion.name not in ("static", "static-start"):
+        checks.one_of("FDK window", self.window, WINDOWS)
+        if self.motion.name == "micro-views":
             raise InputError(
                 "--motion",
                 repr(self.motion.name),
-                "static or static-start for --method fdk",
-                "use --method phyradgs to model motion",
+                "static, static-start or per-row for --method fdk",
+                "use --method phyradgs to model exposure blur",
             )
+
+
+FDK_PRESETS = {window: FdkOptions(window) for window in WINDOWS}  # the first is the default
 
 
 def fdk(
@@ -37,47 +60,70 @@ def fdk(
 ) -> Reconstruction:
     """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing."""
     started = time.perf_counter()
-    pose = np.concatenate([options.motion.cells(scan, f).pose for f in range(scan.frames)])
-    volume = fdk_volume(rt, unmasked_frames(scan), pose, scan.grid)
+    motion = replace(options.motion, sub_intervals=1)  # one pose a line, at the middle of its exposure
+    pose = np.stack([motion.cells(scan, f).pose for f in range(scan.frames)])
+    if pose.shape[1] == 1:
+        pose = pose[:, 0]
+    frames, axis = unmasked_frames(scan), scan.shutter.axis
+    volume = fdk_volume(rt, frames, pose, scan.grid, window=options.window, axis=axis)
     facts = {"method": "fdk", "options": asdict(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
 
-def fdk_volume(rt: Runtime, frames: np.ndarray, pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """FDK of line integrals (F, rows, columns) seen from one pose a frame (F, 12), on ``grid``, 1/mm.
+def fdk_volume(
+    rt: Runtime,
+    frames: np.ndarray,
+    pose: np.ndarray,
+    grid: Grid,
+    *,
+    window: str = "ram-lak",
+    axis: str = "rows",
+) -> np.ndarray:
+    """FDK of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
-    Full turn: each view counts with half the real angular gap to its neighbours (every ray is seen twice).
+    pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns)
+    and short scans are recognised and weighted; a warning is logged where data are missing. Raises InputError for a
+    source on the rotation axis.
     """
-    source, normal, dso_mm, dsd_mm = _central_geometry(pose)
-    du_mm = np.linalg.norm(pose[:, 6:9], axis=1)
-    filtered = np.empty_like(frames, dtype=np.float32)
-    for f, frame in enumerate(frames):
-        to_pixel = pixel_centres(pose[f], frame.shape) - source[f]
-        cosine = dsd_mm[f] / np.linalg.norm(to_pixel, axis=-1)
-        filtered[f] = ramp_filter(frame * cosine, du_mm[f] * dso_mm[f] / dsd_mm[f])
-    weight = 0.5 * angular_gaps(source) * (dso_mm / dsd_mm) ** 2
-    return backproject(rt, filtered, pose, weight, grid)
+    shape = (frames.shape[1], frames.shape[2])
+    by_pixel = pose_of_pixels(pose, axis)
+    if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
+        raise InputError("poses", "a source on the rotation axis", "a source beside it")
+    angle_rad = view_angles(by_pixel)
+    canonical = weights.turned_back(by_pixel, angle_rad)
+    if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
+        canonical = canonical[:1]
+    arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape)
+    warn_if_incomplete(arc, fan, canonical, grid)
+    missing = fan.missing_columns if arc.is_full else (0, 0)
+    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan), missing, window)
+    pose = widened(pose, axis, missing)
+    share = 0.5 * arc.gap_rad  # every ray is seen twice
+    if pose.ndim == 2:
+        return backproject(rt, filtered, pose, share, grid)
+    return backproject_lines(rt, filtered, pose, share, grid, axis)
 
 
-def ramp_filter(rows: np.ndarray, spacing_mm: float) -> np.ndarray:
-    """Ram-Lak along the last axis in its space-domain form (Kak and Slaney, Eq. 61), zero-padded twofold."""
-    width = rows.shape[-1]
-    length = next_fast_len(2 * width)
-    n = np.minimum(np.arange(length), length - np.arange(length))
-    kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
-    kernel[0] = 0.25
-    spectrum = rfft(rows, length, axis=-1) * rfft(kernel).real
-    return (irfft(spectrum, length, axis=-1)[..., :width] / spacing_mm).astype(np.float32)
+def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
+    """Weighted and filtered frames (F, rows, columns + missing) float32.
 
-
-def angular_gaps(source: np.ndarray) -> np.ndarray:
-    """Half the angle between each view's two neighbours around the turn, radians, from sources (F, 3)."""
-    angle = np.arctan2(source[:, 1], source[:, 0])
-    order = np.argsort(angle, kind="stable")
-    ahead = np.diff(angle[order], append=angle[order[0]] + 2 * np.pi)
-    gaps = np.empty(len(angle))
-    gaps[order] = (ahead + np.roll(ahead, 1)) / 2
-    return gaps
+    A displaced detector's rows grow to be symmetric: the filter's response goes on where nothing was measured.
+    """
+    views, rows, columns = frames.shape
+    width = columns + sum(missing)
+    filtered = np.empty((views, rows, width), np.float32)
+    count = max(1, _BLOCK_BYTES // (4 * rows * width))
+    for first in range(0, views, count):
+        block = np.zeros((min(count, views - first), rows, width), np.float32)
+        for i, frame in enumerate(frames[first : first + count]):
+            np.multiply(
+                frame,
+                weight(first + i),
+                out=block[i, :, missing[0] : missing[0] + columns],
+                casting="same_kind",
+            )
+        filtered[first : first + count] = ramp_filter(block, 1.0, window)
+    return filtered
 
 
 def unmasked_frames(scan: Scan) -> np.ndarray:
@@ -95,15 +141,3 @@ def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
         good = np.flatnonzero(~bad)
         filled[f, v, bad] = np.interp(np.flatnonzero(bad), good, filled[f, v, good]) if good.size else 0.0
     return filled
-
-
-def _central_geometry(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Source (F, 3), detector normal (F, 3), distances from source to axis and to detector plane (F,), mm."""
-    source = pose[:, 0:3]
-    normal = np.cross(pose[:, 6:9], pose[:, 9:12])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    dsd_mm = np.abs(np.einsum("fi,fi->f", normal, pose[:, 3:6] - source))
-    dso_mm = np.linalg.norm(source[:, :2], axis=1)
-    if np.any(dso_mm <= 0):
-        raise InputError("poses", "a source on the rotation axis", "a source beside it")
-    return source, normal, dso_mm, dsd_mm

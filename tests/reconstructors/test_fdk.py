@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import FDK_MEAN, FDK_SCALE, FDK_SHEPP_LOGAN, FLOAT32, FLOAT64, RAMP
+from tolerances import FDK_MEAN, FDK_SCALE, FDK_SHEPP_LOGAN, FLOAT32
 
 from phyradgs_cl.acquisition import (
     CircularOrbit,
@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
-from phyradgs_cl.reconstructors.fdk import FdkOptions, angular_gaps, fdk, fdk_volume, fill_masked, ramp_filter
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, fill_masked
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32
 
@@ -100,39 +100,13 @@ def test_scan_and_volume_agree(rt) -> None:
     middle = geometry.pose(first + 0.1 * 1.5 / 2)
     result = fdk(scan, FdkOptions(), rt)
     np.testing.assert_allclose(result.volume, fdk_volume(rt, frames, middle, grid), rtol=0, atol=FLOAT32)
-    begun = fdk(scan, FdkOptions(Motion("static-start")), rt)
+    begun = fdk(scan, FdkOptions(motion=Motion("static-start")), rt)
     np.testing.assert_allclose(
         begun.volume, fdk_volume(rt, frames, geometry.pose(first), grid), rtol=0, atol=FLOAT32
     )
     assert np.abs(begun.volume - result.volume).max() > 1e-3
     with pytest.raises(InputError, match="micro-views"):
-        FdkOptions(Motion("micro-views"))
-
-
-@pytest.mark.parametrize("width", [1, 2, 17, 64])
-def test_ramp_filter_is_a_convolution(width) -> None:
-    """Kak and Slaney's kernel h(0) = 1/4τ², h(odd n) = −1/(πnτ)², times τ, without wrapping around."""
-    spacing_mm = 0.37
-    rows = np.random.default_rng(63).normal(size=(3, width))
-    n = np.arange(-(width - 1), width)
-    kernel = np.zeros(2 * width - 1)
-    kernel[n % 2 != 0] = -1 / (np.pi * n[n % 2 != 0] * spacing_mm) ** 2
-    kernel[n == 0] = 1 / (4 * spacing_mm**2)
-    expected = np.stack([np.convolve(row, kernel)[width - 1 : 2 * width - 1] * spacing_mm for row in rows])
-    found = ramp_filter(rows, spacing_mm)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=RAMP * np.abs(expected).max())
-
-
-def test_angular_gaps_make_a_full_turn() -> None:
-    angles = np.random.default_rng(64).uniform(-np.pi, np.pi, 13)
-    source = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1) * 40
-    gaps = angular_gaps(source)
-    assert gaps.sum() == pytest.approx(2 * np.pi, rel=FLOAT64)
-    assert np.all(gaps > 0)
-    even = angular_gaps(
-        np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4), np.zeros(8)], -1)
-    )
-    np.testing.assert_allclose(even, np.pi / 4, rtol=FLOAT64)
+        FdkOptions(motion=Motion("micro-views"))
 
 
 def test_masked_pixels_are_filled_along_their_row() -> None:

@@ -1,0 +1,225 @@
+"""FDK beside RTK's on the same projections: difference, RTK's own quality limits, and speed as a ratio of one run.
+
+    python -m venv PEER && PEER/bin/pip install itk-rtk numpy
+    python benchmarks/rtk_fdk.py --peer-python PEER/bin/python [--json docs/results/rtk_fdk.json] [--device D]
+
+Shepp-Logan in Kak and Slaney's table, scaled by 116 mm, contrasts as they are (1/mm); source 600 mm from the axis and
+1200 mm from the detector, 128 x 128 pixels of 4 mm, 128^3 voxels of 2 mm: the set-up of RTK's own tests, whose limits
+the table names. PSNR: range 2, over the voxels that every view sees (displaced: that some view of every opposite
+pair sees), against the phantom at the voxels' centres; and as RTK's tests count it, over the whole cube with no error
+outside that field of view.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.layout import projection_matrices
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors.fdk import fdk_volume
+from phyradgs_cl.runtime import Runtime
+
+PIXELS, PIXEL_MM = 128, 4.0
+GRID = Grid.cube(128, 256.0)
+DSO_MM, DSD_MM = 600.0, 1200.0
+PHANTOM = shepp_logan(116.0, "kak-slaney", 1.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One comparison; offsets in mm along u and v, ``limit_db`` RTK's own."""
+
+    name: str
+    views: int
+    arc_deg: float = 360.0
+    detector_offset_mm: float = 0.0
+    source_offset_mm: tuple[float, float] = (0.0, 0.0)
+    limit_db: float | None = None
+
+    @property
+    def angles_rad(self) -> np.ndarray:
+        return np.deg2rad(self.arc_deg) * np.arange(self.views) / self.views
+
+    def pose(self) -> np.ndarray:
+        """Poses (F, 12): the source moves along the detector's own axes, the detector stays."""
+        shape, pitch = (PIXELS, PIXELS), (PIXEL_MM, PIXEL_MM)
+        pose = ConeGeometry(DSO_MM, DSD_MM, shape, pitch, (0.0, self.detector_offset_mm)).pose(
+            self.angles_rad
+        )
+        along_u, along_v = self.source_offset_mm
+        pose[:, 0:3] += (along_u * pose[:, 6:9] + along_v * pose[:, 9:12]) / PIXEL_MM
+        return pose
+
+    def task(self, frames: np.ndarray, repeats: int) -> dict[str, Any]:
+        """What benchmarks/rtk_peer.py reads; RTK's (X, Y, Z) are (y, z, x) here, angles and stack the same."""
+        return {
+            "projections": frames,
+            "gantry_deg": np.rad2deg(self.angles_rad),
+            "sid_mm": DSO_MM,
+            "sdd_mm": DSD_MM,
+            "pixel_mm": PIXEL_MM,
+            "projection_offset_mm": (self.detector_offset_mm, 0.0),
+            "source_offset_mm": self.source_offset_mm,
+            "voxels": GRID.shape[0],
+            "spacing_mm": GRID.voxel_size_mm[0],
+            "displaced": self.detector_offset_mm != 0,
+            "short": self.arc_deg < 360,
+            "repeats": repeats,
+        }
+
+
+CASES = (
+    Case("full turn", 90),
+    Case("source offset 20 and 15 mm", 180, source_offset_mm=(20.0, 15.0), limit_db=26.0),
+    Case("short scan of 240 degrees", 110, arc_deg=240.0, limit_db=22.0),
+    Case("detector displaced by 120 mm", 180, detector_offset_mm=120.0, limit_db=24.0),
+)
+
+
+def projections(pose: np.ndarray) -> np.ndarray:
+    """Closed-form line integrals (F, rows, columns)."""
+    targets = (pixel_centres(one, (PIXELS, PIXELS)) for one in pose)
+    frames = [PHANTOM.line_integrals(one[:3], target) for one, target in zip(pose, targets, strict=True)]
+    return np.stack(frames).astype(np.float32)
+
+
+def field_of_view(case: Case, pose: np.ndarray) -> np.ndarray:
+    """Voxels (z, y, x) whose rays are measured: by every view, or for a displaced detector by one of a pair."""
+    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij", sparse=True)
+    seen = np.ones(GRID.shape, bool)
+    for m in projection_matrices(pose[:: max(1, len(pose) // 36)]):
+        depth = m[8] * x + m[9] * y + m[10] * z + m[11]
+        u, v = ((m[r] * x + m[r + 1] * y + m[r + 2] * z + m[r + 3]) / depth for r in (0, 4))
+        seen &= (v >= 0) & (v <= PIXELS - 1)
+        if case.detector_offset_mm == 0:
+            seen &= (u >= 0) & (u <= PIXELS - 1)
+    reach_mm = (PIXELS - 1) / 2 * PIXEL_MM + abs(case.detector_offset_mm)
+    return seen & (np.hypot(x, y) <= DSO_MM * np.sin(np.arctan(reach_mm / DSD_MM)))
+
+
+def run_peer(python: str, task: dict[str, Any]) -> tuple[np.ndarray, list[list[float]], str]:
+    """RTK's volume in this project's axes (z, y, x), its seconds and processor seconds, its version."""
+    with tempfile.TemporaryDirectory() as folder:
+        given, result = Path(folder) / "task.npz", Path(folder) / "result.npz"
+        np.savez(given, **task)
+        script = Path(__file__).with_name("rtk_peer.py")
+        subprocess.run([python, str(script), str(given), str(result)], check=True, stdout=subprocess.DEVNULL)
+        with np.load(result) as found:
+            volume = np.ascontiguousarray(found["volume"].transpose(1, 2, 0))
+            return volume, found["seconds"].tolist(), str(found["version"])
+
+
+def decibels(volume: np.ndarray, truth: np.ndarray, seen: np.ndarray, voxels: int | None = None) -> float:
+    """PSNR of range 2 over the voxels seen; their squared error spread over ``voxels`` where given."""
+    squares = float(np.sum((volume[seen] - truth[seen]) ** 2))
+    return float(10 * np.log10(4.0 * (voxels or np.count_nonzero(seen)) / squares))
+
+
+def compare(rt: Runtime, python: str, case: Case) -> dict[str, Any]:
+    pose = case.pose()
+    frames = projections(pose)
+    ours = fdk_volume(rt, frames, pose, GRID).astype(np.float64)
+    theirs, _, version = run_peer(python, case.task(frames, 1))
+    seen, truth = (
+        field_of_view(case, pose),
+        PHANTOM.density(*np.meshgrid(*GRID.axes_mm(), indexing="ij")[::-1]),
+    )
+    difference = np.sqrt(
+        np.mean((ours[seen] - theirs[seen]) ** 2) / np.mean(theirs[seen].astype(np.float64) ** 2)
+    )
+    return {
+        "case": case.name,
+        "views": case.views,
+        "relative_rms": float(difference),
+        "psnr_db": decibels(ours, truth, seen),
+        "rtk_psnr_db": decibels(theirs, truth, seen),
+        "psnr_whole_cube_db": decibels(ours, truth, seen, truth.size),
+        "limit_db": case.limit_db,
+        "rtk_version": version,
+    }
+
+
+def speed(rt: Runtime, python: str, rounds: int) -> dict[str, Any]:
+    """Best seconds of alternating runs, both from arrays in memory to an array in memory; processor time too.
+
+    Processor time (all cores together) says more where other programs run at the same time.
+    """
+    case = CASES[0]
+    pose = case.pose()
+    frames = projections(pose)
+    fdk_volume(rt, frames, pose, GRID)  # builds the kernels
+    ours: list[list[float]] = []
+    theirs: list[list[float]] = []
+    for _ in range(rounds):
+        for _ in range(6):
+            started, processor = time.perf_counter(), time.process_time()
+            fdk_volume(rt, frames, pose, GRID)
+            ours.append([time.perf_counter() - started, time.process_time() - processor])
+        theirs += run_peer(python, case.task(frames, 3))[1]
+    (seconds, processor_seconds), (rtk_seconds, rtk_processor_seconds) = np.min(ours, 0), np.min(theirs, 0)
+    return {
+        "device": rt.device.name,
+        "seconds": seconds,
+        "rtk_seconds": rtk_seconds,
+        "ratio": rtk_seconds / seconds,
+        "median_ratio": float(np.median(theirs, 0)[0] / np.median(ours, 0)[0]),
+        "processor_seconds": processor_seconds,
+        "rtk_processor_seconds": rtk_processor_seconds,
+        "processor_ratio": rtk_processor_seconds / processor_seconds,
+        "all_seconds": ours,
+        "all_rtk_seconds": theirs,
+    }
+
+
+def table(rows: list[dict[str, Any]], times: dict[str, Any]) -> str:
+    lines = [
+        "| case | views | relative RMS to RTK | PSNR dB | RTK PSNR dB | whole cube dB | RTK's limit dB |",
+        "|---|--:|--:|--:|--:|--:|--:|",
+    ]
+    for r in rows:
+        limit = "" if r["limit_db"] is None else f"{r['limit_db']:.0f}"
+        lines.append(
+            f"| {r['case']} | {r['views']} | {r['relative_rms']:.1e} | {r['psnr_db']:.2f} "
+            f"| {r['rtk_psnr_db']:.2f} | {r['psnr_whole_cube_db']:.2f} | {limit} |"
+        )
+    return "\n".join([*lines, "", speed_line(times)])
+
+
+def speed_line(times: dict[str, Any]) -> str:
+    return (
+        "128^3 from 90 views of 128^2: {seconds:.3f} s, RTK {rtk_seconds:.3f} s, {ratio:.1f} times as fast "
+        "(medians {median_ratio:.1f}); processor time {processor_seconds:.2f} s, RTK "
+        "{rtk_processor_seconds:.2f} s, {processor_ratio:.1f} times less"
+    ).format(**times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--peer-python", required=True, help="a Python that has itk-rtk")
+    parser.add_argument("--json", type=Path, default=Path("docs/results/rtk_fdk.json"))
+    parser.add_argument("--rounds", type=int, default=4, help="alternations of the speed comparison")
+    parser.add_argument("--device")
+    options = parser.parse_args()
+    rt = Runtime(options.device)
+    rows = [compare(rt, options.peer_python, case) for case in CASES]
+    times = speed(rt, options.peer_python, options.rounds)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
+    options.json.write_text(json.dumps({"cases": rows, "speed": times}, indent=1) + "\n")
+    print(table(rows, times))
+
+
+if __name__ == "__main__":
+    main()

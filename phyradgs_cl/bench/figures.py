@@ -1,0 +1,90 @@
+"""Slices of every run, kept small beside the results, and figures that put the rows of a table side by side."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.bench.case import FLY, Images
+from phyradgs_cl.bench.job import BenchJob
+from phyradgs_cl.bench.results import Line, key_of
+from phyradgs_cl.bench.summary import lines_of
+from phyradgs_cl.errors import OutputError
+from phyradgs_cl.io import written_beside
+from phyradgs_cl.metrics import panels_png
+
+_TRUTH = {"run": "truth", "acquisition": None, "protocol": None, "seed": None, "iterations": None}
+
+
+def write_slices(folder: Path, facts: Mapping[str, Any], images: Images) -> None:
+    """Keeps the slices of a run, or of the truth where ``facts`` say so."""
+    path = slices_path(folder, facts)
+    _make(path.parent)
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, *[np.asarray(image, np.float32) for image in images])
+
+
+def read_slices(folder: Path, facts: Mapping[str, Any]) -> Images | None:
+    """The slices of a run; None where there are none, or they are damaged."""
+    path = slices_path(folder, facts)
+    try:
+        with np.load(path) as stored:
+            return [stored[name] for name in sorted(stored.files, key=lambda name: int(name[4:]))]
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return None
+
+
+def slices_path(folder: Path, facts: Mapping[str, Any]) -> Path:
+    """Where the slices of a run are: a file whose name follows from the run's identity."""
+    digest = hashlib.sha256(json.dumps(key_of(facts)).encode()).hexdigest()[:16]
+    return folder / "slices" / f"{facts['volume']}_{digest}.npz"
+
+
+def truth_of(facts: Mapping[str, Any]) -> Line:
+    """The facts under which the truth's slices of a run's volume are kept."""
+    return {**facts, **_TRUTH}
+
+
+def write_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
+    """One PNG for each volume and protocol; the files written."""
+    chosen = [line for line in lines_of(job, lines) if line["acquisition"] == FLY]
+    cases = dict.fromkeys((line["protocol"], line["volume"]) for line in chosen)
+    figures = [
+        _figure(job, protocol, [x for x in chosen if (x["protocol"], x["volume"]) == (protocol, volume)])
+        for protocol, volume in cases
+    ]
+    return [path for path in figures if path is not None]
+
+
+def _figure(job: BenchJob, protocol: str, lines: Sequence[Line]) -> Path | None:
+    """The figure of one volume, of its first seed; None where no slices are kept."""
+    seed = min(line["seed"] for line in lines)
+    by_run = {line["run"]: line for line in lines if line["seed"] == seed}
+    truth = read_slices(job.output, truth_of(lines[0]))
+    columns = [("truth", truth)] if truth is not None else []
+    for row in job.chosen_rows:
+        line = by_run.get(row.run)
+        images = read_slices(job.output, line) if line is not None else None
+        if line is not None and images is not None:
+            columns.append((f"{row.label}\n{line['metrics']['psnr_db']:.2f} dB", images))
+    if len(columns) < 2:
+        return None
+    volume, size = lines[0]["volume"], job.bench_size
+    path = job.output / "figures" / f"{job.kind}_{size.name}_{protocol}_{volume}.png"
+    _make(path.parent)
+    title = f"{volume}, {size.voxels}³ from {lines[0]['views']} views of {size.pixels}², seed {seed}"
+    panels_png(path, columns, title)
+    return path
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(str(folder), error.strerror or str(error), "a folder that can be made") from error

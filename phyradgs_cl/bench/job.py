@@ -1,0 +1,207 @@
+"""What a benchmark is told to do, and the runs that follow from it, checked before any work."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import PROTOCOLS
+from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.bench.case import FLY, STILL
+from phyradgs_cl.bench.results import Line
+from phyradgs_cl.bench.rows import Row, choose_rows
+from phyradgs_cl.bench.sizes import BenchSize, bench_size
+from phyradgs_cl.bench.volumes import find_volumes
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+
+SYNTHETIC, PHANTOM = "synthetic", "phantom"
+BUILT_IN = ("foot", "jaw")
+SPHERES = "spheres"
+_DEFAULT_SIZES = {"table1": "S", "table2": "S", "phantom": "M", "quick": "XS"}
+_FLY_PROTOCOLS = tuple(name for name, protocol in PROTOCOLS.items() if protocol.is_fly)
+
+
+@dataclass(frozen=True)
+class BenchJob:
+    """Which table, of which volumes, at which size.
+
+    Args:
+        kind: table1, table2, phantom or quick.
+        output: folder of the results file, tables, figures and slices; made where it is missing.
+        volumes: folder of HDF5 volumes; the built-in phantoms foot and jaw without it. Not for phantom.
+        size: XS, S, M, L, XL or a size of one's own; by default the kind's.
+        names: volumes by name; all by default, the first two for quick.
+        protocols: rapid (25 views), standard (50); by default both for table1, rapid for the others.
+        rows: labels of rows; all of the table by default.
+        seeds: of noise, jitter, cloud and frame order.
+        iterations: of the splatting methods, instead of the size's.
+        axis: what is read out at one time, rows or columns.
+    """
+
+    kind: str
+    output: Path
+    volumes: Path | None = None
+    size: str | BenchSize | None = None
+    names: Sequence[str] | None = None
+    protocols: Sequence[str] | None = None
+    rows: Sequence[str] | None = None
+    seeds: Sequence[int] = (0,)
+    iterations: int | None = None
+    axis: str = "rows"
+
+    def __post_init__(self) -> None:
+        choose_rows(self.kind, self.rows)
+        for name in self.chosen_protocols:
+            checks.one_of("--protocols", name, _FLY_PROTOCOLS)
+        for seed in self.seeds:
+            checks.within("--seeds", seed, 0, 2**63)
+        if not self.seeds:
+            raise InputError("--seeds", "nothing", "at least one whole number")
+        checks.one_of("--readout", self.axis, AXES)
+        if self.kind == "phantom" and (self.volumes is not None or self.names):
+            raise InputError(
+                "--volumes and --names", "given for phantom", "none: it has one object of its own"
+            )
+
+    @property
+    def bench_size(self) -> BenchSize:
+        """The size with the job's own number of iterations."""
+        wish = _DEFAULT_SIZES[self.kind] if self.size is None else self.size
+        size = bench_size(wish) if isinstance(wish, str) else wish
+        return size if self.iterations is None else replace(size, iterations=self.iterations)
+
+    @property
+    def chosen_rows(self) -> tuple[Row, ...]:
+        return choose_rows(self.kind, self.rows)
+
+    @property
+    def chosen_protocols(self) -> tuple[str, ...]:
+        return tuple(self.protocols or (("rapid", "standard") if self.kind == "table1" else ("rapid",)))
+
+    @property
+    def study(self) -> str:
+        """Volumes with TIGRE's noise, or the sphere phantom with raw counts."""
+        return PHANTOM if self.kind == "phantom" else SYNTHETIC
+
+    @property
+    def gaussians(self) -> int:
+        """The first cloud of every splatting row: the default number for the grid."""
+        return SplatOptions().gaussians_for(Grid.cube(self.bench_size.voxels, 2.0))
+
+    def sources(self) -> dict[str, Path | None]:
+        """Volume names with their files; None for a phantom of this package."""
+        if self.kind == "phantom":
+            return {SPHERES: None}
+        if self.volumes is not None:
+            found = find_volumes(self.volumes, self.names, self.bench_size.voxels)
+            short = self.kind == "quick" and not self.names
+            return dict(list(found.items())[:2]) if short else dict(found)
+        for name in self.names or ():
+            checks.one_of("--names (without --volumes)", name, BUILT_IN)
+        return dict.fromkeys(self.names or BUILT_IN)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRun:
+    """One reconstruction: of which case, by which row, and the facts that identify it in the results file."""
+
+    volume: str
+    source: Path | None
+    protocol: str
+    seed: int
+    acquisition: str
+    row: Row
+    options: Any
+    facts: Line
+
+    @property
+    def case(self) -> tuple[str, str, int]:
+        """Runs with the same case share their scans."""
+        return self.volume, self.protocol, self.seed
+
+    @property
+    def title(self) -> str:
+        return f"{self.volume}, {self.protocol}, seed {self.seed}: {self.row.label} ({self.acquisition})"
+
+
+def plan_runs(job: BenchJob) -> list[PlannedRun]:
+    """Every run of a job, a case after the other, stop-and-shoot runs once for all rows that share them."""
+    shared = _with_options(job)
+    plan = []
+    for seed in dict.fromkeys(job.seeds):
+        for volume, source in job.sources().items():
+            for protocol in dict.fromkeys(job.chosen_protocols):
+                for acquisition, row, options in shared:
+                    facts = _facts(job, volume, source, protocol, seed, acquisition, row, options)
+                    plan.append(PlannedRun(volume, source, protocol, seed, acquisition, row, options, facts))
+    return plan
+
+
+def _with_options(job: BenchJob) -> list[tuple[str, Row, Any]]:
+    """(acquisition, row, options) of every case: options are checked here, before any work."""
+    rows = [row for row in job.chosen_rows if row.method is not None]
+    wanted = [(FLY, row) for row in rows] + [(STILL, row.standing()) for row in rows]
+    unique = {(acquisition, row.run): row for acquisition, row in reversed(wanted)}
+    size = job.bench_size
+    return [
+        (acquisition, row, row.options(job.gaussians, size.iterations))
+        for (acquisition, _), row in reversed(unique.items())
+    ]
+
+
+def _facts(
+    job: BenchJob,
+    volume: str,
+    source: Path | None,
+    protocol: str,
+    seed: int,
+    acquisition: str,
+    row: Row,
+    options: Any,
+) -> Line:
+    size = job.bench_size
+    return {
+        "study": job.study,
+        "volume": volume,
+        "source": source.name if source is not None else "built-in",
+        "run": row.run,
+        "label": row.label,
+        "acquisition": acquisition,
+        "method": row.method,
+        "size": size.name,
+        "voxels": size.voxels,
+        "pixels": size.pixels,
+        "protocol": protocol,
+        "views": PROTOCOLS[protocol].views,
+        "axis": job.axis,
+        "seed": seed,
+        "iterations": size.iterations if row.is_splatting else None,
+        "options": plain(asdict(options)),
+    }
+
+
+def plain(value: Any) -> Any:
+    """A value as it comes back from JSON: tuples are lists."""
+    return json.loads(json.dumps(value, default=str))
+
+
+Report = Callable[["BenchProgress"], None]
+
+
+@dataclass(frozen=True)
+class BenchProgress:
+    """Where a benchmark is: run ``number`` of ``runs``, and how far in it; ``line`` is the result once it is done."""
+
+    number: int
+    runs: int
+    title: str
+    iteration: int = 0
+    iterations: int = 0
+    line: Line | None = None
+    left_s: float | None = None

@@ -1,0 +1,153 @@
+"""Rows of the tables: a label, and the method with the motion model behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from difflib import get_close_matches
+from typing import Any
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors import METHODS, method_options
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+
+KINDS = ("table1", "table2", "phantom", "quick")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: ``method`` None is a system that the paper compares with and that is not here yet.
+
+    strips and sub_intervals matter to micro-views; ``still`` is the label of the same method with a static
+    model, which is what a stop-and-shoot scan is reconstructed with; ``changes`` are further options, told apart
+    by ``variant``.
+    """
+
+    label: str
+    method: str | None
+    motion: str = "static"
+    strips: int | None = None
+    sub_intervals: int | None = None
+    still: str = ""
+    variant: str = ""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def run(self) -> str:
+        """What is computed, whatever it is called: rows of two tables with one run share its result."""
+        counts = f"{self.strips}x{self.sub_intervals}" if self.motion == "micro-views" else ""
+        return " ".join(part for part in (self.method or "", self.motion, counts, self.variant) if part)
+
+    def standing(self) -> Row:
+        """The row of the same method for a gantry that stands still."""
+        return Row(self.still or self.label, self.method, variant=self.variant, changes=self.changes)
+
+    def options(self, gaussians: int, iterations: int) -> Any:
+        """The method's options; splatting methods all get the same first cloud and iterations."""
+        if self.method not in METHODS:
+            raise InputError(
+                f"row {self.label!r}",
+                f"the method {self.method!r}",
+                f"one of {', '.join(METHODS)}",
+                "choose other rows with --rows",
+            )
+        changes: dict[str, Any] = {"motion": self.motion, **self.changes}
+        if self.motion == "micro-views":
+            changes |= {"strips": self.strips, "sub_intervals": self.sub_intervals}
+        if self.is_splatting:
+            changes |= {"gaussians": gaussians, "iterations": iterations}
+        try:
+            return method_options(str(self.method), None, changes)
+        except InputError as error:
+            culprit = f"row {self.label!r}: {error.culprit}"
+            raise InputError(culprit, error.found, error.expected, "choose other rows with --rows") from error
+
+    @property
+    def is_splatting(self) -> bool:
+        """Whether the method places Gaussians, and so shares their number and the iterations."""
+        method = METHODS.get(self.method or "")
+        return method is not None and isinstance(next(iter(method.presets.values())), SplatOptions)
+
+
+def _micro_views(label: str, method: str, strips: int, sub_intervals: int, still: str) -> Row:
+    return Row(label, method, "micro-views", strips, sub_intervals, still)
+
+
+_ITERATIVE = {
+    "SART": "sart",
+    "OS-SART": "os-sart",
+    "SIRT": "sirt",
+    "CGLS": "cgls",
+    "ASD-POCS": "asd-pocs",
+    "FISTA-TV": "fista-tv",
+}
+_FDK = (Row("FDK", "fdk"), Row("FDK per-row", "fdk", "per-row", still="FDK"))
+_NOT_YET = (Row("NAF", None), Row("SAX-NeRF", None))
+_SPLATTING = (
+    Row("R2-Gaussian", "r2"),
+    _micro_views("R2-Gaussian w/ ST", "r2", 8, 5, "R2-Gaussian"),
+    Row("PhyRadGS w/o ST", "phyradgs"),
+    _micro_views("PhyRadGS", "phyradgs", 8, 5, "PhyRadGS w/o ST"),
+)
+
+
+def _our_settings() -> dict[str, Any]:
+    """PhyRadGS's default rates, weights and density control, as changes to R2-Gaussian's constants."""
+    shared = ("ssim_weight", "tv_weight", "density_weight", "rates", "control")
+    return {name: value for name, value in asdict(SplatOptions()).items() if name in shared}
+
+
+def _table1() -> tuple[Row, ...]:
+    static = tuple(Row(label, method) for label, method in _ITERATIVE.items())
+    exact = tuple(
+        Row(f"{label} per-row", method, "per-row", still=label) for label, method in _ITERATIVE.items()
+    )
+    return (*_FDK, *static, *exact, *_NOT_YET, *_SPLATTING)
+
+
+def _extras() -> tuple[Row, ...]:
+    """Rows that are run only when they are asked for by name."""
+    strips = tuple(
+        _micro_views(f"{label} micro-views", method, 8, 5, label) for label, method in _ITERATIVE.items()
+    )
+    tuned = "R2-Gaussian (settings of PhyRadGS)"
+    same: dict[str, Any] = {"variant": "tuned", "changes": _our_settings()}
+    both = (
+        Row(tuned, "r2", **same),
+        Row("R2-Gaussian w/ ST (settings of PhyRadGS)", "r2", "micro-views", 8, 5, tuned, **same),
+    )
+    return (*strips, *both)
+
+
+def _table2() -> tuple[Row, ...]:
+    counts = [(m, 5) for m in (1, 4, 8, 16)] + [(8, n) for n in (1, 3, 7)]
+    return tuple(_micro_views(f"M={m} N={n}", "phyradgs", m, n, "PhyRadGS w/o ST") for m, n in counts)
+
+
+def rows_of(kind: str) -> tuple[Row, ...]:
+    """The rows of a table, in order."""
+    if kind not in KINDS:
+        raise InputError("benchmark", repr(kind), f"one of {', '.join(KINDS)}")
+    if kind == "quick":
+        wanted = ("FDK", "ASD-POCS", "ASD-POCS per-row", "R2-Gaussian", "PhyRadGS w/o ST", "PhyRadGS")
+        return tuple(row for row in _table1() if row.label in wanted)
+    return _table2() if kind == "table2" else _table1()
+
+
+def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:
+    """The rows of a kind, or those with the given labels in the table's order; InputError for one that is unknown."""
+    rows = rows_of(kind)
+    if not labels:
+        return rows
+    # a quick run may take any row of table 1; extras stand at the end
+    candidates = (*(_table1() if kind == "quick" else rows), *(() if kind == "table2" else _extras()))
+    by_name = {row.label.casefold(): row for row in candidates}
+    wanted = set()
+    for label in labels:
+        name = label.strip().casefold()
+        if name not in by_name:
+            close = get_close_matches(name, by_name, n=1)
+            remedy = f"did you mean {by_name[close[0]].label!r}?" if close else ""
+            raise InputError("--rows", repr(label), "; ".join(row.label for row in candidates), remedy)
+        wanted.add(name)
+    return tuple(row for name, row in by_name.items() if name in wanted)

@@ -1,0 +1,240 @@
+"""Runs a benchmark: whatever the results file lacks, one line a run, and then the tables."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import __version__
+from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
+from phyradgs_cl.bench.case import Case, SyntheticCase
+from phyradgs_cl.bench.figures import truth_of, write_figures, write_slices
+from phyradgs_cl.bench.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
+from phyradgs_cl.bench.phantom_case import PhantomCase
+from phyradgs_cl.bench.pseudo_truth import PseudoTruth, refuse_interrupted
+from phyradgs_cl.bench.results import Line, Present, append_line, read_lines
+from phyradgs_cl.bench.summary import REFERENCE
+from phyradgs_cl.bench.tables import write_tables
+from phyradgs_cl.errors import InputError, NumericalError, OutputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import file_kind
+from phyradgs_cl.reconstructors import Progress, ProgressReport, reconstruct
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
+
+RESULTS = "results.jsonl"
+# R2-Gaussian's scanner: distances and sides in scene units
+_TO_AXIS, _TO_DETECTOR, _PANEL_SIDE, _BOX_SIDE = 5.0, 7.0, 4.0, 2.0
+log = logging.getLogger(__name__)
+
+
+@np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line
+def run_bench(
+    job: BenchJob, make_runtime: Callable[[], Runtime], report: Report = lambda progress: None
+) -> list[Path]:
+    """Makes the runs that the results file lacks, then tables and figures; the files written.
+
+    A run is in the file once it is done, so that an interruption (KeyboardInterrupt) loses the present one only and
+    the same job goes on from there.
+
+    Args:
+        job: what to run; everything in it is checked before the first run.
+        make_runtime: called once, if there is anything to do.
+        report: called at the iterations of a run, and with its line when it is done.
+
+    Raises:
+        InputError: rows, volumes, names or options that do not exist.
+        OutputError: the folder cannot be written.
+    """
+    plan = plan_runs(job)
+    results = _results_file(job.output)
+    present = Present(read_lines(results))
+    missing = [run for run in plan if not present.has(run.facts)]
+    _check_volumes(missing)
+    if missing:
+        batch = _Batch(job, make_runtime(), results, present, missing, len(plan), report)
+        for _, group in groupby(missing, key=lambda run: run.case):
+            batch.run_case(list(group))
+    return remake_tables(job)
+
+
+def remake_tables(job: BenchJob) -> list[Path]:
+    """Writes tables and figures from the results file as it is; the files written."""
+    lines = read_lines(job.output / RESULTS)
+    if not lines:
+        raise InputError(str(job.output / RESULTS), "no results", "a results file", "run the benchmark first")
+    return [*write_tables(job, lines), *write_figures(job, lines)]
+
+
+class _Batch:
+    """The runs that are made now, and what is known about the time that they take."""
+
+    def __init__(
+        self,
+        job: BenchJob,
+        rt: Runtime,
+        results: Path,
+        present: Present,
+        missing: Sequence[PlannedRun],
+        total: int,
+        report: Report,
+    ) -> None:
+        self.job, self.rt, self.results, self.present, self.report = job, rt, results, present, report
+        self.left, self.total = list(missing), total
+        self.known = [line for line in read_lines(results) if "seconds" in line]
+
+    def run_case(self, runs: Sequence[PlannedRun]) -> None:
+        """All missing runs of one case."""
+        title = f"reference of seed {runs[0].seed}"
+        first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
+        case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
+        write_slices(self.job.output, truth_of(runs[0].facts), case.slices(case.truth))
+        self._write_references(runs[0], case)
+        for run in runs:
+            number = self.total - len(self.left) + 1
+            started = BenchProgress(number, self.total, run.title)
+            self.report(started)
+            line = _one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
+            self._keep(line)
+            self.left.remove(run)
+            self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
+
+    def _keep(self, line: Line) -> None:
+        with finish_despite_interrupt():
+            append_line(self.results, line)
+        self.present.add(line)
+        if "seconds" in line:
+            self.known.append(line)
+
+    def _write_references(self, run: PlannedRun, case: Case) -> None:
+        """Lines about what results are compared with, where the case has any that the file lacks."""
+        iterations = self.job.bench_size.iterations
+        same = {"acquisition": REFERENCE, "method": None, "options": {}, "iterations": iterations}
+        for name, measure in case.references().items():
+            facts = {**run.facts, **same, "run": name, "label": name}
+            if not self.present.has(facts):
+                metrics = {key: _number(value) for key, value in measure().items()}
+                self._keep({**facts, "metrics": metrics, **environment(self.rt)})
+
+    def _left_s(self) -> float | None:
+        """Seconds that the missing runs will take, by what the same runs took on other objects; None if unknown."""
+        total = 0.0
+        for run in self.left:
+            like = [line["seconds"] for line in self.known if _is_like(line, run)]
+            if not like:
+                return None
+            total += float(np.mean(like))
+        return total
+
+
+def _one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
+    scan = case.scan(run.acquisition)
+    started = time.perf_counter()
+    try:
+        result = reconstruct(scan, str(run.row.method), rt, run.options, seed=run.seed, report=progress)
+    except NumericalError as error:  # one method that overflows must not cost a night's other runs
+        log.warning("%s: %s", run.title, error)
+        return {**run.facts, "error": str(error), **environment(rt)}
+    seconds = time.perf_counter() - started
+    refuse_interrupted(result)
+    write_slices(job.output, run.facts, case.slices(result.volume))
+    return {
+        **run.facts,
+        "metrics": {name: _number(value) for name, value in case.measure(result.volume).items()},
+        "seconds": round(seconds, 3),
+        "gaussians": result.facts.get("gaussians"),
+        **environment(rt),
+    }
+
+
+def make_case(job: BenchJob, rt: Runtime, run: PlannedRun, report: ProgressReport) -> Case:
+    """The object of a run on its scanner; ``report`` follows the reconstruction of a pseudo-truth."""
+    size, protocol = job.bench_size, PROTOCOLS[run.protocol]
+    if job.study == PHANTOM:
+        pseudo = PseudoTruth(job, rt, run.seed, report)
+        return PhantomCase(rt, size, protocol, job.axis, run.seed, pseudo.volume_of)
+    geometry = ConeGeometry(_TO_AXIS, _TO_DETECTOR, (size.pixels,) * 2, (_PANEL_SIDE / size.pixels,) * 2)
+    return SyntheticCase(rt, _scene(job, rt, run, geometry), geometry, protocol, job.axis, run.seed)
+
+
+def _scene(job: BenchJob, rt: Runtime, run: PlannedRun, geometry: ConeGeometry) -> Scene:
+    voxels = job.bench_size.voxels
+    box = Grid.cube(voxels, _BOX_SIDE)
+    if run.source is None:
+        return phantom_scene(rt, run.volume, geometry, box, voxels, job.axis, 0)
+    return volume_scene(rt, str(run.source), geometry, box, voxels, job.axis)
+
+
+def environment(rt: Runtime) -> dict[str, Any]:
+    """What a number depends on besides its options: program, interpreter, libraries, device."""
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "pyopencl": _installed("pyopencl"),
+        "pocl": _installed("pocl-binary-distribution"),
+        "platform": rt.device.platform,
+        "device": rt.device.name,
+        "device_version": rt.device.version,
+        "compute_units": rt.device.compute_units,
+        "host_cores": os.cpu_count(),
+        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _number(value: float) -> float | None:
+    """JSON has neither NaN nor infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _forwarded(report: Report, started: BenchProgress) -> ProgressReport:
+    """A method's report as the benchmark's."""
+
+    def forward(p: Progress) -> None:
+        report(BenchProgress(started.number, started.runs, started.title, p.iteration, p.iterations))
+
+    return forward
+
+
+def _is_like(line: Line, run: PlannedRun) -> bool:
+    same = ("run", "voxels", "pixels", "iterations", "views")
+    return all(line.get(name) == run.facts[name] for name in same)
+
+
+def _check_volumes(runs: Sequence[PlannedRun]) -> None:
+    """Files that are no volumes are named now, not after hours of other runs."""
+    for path in dict.fromkeys(run.source for run in runs):
+        if path is not None and file_kind(path) == "scan":
+            expected = "a dataset /volume (z, y, x), or one of our volumes"
+            raise InputError(str(path), "a scan", expected, "take it out of the folder, or choose --names")
+
+
+def _results_file(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / RESULTS
+        path.open("ab").close()
+    except OSError as error:
+        raise OutputError(
+            str(folder), error.strerror or str(error), "a folder that can be written"
+        ) from error
+    return path

@@ -1,0 +1,43 @@
+"""Which volumes a folder holds, and which of several resolutions is projected."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from phyradgs_cl.errors import InputError
+
+_COUNTED = re.compile(r"(?P<name>.+)_(?P<count>\d+)")
+
+
+def find_volumes(folder: Path, names: Sequence[str] | None, voxels: int) -> dict[str, Path]:
+    """Name to file of the volumes in ``folder``, in alphabetical order, or those of ``names``.
+
+    Files are NAME_COUNT.h5 or NAME.h5. Of one name, the file with twice ``voxels`` a side is taken, else the largest.
+
+    Raises:
+        InputError: no such folder, no volume in it, a name that is not there.
+    """
+    if not folder.is_dir():
+        raise InputError("--volumes", str(folder), "a folder of HDF5 volumes", "check the path")
+    found: dict[str, dict[int, Path]] = {}
+    for path in sorted(folder.glob("*.h5")):
+        match = _COUNTED.fullmatch(path.stem)
+        name, count = (match["name"], int(match["count"])) if match else (path.stem, 0)
+        found.setdefault(name, {})[count] = path
+    if not found:
+        expected = "files NAME_COUNT.h5 or NAME.h5 with a dataset /volume (z, y, x)"
+        raise InputError("--volumes", f"no .h5 file in {folder}", expected)
+    for name in names or ():
+        if name not in found:
+            close = get_close_matches(name, found, n=1)
+            remedy = f"did you mean {close[0]!r}?" if close else ""
+            raise InputError("--names", repr(name), f"one of {', '.join(found)}", remedy)
+    chosen = list(dict.fromkeys(names)) if names else list(found)
+    return {name: _best(found[name], 2 * voxels) for name in chosen}
+
+
+def _best(files: dict[int, Path], wanted: int) -> Path:
+    return files.get(wanted) or files[max(files)]

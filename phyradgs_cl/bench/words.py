@@ -1,0 +1,44 @@
+"""Lists on the command line, and results as lines for people."""
+
+from __future__ import annotations
+
+from phyradgs_cl.bench.job import BenchProgress
+from phyradgs_cl.errors import InputError
+
+
+def listed(option: str, text: str | None) -> list[str] | None:
+    """The parts of "a,b", without blanks around them; None for None, InputError for an empty part."""
+    if text is None:
+        return None
+    parts = [part.strip() for part in text.split(",")]
+    if not all(parts):
+        raise InputError(option, repr(text), "names with commas between them", "write for example a,b")
+    return parts
+
+
+def listed_seeds(option: str, text: str) -> list[int]:
+    """The whole numbers of "0,1,2"."""
+    parts = listed(option, text) or []
+    if not all(part.isascii() and part.isdigit() for part in parts):
+        raise InputError(option, repr(text), "whole numbers of at least 0", "write for example 0,1,2")
+    return [int(part) for part in parts]
+
+
+def result_text(progress: BenchProgress) -> str:
+    """What a finished run gave, and how long the others will take."""
+    line = progress.line or {}
+    numbers = line.get("metrics")
+    if numbers is None:
+        found = f"failed: {line.get('error')}"
+    else:
+        psnr = numbers.get("psnr_db")
+        found = f"PSNR {'inf' if psnr is None else format(psnr, '.2f')} dB, SSIM {numbers['ssim']:.3f}"
+        found += f", {line['seconds']:.1f} s"
+    left = f"; about {_duration(progress.left_s)} left" if progress.left_s else ""
+    return f"{progress.number}/{progress.runs} {progress.title}: {found}{left}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,135 @@
+"""FDK's weights of rays: the measure of a ray, displaced detectors, short scans.
+
+The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displaced detectors after G. Wang, Med. Phys. 29
+(2002) 1634, in the fan angle; short scans after D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for
+arcs beyond the least, Med. Phys. 27 (2000) 773. A ray and its opposite have redundancy weights that sum to 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# The transition between seen once and seen twice is this many times as wide as the overhang, or all that is seen
+# twice (Wang's sine throughout). Every ray that is not counted evenly with its opposite adds noise and aliasing, so a
+# quarter-pixel offset touches two columns; wider transitions were noisier (up to 15 %) and no freer of artefacts.
+TRANSITION = 1.0
+_SYMMETRIC = 0.01  # pixels of overhang that are no displacement
+
+
+def source_angle(pose: np.ndarray) -> np.ndarray:
+    """The source's angle (...) about +z, radians, of poses (..., 12)."""
+    return np.arctan2(pose[..., 1], pose[..., 0])
+
+
+def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Poses (F, ..., 12) turned by −angle (F,) about +z: equal for all views of a circular orbit."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    turn = np.zeros((len(angle_rad), 3, 3))
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1
+    vectors = pose.reshape(len(pose), -1, 3)
+    return np.einsum("fij,fkj->fki", turn, vectors).reshape(pose.shape)
+
+
+def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Vectors (..., v, u, 3) mm from source to pixels of the given rows (v,) and columns (u,).
+
+    pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one a row (v, 1, 12), one a column (1, u, 12).
+    """
+    corner = pose[..., 3:6] - pose[..., 0:3]
+    return corner + columns[:, None] * pose[..., 6:9] + rows[:, None, None] * pose[..., 9:12]
+
+
+def ray_measure(pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """The measure (v, u) of each ray per radian of gantry angle and mm of detector, over the filter's own 1/mm².
+
+    |ȧ·n| / D with ȧ the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the
+    distance of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine.
+    """
+    row = pose[..., 6:9] / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
+    motion = np.stack([-pose[..., 1], pose[..., 0], np.zeros(pose.shape[:-1])], -1)
+    length = np.linalg.norm(rays, axis=-1)
+    along = rays / length[..., None]
+    cosine = (row * along).sum(-1)
+    normal_motion = (motion * row).sum(-1) - cosine * (motion * along).sum(-1)
+    return np.abs(normal_motion) / (length * (1 - cosine**2))
+
+
+def fan_angle(pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Angle (v, u) of each ray about +z from the source's view of the axis, radians, counter-clockwise positive."""
+    x, y = -pose[..., 0], -pose[..., 1]
+    return np.arctan2(x * rays[..., 1] - y * rays[..., 0], x * rays[..., 0] + y * rays[..., 1])
+
+
+@dataclass(frozen=True)
+class Fan:
+    """The fan angles that every view sees, and how far the detector is off centre, in columns at its two ends."""
+
+    low_rad: float
+    high_rad: float
+    missing_columns: tuple[int, int] = (0, 0)
+
+    @property
+    def is_displaced(self) -> bool:
+        return self.missing_columns != (0, 0)
+
+    @property
+    def sees_axis(self) -> bool:
+        return self.low_rad < 0 < self.high_rad
+
+    @property
+    def half_rad(self) -> float:
+        """The wider side."""
+        return max(self.high_rad, -self.low_rad)
+
+
+def measured_fan(pose: np.ndarray, shape: tuple[int, int]) -> Fan:
+    """What views with poses as in ``pixel_rays``, (F, ..., 12), see on a detector of ``shape`` (rows, columns).
+
+    ``missing_columns`` would make the detector reach equally far on both sides of the axis.
+    """
+    rows, columns = np.arange(shape[0]), np.arange(shape[1])
+    outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose
+    ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]])), axis=-1)
+    low, high = float(ends[..., 0].max()), float(ends[..., 1].min())
+    overhang = abs(high + low) * max(shape[1] - 1, 1)
+    if shape[1] == 1 or overhang <= _SYMMETRIC * (high - low):
+        return Fan(low, high)
+    middle = pose[0, [pose.shape[1] // 2]]
+    across = fan_angle(middle, pixel_rays(middle, rows[[shape[0] // 2]], columns))[0]
+    axis = float(np.interp(0.0, across if across[-1] > across[0] else -across, columns))
+    missing = max(1, int(np.ceil(abs(shape[1] - 1 - 2 * axis) - 1e-6)))
+    return Fan(low, high, (missing, 0) if axis < (shape[1] - 1) / 2 else (0, missing))
+
+
+def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
+    """1 ± sin over what the fan sees on both sides of the axis, 0 and 2 beyond; angle_rad of any shape.
+
+    Where the axis itself is not seen every ray is measured once, and counts 2.
+    """
+    if not fan.sees_axis:
+        return np.full(angle_rad.shape, 2.0)
+    short = min(fan.high_rad, -fan.low_rad)
+    sign = 1.0 if fan.high_rad > -fan.low_rad else -1.0
+    width = min(short, TRANSITION * (fan.half_rad - short))
+    into = np.clip((np.abs(angle_rad) - (short - width)) / width, 0, 1)
+    return 1 + sign * np.sign(angle_rad) * np.sin(np.pi / 2 * into)
+
+
+def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: float) -> np.ndarray:
+    """Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc.
+
+    Rays without an opposite in the arc count 2. Under half a turn there is no opposite at all.
+    """
+    margin = (coverage_rad - np.pi) / 2
+    if margin <= 0:
+        return np.full(angle_rad.shape, 2.0)
+    rise = _eased(progress_rad, margin - angle_rad)
+    return 2 * rise * _eased(coverage_rad - progress_rad, margin + angle_rad)
+
+
+def _eased(distance_rad: float, half_width_rad: np.ndarray) -> np.ndarray:
+    """sin² from 0 at the end of the arc to 1 at twice the half width from it."""
+    share = np.clip(distance_rad / (2 * np.maximum(half_width_rad, 1e-12)), 0, 1)
+    return np.sin(np.pi / 2 * share) ** 2

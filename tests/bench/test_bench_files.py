@@ -1,0 +1,164 @@
+"""Results files, folders of volumes, rows and jobs: all that needs no device."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from phyradgs_cl.bench import KINDS, BenchJob, BenchSize, Row, listed, listed_seeds, plan_runs, rows_of
+from phyradgs_cl.bench.published import TABLE1, TABLE2
+from phyradgs_cl.bench.results import KEY, Present, append_line, read_lines
+from phyradgs_cl.bench.volumes import find_volumes
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.reconstructors import METHODS
+
+FACTS = {**dict.fromkeys(KEY, 1), "options": {"motion": {"name": "static"}, "iterations": 5}, "metrics": {}}
+
+
+def test_a_damaged_last_line_is_skipped_and_closed_off(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "results.jsonl"
+    append_line(path, {**FACTS, "run": "a"})
+    with open(path, "a") as file:
+        file.write('{"run": "b", "seed": 1, "metr')
+    assert [line["run"] for line in read_lines(path)] == ["a"]
+    assert "line 2 is damaged" in caplog.text
+    append_line(path, {**FACTS, "run": "c"})
+    assert [line["run"] for line in read_lines(path)] == ["a", "c"]
+
+
+def test_a_file_without_any_result_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    assert read_lines(path) == []
+    path.write_text("these are\nnotes\n")
+    with pytest.raises(InputError, match="no result in any line"):
+        read_lines(path)
+    with pytest.raises(OutputError, match="missing"):
+        append_line(tmp_path / "missing" / "results.jsonl", {})
+
+
+def test_a_run_is_present_with_the_same_identity_and_options() -> None:
+    present = Present([FACTS])
+    assert present.has(FACTS)
+    for name in KEY:
+        assert not present.has({**FACTS, name: 2})
+    assert not present.has({**FACTS, "options": {"motion": {"name": "per-row"}, "iterations": 5}})
+    # an option that the program has gained since is no reason to run again
+    assert present.has({**FACTS, "options": {**FACTS["options"], "new": 1}})
+    assert not Present([{**FACTS, "error": "overflow"}]).has(FACTS)
+
+
+def test_of_a_volume_twice_the_size_is_taken_else_the_largest(tmp_path: Path) -> None:
+    for name in ("head_64", "head_128", "head_256", "plain", "two_words_32"):
+        (tmp_path / f"{name}.h5").touch()
+    found = {name: path.stem for name, path in find_volumes(tmp_path, None, 64).items()}
+    assert found == {"head": "head_128", "plain": "plain", "two_words": "two_words_32"}
+    assert find_volumes(tmp_path, ["head"], 256)["head"].stem == "head_256"
+    with pytest.raises(InputError, match="--names: found 'heat'; .*did you mean 'head'"):
+        find_volumes(tmp_path, ["heat"], 64)
+
+
+def test_folders_without_volumes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no \.h5 file in"):
+        find_volumes(tmp_path, None, 64)
+    with pytest.raises(InputError, match="a folder of HDF5 volumes"):
+        find_volumes(tmp_path / "missing", None, 64)
+
+
+def test_rows_are_the_papers_and_more() -> None:
+    assert set(TABLE1) <= {row.label for row in rows_of("table1")}
+    assert set(TABLE2) == {row.label for row in rows_of("table2")}
+    for kind in KINDS:
+        labels = [row.label for row in rows_of(kind)]
+        assert len(set(labels)) == len(labels)
+
+
+def test_tables_share_the_run_of_the_default_strips() -> None:
+    full = next(row for row in rows_of("table1") if row.label == "PhyRadGS")
+    assert full.run == next(row for row in rows_of("table2") if row.label == "M=8 N=5").run
+    assert full.standing().run == next(r for r in rows_of("table1") if r.label == "PhyRadGS w/o ST").run
+
+
+def test_a_row_of_an_unknown_name_or_method_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--rows: found 'PhyRad'; .*did you mean 'PhyRadGS'"):
+        BenchJob("table1", tmp_path, rows=["PhyRad"])
+    with pytest.raises(InputError, match="row 'Magic': found the method 'magic'; expected one of phyradgs"):
+        Row("Magic", "magic").options(10, 10)
+    with pytest.raises(InputError, match="row 'R2 exact': --motion"):
+        Row("R2 exact", "r2", "per-row").options(10, 10)
+
+
+def test_stop_and_shoot_is_planned_once_for_the_rows_that_share_it(tmp_path: Path) -> None:
+    rows = ["PhyRadGS", "PhyRadGS w/o ST", "R2-Gaussian w/ ST"]
+    job = BenchJob("table1", tmp_path, rows=rows, names=["foot"], protocols=["rapid"], iterations=7)
+    planned = [(run.acquisition, run.row.label) for run in plan_runs(job)]
+    assert sorted(planned) == [
+        ("fly-scan", "PhyRadGS"),
+        ("fly-scan", "PhyRadGS w/o ST"),
+        ("fly-scan", "R2-Gaussian w/ ST"),
+        ("stop-and-shoot", "PhyRadGS w/o ST"),
+        ("stop-and-shoot", "R2-Gaussian"),
+    ]
+    options = [run.options for run in plan_runs(job)]
+    assert {o.iterations for o in options} == {7}
+    assert {o.gaussians for o in options} == {job.gaussians}
+
+
+def test_a_plan_runs_over_seeds_volumes_and_protocols(tmp_path: Path) -> None:
+    job = BenchJob("table1", tmp_path, rows=["FDK"], seeds=(0, 1))
+    cases = [run.case for run in plan_runs(job)]
+    assert len(set(cases)) == 2 * 2 * 2
+    assert len(cases) == 2 * len(set(cases))  # on a moving and on a standing gantry
+    assert json.loads(json.dumps([run.facts for run in plan_runs(job)]))
+
+
+def test_rows_that_are_not_there_yet_are_not_run(tmp_path: Path) -> None:
+    job = BenchJob("table1", tmp_path, rows=["NAF", "FDK"], names=["jaw"], protocols=["rapid"])
+    assert {run.row.method for run in plan_runs(job)} == {"fdk"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "culprit"),
+    [
+        ({"kind": "table3"}, "benchmark: found 'table3'"),
+        ({"protocols": ["static"]}, "--protocols: found 'static'"),
+        ({"seeds": (-1,)}, "--seeds: found -1"),
+        ({"seeds": ()}, "--seeds: found nothing"),
+        ({"iterations": -1}, "--iterations: found -1"),
+        ({"size": "XXL"}, "--size: found 'XXL'"),
+        ({"axis": "diagonal"}, "--readout: found 'diagonal'"),
+        ({"names": ["hand"]}, r"--names \(without --volumes\): found 'hand'"),
+        ({"kind": "phantom", "names": ["foot"]}, "given for phantom"),
+    ],
+)
+def test_wrong_jobs_are_refused(tmp_path: Path, changes: dict[str, object], culprit: str) -> None:
+    with pytest.raises(InputError, match=culprit):
+        plan_runs(replace(BenchJob("table1", tmp_path, rows=["FDK"]), **changes))  # type: ignore[arg-type]
+
+
+def test_lists_of_the_command_line() -> None:
+    assert listed("--names", "a, b") == ["a", "b"]
+    assert listed("--names", None) is None
+    assert listed_seeds("--seeds", "0,12") == [0, 12]
+    for text in ("", "a,,b"):
+        with pytest.raises(InputError, match="--names"):
+            listed("--names", text)
+    with pytest.raises(InputError, match="--seeds: found '1,x'"):
+        listed_seeds("--seeds", "1,x")
+
+
+def test_every_default_row_with_a_known_method_has_options() -> None:
+    for kind in KINDS:
+        for row in rows_of(kind):
+            if row.method in METHODS:
+                options = row.options(100, 10)
+                assert options.motion.name == row.motion
+
+
+def test_sizes_of_ones_own_are_checked() -> None:
+    with pytest.raises(InputError, match="voxels of a benchmark size"):
+        BenchSize("T", 1, 8, 1)

@@ -1,0 +1,312 @@
+"""Whole benchmarks at sizes of some voxels: resuming, tables, figures, poses, interruptions, the phantom study."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Motion
+from phyradgs_cl.bench import (
+    RESULTS,
+    BenchJob,
+    BenchProgress,
+    BenchSize,
+    remake_tables,
+    result_text,
+    run_bench,
+)
+from phyradgs_cl.bench import run as bench_run
+from phyradgs_cl.bench.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, standing
+from phyradgs_cl.bench.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
+from phyradgs_cl.bench.raw_counts import Panel, measured_attenuation
+from phyradgs_cl.bench.results import read_lines
+from phyradgs_cl.errors import InputError, NumericalError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import phantom_scene
+
+TINY = BenchSize("T", 12, 16, 8)
+ROWS = ["FDK", "PhyRadGS w/o ST", "PhyRadGS"]
+RUNS_A_CASE = 5  # three on the fly-scan, two on the stop-and-shoot scan
+
+
+def no_runtime() -> Runtime:
+    raise AssertionError("a device was asked for")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two volumes of some voxels."""
+    for seed, name in enumerate(("ball_24", "box")):
+        z, y, x = np.mgrid[-1:1:24j, -1:1:24j, -1:1:24j]
+        inside = (x**2 + y**2 + z**2 < 0.4) if seed == 0 else (np.abs(x) < 0.5) & (np.abs(y) < 0.4)
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file["volume"] = (200 * inside * (np.abs(z) < 0.7)).astype(np.uint8)
+    return tmp_path
+
+
+@pytest.fixture
+def job(folder: Path) -> BenchJob:
+    return BenchJob("table1", folder / "out", folder, TINY, protocols=["rapid"], rows=ROWS)
+
+
+def test_a_run_is_not_made_twice_and_a_damaged_line_again(job: BenchJob, rt: Runtime) -> None:
+    seen: list[BenchProgress] = []
+    written = run_bench(job, lambda: rt, seen.append)
+    results = job.output / RESULTS
+    whole = results.read_bytes()
+    assert whole.count(b"\n") == 2 * RUNS_A_CASE
+    assert [p.number for p in seen if p.line is not None] == list(range(1, 2 * RUNS_A_CASE + 1))
+    assert all(path.stat().st_size for path in written)
+    run_bench(job, no_runtime)
+    assert results.read_bytes() == whole
+    results.write_bytes(whole[:-40])  # killed while the last line was written
+    made: list[BenchProgress] = []
+    run_bench(job, lambda: rt, made.append)
+    assert [p.number for p in made if p.line is not None] == [2 * RUNS_A_CASE]
+    assert len(read_lines(results)) == 2 * RUNS_A_CASE
+    run_bench(job, no_runtime)
+
+
+def test_lines_have_what_is_needed_to_make_them_again(job: BenchJob, rt: Runtime) -> None:
+    run_bench(replace(job, names=["ball"], rows=["PhyRadGS"]), lambda: rt)
+    line = read_lines(job.output / RESULTS)[0]
+    expected = {
+        "volume": "ball", "source": "ball_24.h5", "label": "PhyRadGS", "acquisition": "fly-scan", "method": "phyradgs",
+        "run": "phyradgs micro-views 8x5", "voxels": 12, "pixels": 16, "views": 25, "protocol": "rapid", "axis": "rows",
+        "seed": 0, "iterations": 8, "python": None, "numpy": np.__version__, "device": rt.device.name,
+    }  # fmt: skip
+    assert {**line, "python": None} | expected == {**line, "python": None}
+    assert line["options"]["motion"] == {"name": "micro-views", "strips": 8, "sub_intervals": 5}
+    assert {"psnr_db", "ssim", "psnr_2d_db", "ssim_2d", "data_range"} <= line["metrics"].keys()
+
+
+def test_tables_have_means_papers_numbers_and_rows_to_come(job: BenchJob, rt: Runtime) -> None:
+    job = replace(job, rows=[*ROWS, "NAF"], seeds=(0, 1))
+    run_bench(job, lambda: rt)
+    lines = read_lines(job.output / RESULTS)
+    text = (job.output / "table1_T.md").read_text()
+    means = text[: text.index("PSNR (dB) / SSIM")]  # the volumes one by one follow
+    rows = {row.split("|")[1].strip(): row for row in means.splitlines() if row.startswith("|")}
+    per_seed = [
+        np.mean([x["metrics"]["psnr_db"] for x in lines if x["label"] == "PhyRadGS" and x["seed"] == seed])
+        for seed in (0, 1)
+    ]
+    assert f"| {np.mean(per_seed):.2f} ± {np.std(per_seed, ddof=1):.2f} |" in rows["PhyRadGS"]
+    assert rows["PhyRadGS"].endswith("| 31.23 / 0.871 |")
+    assert "NAF (not yet)" in rows
+    assert "ball" in text
+    with open(job.output / "table1_T.csv", newline="") as file:
+        records = list(csv.DictReader(file))
+    assert [(r["row"], r["acquisition"]) for r in records] == [
+        ("FDK", FLY), ("FDK", STILL), ("PhyRadGS w/o ST", FLY), ("PhyRadGS w/o ST", STILL), ("PhyRadGS", FLY),
+    ]  # fmt: skip
+    full = records[-1]
+    assert float(full["psnr_db"]) == pytest.approx(np.mean(per_seed))
+    assert (full["volumes"], full["seeds"], full["paper_psnr_db"]) == ("2", "2", "31.23")
+    assert f"{float(records[3]['psnr_db']):.2f} ± " in rows["PhyRadGS"]  # the bound stands beside the row
+
+
+def test_tables_alone_need_no_device_but_results(job: BenchJob, rt: Runtime) -> None:
+    with pytest.raises(InputError, match="no results"):
+        remake_tables(job)
+    run_bench(replace(job, rows=["FDK", "PhyRadGS"]), lambda: rt)
+    assert "| PhyRadGS w/o ST | – |" in (remake_tables(job)[0]).read_text()
+    with pytest.raises(InputError, match="found results of 12³"):
+        remake_tables(replace(job, size="S", rows=["PhyRadGS"]))
+
+
+def test_files_that_are_no_volumes_are_named_before_any_work(job: BenchJob) -> None:
+    (job.volumes / "damaged_24.h5").write_text("not HDF5")  # type: ignore[operator]
+    with pytest.raises(InputError, match="damaged_24.h5"):
+        run_bench(job, no_runtime)
+    assert read_lines(job.output / RESULTS) == []
+
+
+def test_an_interruption_loses_the_present_run_only(
+    job: BenchJob, rt: Runtime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that a method has answered with a part of a volume, and one between two runs."""
+    original = bench_run.reconstruct
+
+    def stopped(*arguments: object, **named: object) -> object:
+        result = original(*arguments, **named)  # type: ignore[arg-type]
+        if result.facts["method"] == "phyradgs":
+            result.facts["interrupted_at"] = 3
+        return result
+
+    monkeypatch.setattr(bench_run, "reconstruct", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(job, lambda: rt)
+    assert [line["label"] for line in read_lines(job.output / RESULTS)] == ["FDK"]
+    monkeypatch.undo()
+
+    def stop_after_two(progress: BenchProgress) -> None:
+        if progress.number == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(job, lambda: rt, stop_after_two)
+    assert len(read_lines(job.output / RESULTS)) == 2
+    run_bench(job, lambda: rt)
+    assert len(read_lines(job.output / RESULTS)) == 2 * RUNS_A_CASE
+
+
+def test_a_run_that_overflows_is_noted_and_tried_again(
+    job: BenchJob, rt: Runtime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def overflow(*_: object, **__: object) -> object:
+        raise NumericalError("projections", "values that overflow")
+
+    job = replace(job, rows=["FDK"], names=["ball"])
+    monkeypatch.setattr(bench_run, "reconstruct", overflow)
+    seen: list[BenchProgress] = []
+    with pytest.raises(InputError):  # nothing to make a table of
+        run_bench(job, lambda: rt, seen.append)
+    assert "failed: projections" in result_text(seen[-1])
+    monkeypatch.undo()
+    run_bench(job, lambda: rt)
+    assert len(read_lines(job.output / RESULTS)) == 4
+
+
+@pytest.mark.parametrize("name", ["rapid", "standard"])
+def test_stop_and_shoot_stands_at_the_mid_window_poses(name: str) -> None:
+    protocol, geometry = PROTOCOLS[name], ConeGeometry(5.0, 7.0, (8, 8), (0.5, 0.5))
+    shutter, start_s = protocol.shutter(), protocol.frame_start_s()
+    moving, still = protocol.orbit(geometry), standing(protocol).orbit(geometry)
+    between = held_out(protocol).orbit(geometry)
+    for frame in range(protocol.views):
+        middle_s = np.array([start_s[frame] + shutter.span_s / 2])
+        at_middle = moving.pose(frame, middle_s)
+        np.testing.assert_allclose(still.pose(frame, middle_s), at_middle, atol=1e-9)
+        np.testing.assert_allclose(still.pose(frame, middle_s + 0.3), at_middle, atol=1e-9)
+        turn = between.angle_rad(frame, middle_s) - still.angle_rad(frame, middle_s)
+        np.testing.assert_allclose(turn, np.pi / protocol.views, atol=1e-9)
+
+
+def test_both_scans_of_a_case_agree_in_poses_and_truth(rt: Runtime) -> None:
+    geometry = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, "columns", 0)
+    case = SyntheticCase(rt, scene, geometry, PROTOCOLS["rapid"], "columns", 0)
+    fly, still = case.scan(FLY), case.scan(STILL)
+    assert (fly.is_fly, still.is_fly) == (True, False)
+    for frame in (0, 24):
+        poses = [Motion("static").cells(scan, frame).pose for scan in (fly, still)]
+        np.testing.assert_allclose(*poses, atol=1e-9)
+    assert case.scan(FLY) is fly
+    assert case.measure(case.truth)["psnr_db"] == np.inf
+
+
+def test_held_out_views_of_the_source_itself_are_equal(rt: Runtime) -> None:
+    geometry = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, "rows", 0)
+    views = HeldOutViews(rt, scene.source, geometry, scene.grid, PROTOCOLS["rapid"], "rows")
+    found = views.measure(scene.reference)
+    assert found["psnr_2d_db"] > 30  # the block mean of the source, seen on coarser voxels
+    assert views.measure(0.9 * scene.reference)["psnr_2d_db"] < found["psnr_2d_db"]
+
+
+def test_raw_counts_come_back_as_line_integrals() -> None:
+    clean = np.random.default_rng(0).uniform(0, 2, (6, 32, 32))
+    frames, unusable = measured_attenuation(clean, Panel(), np.random.default_rng(1))
+    assert not unusable.any()
+    # variance of −ln of counts: 1/counts + (σ/counts)², and that of ten flats
+    counts = 5e4 * np.exp(-clean)
+    expected = np.sqrt(np.mean((1 / counts + 100 / counts**2) + 0.1 / 5e4))
+    assert np.std(frames - clean) == pytest.approx(expected, rel=0.1)
+    assert abs(np.mean(frames - clean)) < expected / 10
+    dim, _ = measured_attenuation(clean, Panel(dose=500.0), np.random.default_rng(1))
+    assert np.std(dim - clean) > 5 * expected
+
+
+def test_the_sphere_phantom_study_runs_and_says_shape(tmp_path: Path, rt: Runtime) -> None:
+    job = BenchJob("phantom", tmp_path / "out", size=BenchSize("T", 40, 32, 8), rows=["FDK", "PhyRadGS"])
+    run_bench(job, lambda: rt)
+    lines = {(x["label"], x["acquisition"]): x["metrics"] for x in read_lines(job.output / RESULTS)}
+    references = {("truth", "reference"), ("pseudo-truth", "reference")}
+    runs = {("FDK", FLY), ("PhyRadGS", FLY), ("FDK", STILL), ("PhyRadGS w/o ST", STILL)}
+    assert set(lines) == references | runs
+    assert lines["PhyRadGS", FLY].keys() >= {
+        "psnr_db",
+        "psnr_db_pseudo",
+        "psnr_2d_db",
+        "roundness",
+        "edge_rise_mm",
+    }
+    pseudo = next(job.output.glob("pseudo_truth_*.h5"))
+    before = pseudo.stat().st_mtime_ns
+    run_bench(replace(job, rows=["FDK", "PhyRadGS", "R2-Gaussian"]), lambda: rt)
+    assert pseudo.stat().st_mtime_ns == before
+    text = (job.output / "phantom_T.md").read_text()
+    assert "| pseudo-truth |" in text
+    assert "R2-Gaussian" in text
+
+
+def test_the_phantoms_scan_is_the_papers_kind(rt: Runtime) -> None:
+    case = PhantomCase(rt, BenchSize("T", 64, 24, 8), PROTOCOLS["rapid"], "rows", 0, lambda: np.ones(1))
+    fly, still = case.scan(FLY), case.scan(STILL)
+    assert (fly.detector_model, fly.geometry.source_to_detector_mm) == ("intensity", 1200.0)
+    assert min(map(abs, fly.geometry.detector_offset_mm)) > 0
+    assert 1.5 < still.projections.max() < 5
+    shape = case.shape(case.truth)
+    assert shape["bias_balls"] == pytest.approx(0, abs=1e-6)
+    assert shape["bias_holder"] == pytest.approx(0, abs=1e-6)
+    assert shape["round_sections"] == 3 * shape["edge_balls"] > 0
+    assert {HOLDER, BALLS} <= set(np.unique(case._labels()))
+
+
+def test_every_ball_of_the_phantom_has_surroundings_of_its_own() -> None:
+    """The shape metrics look out to 1.75 radii: no other ball, and no end of the holder, may be there."""
+    _, grid = c_arm(BenchSize("T", 40, 24, 8))
+    phantom = phantom_in(grid)
+    holder = phantom.ellipsoids[0].attenuation_per_mm
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(3, 500))
+    directions /= np.linalg.norm(directions, axis=0)
+    for ball in balls_of(phantom):
+        for share in (1.01, 1.4, 1.75):
+            points = np.array(ball.centre_mm)[:, None] + share * ball.radius_mm * directions
+            np.testing.assert_allclose(phantom.density(*points), holder)
+
+
+def test_the_command_runs_resumes_and_makes_tables(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from phyradgs_cl.bench import sizes
+
+    monkeypatch.setitem(sizes.SIZES, "XS", replace(TINY, name="XS"))
+    run: Callable[[list[str]], int] = load_cli().run
+    command = [
+        "bench",
+        "quick",
+        "--volumes",
+        str(folder),
+        "-o",
+        str(folder / "out"),
+        "--rows",
+        "FDK,PhyRadGS",
+    ]
+    assert run(["bench", "--help"]) == 0
+    assert "Example: phyradgs bench table1" in capsys.readouterr().out
+    assert run(command) == 0
+    first = capsys.readouterr().out
+    assert "PhyRadGS (fly-scan): PSNR" in first
+    assert run([*command, "--table-only"]) == 0
+    assert capsys.readouterr().out == "".join(
+        f"{line}\n" for line in first.splitlines() if line.startswith(str(folder))
+    )
+    assert run([*command, "--rows", "PhyRadSG"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("phyradgs: --rows: found 'PhyRadSG'")
+    assert error.count("\n") == 1
+    assert run(["bench", "table1", "--volumes", str(folder / "out"), "-o", str(folder / "none")]) == 2
+    assert not (folder / "none").exists()
+    assert json.loads((folder / "out" / RESULTS).read_text().splitlines()[0])["size"] == "XS"

@@ -1,0 +1,77 @@
+"""Ramp filters: the space-domain kernel, and what windows do to spectrum and noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import FLOAT64, RAMP
+
+from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, FdkOptions, fdk_volume
+from phyradgs_cl.reconstructors.fdk_filters import WINDOWS, ramp_filter, ramp_spectrum
+
+FROM_SHARP_TO_SMOOTH = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
+
+
+@pytest.mark.parametrize("width", [1, 2, 17, 64])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ramp_filter_is_a_convolution(width, dtype) -> None:
+    """Kak and Slaney's kernel h(0) = 1/4τ², h(odd n) = −1/(πnτ)², times τ, without wrapping around."""
+    spacing_mm = 0.37
+    rows = np.random.default_rng(63).normal(size=(3, width)).astype(dtype)
+    n = np.arange(-(width - 1), width)
+    kernel = np.zeros(2 * width - 1)
+    kernel[n % 2 != 0] = -1 / (np.pi * n[n % 2 != 0] * spacing_mm) ** 2
+    kernel[n == 0] = 1 / (4 * spacing_mm**2)
+    expected = np.stack([np.convolve(row, kernel)[width - 1 : 2 * width - 1] * spacing_mm for row in rows])
+    found = ramp_filter(rows, spacing_mm)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, rtol=0, atol=RAMP * np.abs(expected).max())
+
+
+def test_the_ramp_is_half_the_frequency_but_for_its_foot() -> None:
+    """In cycles a sample |f|; at zero the sampled kernel keeps the small constant that a limited row needs."""
+    spectrum = ramp_spectrum(256)
+    np.testing.assert_allclose(spectrum, np.arange(129) / 256, atol=0.01)
+    assert 0 < spectrum[0] < 0.002
+
+
+@pytest.mark.parametrize(
+    ("window", "quarter", "nyquist"),
+    [
+        ("ram-lak", 1.0, 1.0),
+        ("shepp-logan", np.sin(np.pi / 4) / (np.pi / 4), 2 / np.pi),
+        ("cosine", np.sqrt(0.5), 0.0),
+        ("hamming", 0.54, 0.08),
+        ("hann", 0.5, 0.0),
+    ],
+)
+def test_windows_at_half_and_at_the_whole_nyquist_frequency(window, quarter, nyquist) -> None:
+    ratio = ramp_spectrum(256, window) / ramp_spectrum(256)
+    assert ratio[0] == pytest.approx(1.0, rel=FLOAT64)
+    assert ratio[64] == pytest.approx(quarter, rel=FLOAT64)
+    assert ratio[128] == pytest.approx(nyquist, abs=FLOAT64)
+
+
+def test_odd_lengths_have_no_nyquist_sample() -> None:
+    ratio = ramp_spectrum(225, "hann") / ramp_spectrum(225)
+    np.testing.assert_allclose(ratio, 0.5 + 0.5 * np.cos(2 * np.pi * np.arange(113) / 225), rtol=FLOAT64)
+
+
+def test_noise_falls_from_window_to_window(rt) -> None:
+    geometry = ConeGeometry(6.0, 9.0, (8, 48), (0.075, 0.075))
+    pose = geometry.pose(np.arange(40) * 2 * np.pi / 40)
+    frames = np.random.default_rng(66).normal(size=(40, 8, 48)).astype(np.float32)
+    grid = Grid((2, 24, 24), (0.05, 0.06, 0.06))
+    noise = [fdk_volume(rt, frames, pose, grid, window=window).std() for window in FROM_SHARP_TO_SMOOTH]
+    assert all(after < 0.97 * before for before, after in zip(noise[:-1], noise[1:], strict=True))
+
+
+def test_windows_are_presets_and_options() -> None:
+    assert list(FDK_PRESETS) == list(WINDOWS) == FROM_SHARP_TO_SMOOTH
+    assert next(iter(FDK_PRESETS.values())) == FdkOptions()
+    assert all(options.window == name for name, options in FDK_PRESETS.items())
+    with pytest.raises(InputError, match=r"boxcar.*'hann'"):
+        FdkOptions("boxcar")
