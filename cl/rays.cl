@@ -1,166 +1,235 @@
-/* Ray-driven projector by Joseph's method and its exactly matched adjoint, over all time cells of a frame.
-   Everything is in voxel indices (x, y, z); padded layout for image and volume.
-   Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample a plane of the ray's main axis.
-   Adjoint without atomics: a voxel gathers from the rays whose samples weigh it. Twin: operators/twins/rays.py. */
-
-#define RAY_CELL 28
-#define RAY_SOURCE 0
-#define RAY_D00 3      /* from source to pixel (0, 0) */
-#define RAY_EU 6
-#define RAY_EV 9
-#define RAY_WEIGHT 12
-#define RAY_MATRIX 13  /* 12: rows give u z, v z, z of a voxel index */
-
-typedef struct { float s[3], d[3]; int axis; float step_mm; } ray_t;
-
-inline ray_t ray_through(__global const float *cell, const float4 pitch_mm, const int u, const int v)
-{
-    ray_t r;
-    const float pitch[3] = {pitch_mm.x, pitch_mm.y, pitch_mm.z};
-    float length2 = 0.0f;
-    for (int k = 0; k < 3; ++k) {
-        r.s[k] = cell[RAY_SOURCE + k];
-        r.d[k] = cell[RAY_D00 + k] + (float)u * cell[RAY_EU + k] + (float)v * cell[RAY_EV + k];
-        length2 += (r.d[k] * pitch[k]) * (r.d[k] * pitch[k]);
-    }
-    const float ax = fabs(r.d[0]), ay = fabs(r.d[1]), az = fabs(r.d[2]);
-    r.axis = ax >= ay && ax >= az ? 0 : (ay >= az ? 1 : 2);
-    r.step_mm = sqrt(length2) / fmax(fmax(ax, ay), az);
-    return r;
-}
-
-/* one ray; a is the main axis, b and c the others, with strides in the padded volume */
-inline float ray_sum(const ray_t r, __global const float *volume, const int na, const int nb, const int nc,
-                     const int a, const int b, const int c, const size_t sa, const size_t sb, const size_t sc)
-{
-    const float inv = 1.0f / r.d[a];
-    /* planes between source and detector, then those where both other coordinates touch the volume */
-    float lo = fmax(0.0f, fmin(r.s[a], r.s[a] + r.d[a])), hi = fmin((float)(na - 1), fmax(r.s[a], r.s[a] + r.d[a]));
-    const float gb = r.d[b] * inv, gc = r.d[c] * inv;
-    if (fabs(gb) > 1e-9f) {
-        const float p = r.s[a] + (-1.0f - r.s[b]) / gb, q = r.s[a] + ((float)nb - r.s[b]) / gb;
-        lo = fmax(lo, fmin(p, q) - 0.01f);
-        hi = fmin(hi, fmax(p, q) + 0.01f);
-    }
-    if (fabs(gc) > 1e-9f) {
-        const float p = r.s[a] + (-1.0f - r.s[c]) / gc, q = r.s[a] + ((float)nc - r.s[c]) / gc;
-        lo = fmax(lo, fmin(p, q) - 0.01f);
-        hi = fmin(hi, fmax(p, q) + 0.01f);
-    }
-    float sum = 0.0f;
-    if (!(hi >= lo))
-        return sum;
-    const int first = (int)ceil(lo), last = (int)floor(hi);
-    for (int i = first; i <= last; ++i) {
-        const float t = (float)i - r.s[a];
-        const float y = r.s[b] + gb * t, z = r.s[c] + gc * t;
-        const float yf = floor(y), zf = floor(z);
-        const int j = (int)yf, k = (int)zf;
-        const float wy = y - yf, wz = z - zf;
-        __global const float *plane = volume + (size_t)i * sa;
-        const int j0 = j >= 0 && j < nb, j1 = j + 1 >= 0 && j + 1 < nb;
-        const int k0 = k >= 0 && k < nc, k1 = k + 1 >= 0 && k + 1 < nc;
-        if (j0 && j1 && k0 && k1) {
-            __global const float *at = plane + (size_t)j * sb + (size_t)k * sc;
-            sum += (1.0f - wz) * ((1.0f - wy) * at[0] + wy * at[sb]) + wz * ((1.0f - wy) * at[sc] + wy * at[sb + sc]);
-        } else {
-            if (j0 && k0) sum += (1.0f - wy) * (1.0f - wz) * plane[(size_t)j * sb + (size_t)k * sc];
-            if (j1 && k0) sum += wy * (1.0f - wz) * plane[(size_t)(j + 1) * sb + (size_t)k * sc];
-            if (j0 && k1) sum += (1.0f - wy) * wz * plane[(size_t)j * sb + (size_t)(k + 1) * sc];
-            if (j1 && k1) sum += wy * wz * plane[(size_t)(j + 1) * sb + (size_t)(k + 1) * sc];
-        }
-    }
-    return sum * r.step_mm;
-}
+/* Ray-driven projector by Joseph's method and its exactly matched adjoint, over all time cells of many frames in
+   one launch each. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample a plane of the ray's main
+   axis. Frames are padded rows, volumes too, with a border of zeros in y and z. Twin: operators/twins/rays.py. */
+#include "common/ray.h"
+#include "common/ray_window.h"
 
 __kernel void rays_forward(
-    __global const float *volume,     /* guard, then (z, y, pitch) */
-    __global const float *cells,      /* (C, RAY_CELL) */
-    __global const int *cell_lines,   /* (C, 2) */
-    __global const int *line_cells,   /* (lines, 2) */
+    __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
+    __global const float *cells,      /* (C, RAY_CELL), frame after frame */
+    __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last */
+    __global const int *line_cells,   /* (F, lines, 2): first cell and cell after the last that may serve a line */
+    __global const int *frame_list,   /* which frames */
     const int4 shape, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int intensity,              /* average transmitted intensity instead of line integrals */
-    __global float *image)
+    __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
-    const int u = (int)get_global_id(0), v = (int)get_global_id(1);
-    if (u >= width || v >= lines)
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);
+    if (u >= width)
         return;
-    const size_t sy = (size_t)volume_pitch, sz = (size_t)volume_pitch * shape.y;
-    __global const float *body = volume + IMAGE_GUARD;
-    float total = 0.0f;
-    for (int c = line_cells[2 * v]; c < line_cells[2 * v + 1]; ++c) {
+    const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
+    __global const float *body = volume + IMAGE_GUARD + (sy + sz) * BORDER;
+    const size_t line = (size_t)frame_list[n] * lines + v;
+    const vi real = VI_IOTA + u < width;
+    vf total = (vf)(0.0f);
+    for (int c = line_cells[2 * line]; c < line_cells[2 * line + 1]; ++c) {
         if (v < cell_lines[2 * c] || v >= cell_lines[2 * c + 1])
             continue;
-        const ray_t r = ray_through(cells + (size_t)c * RAY_CELL, pitch_mm, u, v);
-        float p;
-        if (r.axis == 0)
-            p = ray_sum(r, body, shape.x, shape.y, shape.z, 0, 1, 2, 1, sy, sz);
-        else if (r.axis == 1)
-            p = ray_sum(r, body, shape.y, shape.x, shape.z, 1, 0, 2, sy, 1, sz);
-        else
-            p = ray_sum(r, body, shape.z, shape.x, shape.y, 2, 0, 1, sz, 1, sy);
-        total += cells[(size_t)c * RAY_CELL + RAY_WEIGHT] * (intensity ? exp(-p) : p);
+        __global const float *cell = cells + (size_t)c * RAY_CELL;
+        const rays_t r = rays_through(cell, pitch_mm, (float)u + V_IOTA, (float)v);
+        vf p = (vf)(0.0f);
+        for (int axis = 0; axis < 3; ++axis) {
+            walk_t w;
+            if (!rays_enter(r, cell, axis, real, (int4)(0), shape, &w))
+                continue;
+            const index_t sa = axis == 0 ? 1 : (axis == 1 ? sy : sz), sb = axis == 0 ? sy : 1, sc = axis == 2 ? sy : sz;
+            for (int i = w.lo; i <= w.hi; ++i) {
+                vf wb, wc, v00, v10, v01, v11;
+                const vi j = sample_at(w.gb, w.sb, (float)i - w.sa, w.b_first, w.b_last, &wb);
+                const vi k = sample_at(w.gc, w.sc, (float)i - w.sa, w.c_first, w.c_last, &wc);
+                vindex at = V_INDEX(j) * sb + V_INDEX(k) * sc;
+                __global const float *plane = body + i * sa;
+                #pragma unroll
+                for (int lane = 0; lane < LANES; ++lane) {
+                    __global const float *corner = plane + LANE(index_t, at, lane);
+                    LANE(float, v00, lane) = corner[0];
+                    LANE(float, v10, lane) = corner[sb];
+                    LANE(float, v01, lane) = corner[sc];
+                    LANE(float, v11, lane) = corner[sb + sc];
+                }
+                const vf near = v00 + wb * (v10 - v00), far = v01 + wb * (v11 - v01);
+                p += V_PICK(0.0f, near + wc * (far - near), (w.first <= i) & (w.last >= i));
+            }
+        }
+        p *= r.step_mm;
+        total += cell[RAY_WEIGHT] * (intensity ? exp(-p) : p);
     }
-    image[IMAGE_GUARD + (size_t)v * image_pitch + u] = intensity ? -log(fmax(total, 1e-37f)) : total;
+    if (intensity)
+        total = -log(max(total, 1e-37f));
+    V_STORE(V_PICK(0.0f, total, real), image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u);
 }
 
-/* weight that the ray's sample puts on the voxel, as rays_forward does */
-inline float ray_weight(const ray_t r, const int x, const int y, const int z)
+#if !RAY_VOXEL_ITEMS
+/* Adjoint for CPUs: a work-item owns a brick of voxels. It follows the rays that may meet its brick, plane by plane as
+   the projector does, and adds their shares into a tile of its own; a border of one voxel catches what belongs to
+   neighbours, who find it themselves. One writer a voxel in a fixed order: no atomics. */
+#define TILE_X (BRICK_X + 2)
+#define TILE_Y (BRICK_Y + 2)
+#define TILE_Z (BRICK_Z + 2)
+
+/* rays u_lo..u_hi of one line and cell onto the tile; row: the line's values */
+RAY_INLINE void line_onto(__global const float *cell, __global const float *row, const float4 pitch_mm,
+                          const int u_lo, const int u_hi, const int v, const int4 corner, const int4 size,
+                          __local float *tile)
 {
-    const float index[3] = {(float)x, (float)y, (float)z};
-    const int a = r.axis, b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2;
-    const float ahead = index[a] - r.s[a];
-    if (index[a] < fmin(r.s[a], r.s[a] + r.d[a]) || index[a] > fmax(r.s[a], r.s[a] + r.d[a]))
-        return 0.0f;
-    const float inv = 1.0f / r.d[a];
-    const float wb = 1.0f - fabs(r.s[b] + (r.d[b] * inv) * ahead - index[b]);
-    const float wc = 1.0f - fabs(r.s[c] + (r.d[c] * inv) * ahead - index[c]);
-    return wb > 0.0f && wc > 0.0f ? wb * wc * r.step_mm : 0.0f;
+    for (int u = u_lo; u <= u_hi; u += LANES) {
+        const vi real = VI_IOTA + u <= u_hi;
+        const rays_t r = rays_through(cell, pitch_mm, (float)u + V_IOTA, (float)v);
+        const vf value = V_LOAD(row + u) * (cell[RAY_WEIGHT] * r.step_mm);
+        if (!V_ANY(value != 0.0f)) /* masked pixels, air */
+            continue;
+        for (int axis = 0; axis < 3; ++axis) {
+            walk_t w;
+            if (!rays_enter(r, cell, axis, real, corner, size, &w))
+                continue;
+            const int sa = axis == 0 ? 1 : (axis == 1 ? TILE_X : TILE_X * TILE_Y);
+            const int sb = axis == 0 ? TILE_X : 1, sc = axis == 2 ? TILE_X : TILE_X * TILE_Y;
+            __local float *body = tile + (1 - w.a_first) * sa + (1 - w.b_first) * sb + (1 - w.c_first) * sc;
+            for (int i = w.lo; i <= w.hi; ++i) {
+                vf wb, wc;
+                const vi j = sample_at(w.gb, w.sb, (float)i - w.sa, w.b_first, w.b_last, &wb);
+                const vi k = sample_at(w.gc, w.sc, (float)i - w.sa, w.c_first, w.c_last, &wc);
+                const vf h = V_PICK(0.0f, value, (w.first <= i) & (w.last >= i));
+                const vf far = h * wc, near = h - far;
+                vf h10 = near * wb, h11 = far * wb, h00 = near - h10, h01 = far - h11;
+                vi at = j * sb + k * sc + i * sa;
+                #pragma unroll
+                for (int lane = 0; lane < LANES; ++lane) {
+                    __local float *own = body + LANE(int, at, lane);
+                    own[0] += LANE(float, h00, lane);
+                    own[sb] += LANE(float, h10, lane);
+                    own[sc] += LANE(float, h01, lane);
+                    own[sb + sc] += LANE(float, h11, lane);
+                }
+            }
+        }
+    }
 }
 
 __kernel void rays_adjoint(
-    __global const float *image, __global const float *cells, __global const int *cell_lines,
-    const int cell_count,
+    __global const float *image,      /* guard, then (listed frames, lines, pitch) */
+    __global const float *cells, __global const int *cell_lines,
+    __global const float *matrices,   /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
+    const int matrix_stride,
+    __global const int *frame_cells,  /* (F + 1,): where a frame's cells begin */
+    __global const int *frame_list, const int frame_count,
     const int4 shape, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
     __global float *volume)
 {
-    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
-    if (x >= shape.x || y >= shape.y || z >= shape.z)
-        return;
-    float sum = 0.0f;
-    for (int c = 0; c < cell_count; ++c) {
-        __global const float *cell = cells + (size_t)c * RAY_CELL;
-        __global const float *m = cell + RAY_MATRIX;
-        const float depth = m[8] * x + m[9] * y + m[10] * z + m[11];
-        const float reach = fabs(m[8]) + fabs(m[9]) + fabs(m[10]);
-        int u_lo = 0, u_hi = width - 1, v_lo = cell_lines[2 * c], v_hi = cell_lines[2 * c + 1] - 1;
-        if (depth + reach <= 0.0f)
-            continue;
-        if (depth > reach * 1.001f) {
-            /* any point within one voxel projects within this window, a bound and not an estimate */
-            const float inv = 1.0f / depth, widest = 1.0f / (depth - reach);
-            const float u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inv;
-            const float v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inv;
-            const float ru = (fabs(m[0] - u * m[8]) + fabs(m[1] - u * m[9]) + fabs(m[2] - u * m[10])) * widest + 0.01f;
-            const float rv = (fabs(m[4] - v * m[8]) + fabs(m[5] - v * m[9]) + fabs(m[6] - v * m[10])) * widest + 0.01f;
-            v_lo = max(v_lo, (int)ceil(clamp(v - rv, -1e6f, 1e6f)));
-            v_hi = min(v_hi, (int)floor(clamp(v + rv, -1e6f, 1e6f)));
-            if (v_hi < v_lo)
+    __local float tile[TILE_X * TILE_Y * TILE_Z]; /* of the one work-item in the group */
+    const int4 corner = (int4)((int)get_group_id(0) * BRICK_X, (int)get_group_id(1) * BRICK_Y,
+                               (int)get_group_id(2) * BRICK_Z, 0);
+    const int4 size = min((int4)(BRICK_X, BRICK_Y, BRICK_Z, 0), shape - corner);
+    const float4 half_size = convert_float4(size + 1) * 0.5f; /* with the border */
+    const float4 middle = convert_float4(corner) + convert_float4(size - 1) * 0.5f;
+    for (int k = 0; k < TILE_X * TILE_Y * TILE_Z; ++k)
+        tile[k] = 0.0f;
+    for (int n = 0; n < frame_count; ++n) {
+        __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
+        const int stop = frame_cells[frame_list[n] + 1];
+        for (int c = frame_cells[frame_list[n]]; c < stop; c += LANES) {
+            window_t w;
+            vi seen = window_of(matrices, matrix_stride, cell_lines, width, c, stop, middle, half_size, &w);
+            if (!V_ANY(seen))
                 continue;
-            u_lo = max(u_lo, (int)ceil(clamp(u - ru, -1e6f, 1e6f)));
-            u_hi = min(u_hi, (int)floor(clamp(u + ru, -1e6f, 1e6f)));
-        }
-        float from_cell = 0.0f;
-        for (int v = v_lo; v <= v_hi; ++v)
-            for (int u = u_lo; u <= u_hi; ++u) {
-                const float h = image[IMAGE_GUARD + (size_t)v * image_pitch + u];
-                from_cell += h * ray_weight(ray_through(cell, pitch_mm, u, v), x, y, z);
+            for (int lane = 0; lane < LANES; ++lane) {
+                if (!LANE(int, seen, lane))
+                    continue;
+                __global const float *cell = cells + (size_t)(c + lane) * RAY_CELL;
+                for (int v = LANE(int, w.v_lo, lane); v <= LANE(int, w.v_hi, lane); ++v)
+                    line_onto(cell, frame + (size_t)v * image_pitch, pitch_mm, LANE(int, w.u_lo, lane),
+                              LANE(int, w.u_hi, lane), v, corner, size, tile);
             }
-        sum += cell[RAY_WEIGHT] * from_cell;
+        }
     }
-    const size_t at = IMAGE_GUARD + ((size_t)z * shape.y + y) * volume_pitch + x;
-    volume[at] = add ? volume[at] + sum : sum;
+    const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
+    for (int z = 0; z < size.z; ++z)
+        for (int y = 0; y < size.y; ++y) {
+            __local const float *from = tile + ((z + 1) * TILE_Y + y + 1) * TILE_X + 1;
+            __global float *to = volume + IMAGE_GUARD + (corner.z + z + BORDER) * sz + (corner.y + y + BORDER) * sy
+                                 + corner.x;
+            for (int x = 0; x < size.x; ++x)
+                to[x] = add ? to[x] + from[x] : from[x];
+        }
 }
+
+#else
+/* Adjoint for GPUs: a work-item is a voxel and gathers from the rays whose samples weigh it; a work-group is a block of
+   4 x 4 x 4 voxels, which looks for its cells together. */
+#define BLOCK 4
+#define FEW_CELLS 8    /* a frame of so few is not worth the search */
+
+/* weight that the ray's sample puts on the voxel, as rays_forward does */
+inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)
+{
+    const int a = r.axis, b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2;
+    const float da = a == 0 ? r.x : (a == 1 ? r.y : r.z), db = a == 0 ? r.y : r.x, dc = a == 2 ? r.y : r.z;
+    const float i = (float)(a == 0 ? voxel.x : (a == 1 ? voxel.y : voxel.z));
+    const float j = (float)(a == 0 ? voxel.y : voxel.x), k = (float)(a == 2 ? voxel.y : voxel.z);
+    const float sa = cell[RAY_SOURCE + a];
+    if (i < min(sa, sa + da) || i > max(sa, sa + da))
+        return 0.0f;
+    const float inv = 1.0f / da;
+    const float wb = 1.0f - fabs(fma(db * inv, i - sa, cell[RAY_SOURCE + b]) - j);
+    const float wc = 1.0f - fabs(fma(dc * inv, i - sa, cell[RAY_SOURCE + c]) - k);
+    return wb > 0.0f && wc > 0.0f ? wb * wc * r.step_mm : 0.0f;
+}
+
+__kernel void rays_adjoint(
+    __global const float *image, __global const float *cells, __global const int *cell_lines,
+    __global const float *matrices, const int matrix_stride,
+    __global const int *frame_cells, __global const int *frame_list, const int frame_count,
+    const int4 shape, const int volume_pitch, const float4 pitch_mm,
+    const int lines, const int width, const int image_pitch,
+    const int add,
+    __global float *volume)
+{
+    __local int range[2]; /* cells outside of which none sees the block */
+    const int item = (int)get_local_id(0), items = (int)get_local_size(0);
+    const int4 corner = (int4)((int)get_group_id(0), (int)get_group_id(1), (int)get_group_id(2), 0) * BLOCK;
+    const int4 voxel = corner + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
+    const int inside = voxel.x < shape.x && voxel.y < shape.y && voxel.z < shape.z;
+    const float4 around = (float4)(0.5f * (BLOCK + 1)), middle = convert_float4(corner) + 0.5f * (BLOCK - 1);
+    float sum = 0.0f;
+    for (int n = 0; n < frame_count; ++n) {
+        __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
+        int first = frame_cells[frame_list[n]], stop = frame_cells[frame_list[n] + 1];
+        window_t w;
+        if (stop - first > FEW_CELLS) { /* the same for the whole group */
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (item == 0) {
+                range[0] = stop;
+                range[1] = first;
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+            for (int c = first + item; c < stop; c += items)
+                if (window_of(matrices, matrix_stride, cell_lines, width, c, stop, middle, around, &w)) {
+                    atomic_min(&range[0], c); /* integers: the order does not matter */
+                    atomic_max(&range[1], c + 1);
+                }
+            barrier(CLK_LOCAL_MEM_FENCE);
+            first = range[0];
+            stop = range[1];
+        }
+        for (int c = first; inside && c < stop; ++c) {
+            if (!window_of(matrices, matrix_stride, cell_lines, width, c, stop, convert_float4(voxel), (float4)(1.0f), &w))
+                continue;
+            __global const float *cell = cells + (size_t)c * RAY_CELL;
+            float from_cell = 0.0f;
+            for (int v = w.v_lo; v <= w.v_hi; ++v)
+                for (int u = w.u_lo; u <= w.u_hi; ++u)
+                    from_cell += frame[(size_t)v * image_pitch + u]
+                                 * ray_weight(rays_through(cell, pitch_mm, (float)u, (float)v), cell, voxel);
+            sum += cell[RAY_WEIGHT] * from_cell;
+        }
+    }
+    if (inside) {
+        const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
+        __global float *to = volume + IMAGE_GUARD + (voxel.z + BORDER) * sz + (voxel.y + BORDER) * sy + voxel.x;
+        *to = add ? *to + sum : sum;
+    }
+}
+#endif

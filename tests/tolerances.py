@@ -91,6 +91,8 @@ GAIN_LAW = 1e-2
 CLOUD_VOLUME = 2e-3  # a voxel at the cutoff's edge (0.1 % of a peak) may fall on the other side
 
 # --- iterative methods ---------------------------------------------------------------------------------------
-ITERATIVE_TWIN = 1e-4  # of the largest voxel: a few passes in float32 against float64 with the explicit matrix
+ITERATIVE_TWIN = (
+    1e-4  # of the largest voxel: a few passes in float32 against float64 with the explicit matrix
+)
 KRYLOV = 1e-3  # relative, of CGLS against LSQR: float32 directions lose orthogonality
 CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum

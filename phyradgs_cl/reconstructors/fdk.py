@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -40,6 +41,7 @@ class FdkOptions:
 
     window: str = "ram-lak"
     motion: Motion = Motion("static")
+    has_sub_intervals: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         checks.one_of("FDK window", self.window, WINDOWS)

@@ -63,7 +63,7 @@ def method_options(method: str, preset: str | None = None, changes: Mapping[str,
         raise InputError("--preset", checks.shown(name), f"one of {', '.join(presets)} for --method {method}")
     changes = dict(changes or {})
     base = presets[name]
-    motion = _motion(method, base.motion, {key: changes.pop(key, None) for key in _MOTION_KEYS})
+    motion = _motion(method, base, {key: changes.pop(key, None) for key in _MOTION_KEYS})
     return _changed(replace(base, motion=motion), changes, f"--method {method}")
 
 
@@ -96,8 +96,9 @@ def _accepts(options: Any, motion: Motion) -> bool:
     return True
 
 
-def _motion(method: str, base: Motion, given: dict[str, Any]) -> Motion:
-    """``base`` with the name and the counts that are given, of which the model must have each."""
+def _motion(method: str, options: Any, given: dict[str, Any]) -> Motion:
+    """The motion of ``options`` with the name and the counts that are given, of which the model must have each."""
+    base: Motion = options.motion
     names = motions_of(method)
     name = base.name if given["motion"] is None else given["motion"]
     if name not in names:
@@ -105,6 +106,10 @@ def _motion(method: str, base: Motion, given: dict[str, Any]) -> Motion:
     counts = {key: value for key, value in given.items() if key != "motion" and value is not None}
     for key, value in counts.items():
         option = "--" + key.replace("_", "-")
+        if key == "sub_intervals" and not getattr(options, "has_sub_intervals", True):
+            raise InputError(
+                option, f"--method {method}", "a method with more than one pose a line", "leave it out"
+            )
         if name not in _MODELS_WITH[key]:
             having = " or ".join(n for n in _MODELS_WITH[key] if n in names)
             expected = f"--motion {having}" if having else "a method with a motion that has them"

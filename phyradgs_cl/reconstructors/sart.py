@@ -19,7 +19,7 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.system import System, norm, reciprocal
+from phyradgs_cl.reconstructors.system import System, norm, reciprocal, row_weights
 from phyradgs_cl.runtime import Runtime
 
 ORDERS = ("spread", "random", "ordered")
@@ -92,7 +92,7 @@ class Sart:
         size = options.frames_per_subset
         groups = [order[i : i + size] for i in range(0, len(order), size)]
         self.subsets = [system.subset(group) for group in groups]
-        self._row_weights = [reciprocal(subset.row_sums()) for subset in self.subsets]
+        self._row_weights = [row_weights(subset) for subset in self.subsets]
         kept = max(_WEIGHT_CACHE_BYTES // self.volume.nbytes, 1)
         self._column_weights = [reciprocal(subset.column_sums()) for subset in self.subsets[:kept]]
 

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.system import System, norm, reciprocal
+from phyradgs_cl.reconstructors.system import System, norm, reciprocal, row_weights
 from phyradgs_cl.runtime import Runtime
 
 
@@ -55,7 +55,7 @@ class Sirt:
         self.system, self.options = system, options
         self.volume = np.zeros(system.operator.volume_shape, np.float32)
         self.finished: str | None = None
-        self._rows = reciprocal(system.row_sums())
+        self._rows = row_weights(system)
         self._columns = reciprocal(system.column_sums()) * np.float32(options.relaxation)
 
     def step(self) -> float:

@@ -11,6 +11,8 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
 from phyradgs_cl.runtime import Runtime
 
+_SHORTEST_PATH = 0.1  # of the longest
+
 
 @dataclass(frozen=True, eq=False)
 class System:
@@ -76,8 +78,16 @@ def inner(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.dot(a.ravel().astype(np.float64, copy=False), b.ravel().astype(np.float64, copy=False)))
 
 
-def reciprocal(sums: np.ndarray) -> np.ndarray:
-    """1/sums where they are more than rounding, else 0: rays and voxels that see nothing stay as they are."""
-    floor = 1e-6 * float(sums.max(initial=0.0))
-    with np.errstate(divide="ignore"):
-        return np.where(sums > floor, 1 / sums, 0).astype(np.float32)
+def reciprocal(sums: np.ndarray, share: float = 1e-6) -> np.ndarray:
+    """1/sums; below ``share`` of the largest sum as at that share, and 0 where nothing is seen."""
+    floor = share * float(sums.max(initial=0.0))
+    return np.where(sums > 0, 1 / np.maximum(sums, floor or 1.0), 0).astype(np.float32)
+
+
+def row_weights(system: System) -> np.ndarray:
+    """1/(A 1) of every ray, 1/mm, no more than that of a ray through a tenth of the longest path.
+
+    A ray that only grazes an edge of the volume would else put its whole noise on a voxel or two, and bright corners
+    are what one sees of it. TIGRE measures the paths in a box that is a tenth larger, to the same end.
+    """
+    return reciprocal(system.row_sums(), _SHORTEST_PATH)

@@ -128,6 +128,10 @@ OPTIONS = {
         "direction",
     ),
     "a word for a number": (["simulate", "--views", "many"], "--views"),
+    "sub-intervals of fdk": (
+        ["reconstruct", "{scan}", "--method", "fdk", "--motion", "per-row", "--sub-intervals", "3"],
+        "--sub-intervals",
+    ),
     "jitter of a standing gantry": (
         ["simulate", "--protocol", "static", "--jitter-deg", "0.1"],
         "--jitter-deg",

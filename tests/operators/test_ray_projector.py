@@ -11,14 +11,16 @@ from tolerances import (
     DISCRETISATION_ORDER,
     DISCRETISATION_SHEPP_LOGAN,
     FLOAT32,
+    FLOAT64,
     RAYS,
+    RAYS_BACK,
 )
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector, voxelise
-from phyradgs_cl.operators.twins.rays import joseph_image
+from phyradgs_cl.operators.twins.rays import joseph_adjoint, joseph_image, ray_frame
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z, shepp_logan
 
@@ -72,19 +74,13 @@ def tables(axis: str, geometry: ConeGeometry, shape: tuple[int, int]) -> dict[st
 @pytest.mark.parametrize("motion", ["micro-views", "per line"])
 def test_merged_frame_is_the_weighted_sum_of_static_ones(rt, make_geometry, axis, motion) -> None:
     table, volume = tables(axis, make_geometry(*SHAPE), SHAPE)[motion], noise(GRID.shape, 53)
-    expected = np.zeros(SHAPE)
-    transmitted = np.zeros(SHAPE)
-    for c in range(table.count):
-        lines = slice(int(table.line_start[c]), int(table.line_stop[c]))
-        where = (lines, slice(None)) if axis == "rows" else (slice(None), lines)
-        p = joseph_image(volume, GRID, table.pose[c], SHAPE)[where]
-        expected[where] += table.weight[c] * p
-        transmitted[where] += table.weight[c] * np.exp(-p)
+    expected = ray_frame(volume, GRID, table, SHAPE)
     np.testing.assert_allclose(
         project(rt, volume, GRID, table, SHAPE), expected, rtol=0, atol=RAYS * expected.max()
     )
     intensity = project(rt, volume, GRID, table, SHAPE, "intensity")
-    np.testing.assert_allclose(intensity, -np.log(transmitted), rtol=0, atol=RAYS * expected.max())
+    transmitted = ray_frame(volume, GRID, table, SHAPE, "intensity")
+    np.testing.assert_allclose(intensity, transmitted, rtol=0, atol=RAYS * expected.max())
     assert np.abs(intensity - expected).max() > 10 * RAYS * expected.max()
 
 
@@ -108,6 +104,21 @@ def check_adjoint(rt, grid: Grid, table: TimeCells, shape: tuple[int, int]) -> N
     backward = float((x.astype(np.float64) * aty).sum())
     assert forward > 0 and np.all(np.isfinite(aty))
     assert abs(forward - backward) <= ADJOINT * forward
+
+
+@pytest.mark.parametrize("shape", [(13, 18), (1, 20), (31, 27)])
+@pytest.mark.parametrize("angle", [0.0, 0.77, 2.1])
+def test_backprojection_is_josephs(any_rt, one_cell, make_geometry, shape, angle) -> None:
+    pose, frame = make_geometry(*shape, offset=(0.1, -0.1)).pose(angle), noise(shape, 60)
+    volume = RayProjector(any_rt, GRID, shape).backproject(frame, one_cell(pose, shape[0]))
+    expected = joseph_adjoint(frame, GRID, pose)
+    np.testing.assert_allclose(volume, expected, rtol=0, atol=RAYS_BACK * expected.max())
+
+
+def test_twins_are_adjoint(make_geometry) -> None:
+    x, y, pose = noise(GRID.shape, 61), noise(SHAPE, 62), make_geometry(*SHAPE).pose(0.7)
+    forward = (joseph_image(x, GRID, pose, SHAPE) * y).sum()
+    assert abs((joseph_adjoint(y, GRID, pose) * x).sum() - forward) <= FLOAT64 * forward
 
 
 def test_adjoint_adds_where_it_is_told(rt, make_geometry) -> None:

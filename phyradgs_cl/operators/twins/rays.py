@@ -1,10 +1,13 @@
-"""Float64 twin of the ray-driven projector: Joseph's sums, one ray at a time in NumPy."""
+"""Float64 twin of the ray-driven projector and its transpose: Joseph's sums, one ray at a time in NumPy."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 
@@ -13,12 +16,64 @@ def joseph_image(
     volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]
 ) -> np.ndarray:
     """Line integrals (nv, nu) of a volume (z, y, x) from one pose (12,)."""
+    image = np.zeros(detector_shape)
+    padded = np.pad(volume.astype(np.float64), 1)
+    for index, points, step_mm in _rays(grid, pose, detector_shape, np.ones(detector_shape, bool)):
+        samples = map_coordinates(padded, points[:, ::-1].T + 1, order=1, mode="constant")
+        image[index] = samples.sum() * step_mm
+    return image
+
+
+def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray) -> np.ndarray:
+    """The transpose of ``joseph_image``: pixels (nv, nu) onto a volume (z, y, x), a corner of each sample at a time."""
+    padded = np.zeros([n + 2 for n in grid.shape])
+    for index, points, step_mm in _rays(grid, pose, image.shape, image != 0):
+        touching = np.all((points > -1) & (points < grid.shape[::-1]), axis=1)
+        whole = np.floor(points[touching])
+        rest = points[touching] - whole
+        for corner in np.ndindex(2, 2, 2):
+            share = np.prod(np.where(corner, rest, 1 - rest), axis=1)
+            x, y, z = (whole + corner).astype(int).T + 1
+            np.add.at(padded, (z, y, x), float(image[index]) * step_mm * share)
+    return padded[1:-1, 1:-1, 1:-1]
+
+
+def ray_frame(
+    volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, int], model: str = "log"
+) -> np.ndarray:
+    """The merged frame (rows, columns) of a volume (z, y, x): every cell's whole image, weighed, cut, added up."""
+    frame = np.zeros(detector_shape)
+    for cell in range(table.count):
+        image = joseph_image(volume, grid, table.pose[cell], detector_shape)
+        where = _lines(table, cell)
+        frame[where] += table.weight[cell] * (np.exp(-image[where]) if model == "intensity" else image[where])
+    return -np.log(frame) if model == "intensity" else frame
+
+
+def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
+    """The transpose of ``ray_frame`` with the log model: a frame (rows, columns) onto a volume (z, y, x)."""
+    volume = np.zeros(grid.shape)
+    for cell in range(table.count):
+        image = np.zeros(frame.shape)
+        where = _lines(table, cell)
+        image[where] = table.weight[cell] * frame[where]
+        volume += joseph_adjoint(image, grid, table.pose[cell])
+    return volume
+
+
+def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
+    lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
+    return (lines, slice(None)) if table.axis == "rows" else (slice(None), lines)
+
+
+def _rays(
+    grid: Grid, pose: np.ndarray, detector_shape: tuple[int, ...], wanted: np.ndarray
+) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
+    """(pixel, sample points (n, 3) as voxel indices x y z, length of ray a sample in mm) of the wanted pixels."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     source = (pose[:3] - first) / pitch
     to_pixel = (pixel_centres(pose, detector_shape) - pose[:3]) / pitch
-    image = np.zeros(detector_shape)
-    padded = np.pad(volume.astype(np.float64), 1)
-    for index in np.ndindex(*detector_shape):
+    for index in zip(*np.nonzero(wanted), strict=True):
         d = to_pixel[index]
         axis = int(np.argmax(np.abs(d)))
         ends = np.sort([source[axis], source[axis] + d[axis]])
@@ -26,6 +81,4 @@ def joseph_image(
         planes = planes[(planes >= ends[0]) & (planes <= ends[1])]
         points = source + np.outer((planes - source[axis]) / d[axis], d)
         points[:, axis] = planes
-        samples = map_coordinates(padded, points[:, ::-1].T + 1, order=1, mode="constant")
-        image[index] = samples.sum() * np.linalg.norm(d * pitch) / abs(d[axis])
-    return image
+        yield index, points, float(np.linalg.norm(d * pitch) / abs(d[axis]))

@@ -1,0 +1,209 @@
+"""Speed of the ray-driven projector and its adjoint: beside RTK's Joseph projectors, and by motion model.
+
+    python -m venv PEER && PEER/bin/pip install itk-rtk numpy
+    python benchmarks/ray_speed.py --peer-python PEER/bin/python [--json docs/results/ray_speed.json] [--device D]
+
+The scanner: source 600 mm from the axis and 1200 mm from the detector, a full turn of 90 views of 128 x 128 pixels of
+4 mm, 128^3 voxels of 2 mm. Ours and RTK's operators run in turns; both from host arrays to host arrays. Figures are
+the smallest of all runs, for a random volume with a border of zeros (where RTK ends a volume half a voxel earlier) and
+random frames; results are compared away from that border. RTK's adjoint runs on one thread. Processor time, over all
+threads, tells more than wall time where the machine is not quiet. Motion models are compared with each other on a
+rolling shutter that exposes and reads for a whole view.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.runtime import Runtime
+
+VIEWS, PIXELS, VOXELS = 90, 128, 128
+BORDER = 2  # voxels
+SID_MM, SDD_MM, PIXEL_MM, VOXEL_MM = 600.0, 1200.0, 4.0, 2.0
+EXPOSURE_S, READOUT_S, VIEW_S = 0.5, 0.5, 1.0
+
+Seconds = dict[str, float]
+
+
+def tables(motion: str) -> list[TimeCells]:
+    """The cells of a full turn; ``still`` is a gantry at rest, as RTK knows it."""
+    geometry = ConeGeometry(SID_MM, SDD_MM, (PIXELS, PIXELS), (PIXEL_MM, PIXEL_MM))
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / VIEWS / VIEW_S))
+    shutter = Shutter(0.0) if motion == "still" else Shutter(EXPOSURE_S, READOUT_S)
+    wheres = [(orbit, shutter, frame, frame * VIEW_S, PIXELS) for frame in range(VIEWS)]
+    if motion == "micro-views 8x5":
+        return [micro_view_cells(*where, 8, 5) for where in wheres]
+    if motion.startswith("per-row"):
+        return [per_line_cells(*where, int(motion.split()[1])) for where in wheres]
+    return [static_cells(*where) for where in wheres]
+
+
+INNER: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "forward": lambda frames: frames,
+    "adjoint": lambda volume: volume[BORDER:-BORDER, BORDER:-BORDER, BORDER:-BORDER],
+}
+MOTIONS = ("static", "per-row 1", "per-row 5", "micro-views 8x5")
+
+
+def timed(call: Callable[[], np.ndarray]) -> Seconds:
+    started = time.perf_counter(), time.process_time()
+    call()
+    return {"wall_s": time.perf_counter() - started[0], "processor_s": time.process_time() - started[1]}
+
+
+class Peer:
+    """RTK in a process of its own, which answers one request at a time."""
+
+    def __init__(self, python: str, folder: Path, volume: np.ndarray, frames: np.ndarray) -> None:
+        """volume (z, y, x) 1/mm, frames (F, rows, columns); RTK's (X, Y, Z) are (y, z, x) here."""
+        np.savez(
+            folder / "task.npz",
+            volume=volume.transpose(2, 0, 1),
+            frames=frames,
+            gantry_deg=np.arange(VIEWS) * 360 / VIEWS,
+            sid_mm=SID_MM,
+            sdd_mm=SDD_MM,
+            pixel_mm=PIXEL_MM,
+            voxel_mm=VOXEL_MM,
+        )
+        script = str(Path(__file__).with_name("rtk_rays_peer.py"))
+        pipe = subprocess.PIPE
+        self.folder = folder
+        self.process = subprocess.Popen([python, script, str(folder)], stdin=pipe, stdout=pipe, text=True)
+        self.facts: dict[str, object] = self._answer()
+
+    def run(self, name: str) -> Seconds:
+        assert self.process.stdin is not None
+        self.process.stdin.write(name + "\n")
+        self.process.stdin.flush()
+        return self._answer()
+
+    def result(self, name: str) -> np.ndarray:
+        """Frames, or a volume (z, y, x), of the last run."""
+        values = np.load(self.folder / f"{name}.npy")
+        return values if name == "forward" else values.transpose(1, 2, 0)
+
+    def _answer(self) -> dict:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit("the peer ended without an answer: does its Python have itk-rtk?")
+        return json.loads(line)
+
+
+@contextmanager
+def peer_of(python: str, volume: np.ndarray, frames: np.ndarray) -> Iterator[Peer]:
+    with tempfile.TemporaryDirectory() as folder:
+        peer = Peer(python, Path(folder), volume, frames)
+        try:
+            yield peer
+        finally:
+            assert peer.process.stdin is not None
+            peer.process.stdin.close()
+            peer.process.wait()
+
+
+def least(runs: list[Seconds]) -> Seconds:
+    return {key: min(run[key] for run in runs) for key in runs[0]}
+
+
+def beside_rtk(
+    rt: Runtime, grid: Grid, volume: np.ndarray, python: str, repeats: int
+) -> dict[str, dict[str, object]]:
+    """Seconds of both, their ratios and the relative RMS difference of their results, by operator."""
+    operator = RayOperator(rt, grid, (PIXELS, PIXELS), tables("still"))
+    frames = np.random.default_rng(1).uniform(0, 1, operator.frames_shape).astype(np.float32)
+    mine = {"forward": lambda: operator.forward(volume), "adjoint": lambda: operator.adjoint(frames)}
+    result: dict[str, dict[str, object]] = {}
+    with peer_of(python, volume, frames) as peer:
+        for name, call in mine.items():
+            own = INNER[name](call())
+            peer.run(name)
+            runs = [(timed(call), peer.run(name)) for _ in range(repeats)]
+            ours, theirs = least([a for a, _ in runs]), least([b for _, b in runs])
+            other = INNER[name](peer.result(name))
+            result[name] = {
+                "ours": ours,
+                "rtk": theirs,
+                "times_as_fast_wall": theirs["wall_s"] / ours["wall_s"],
+                "times_as_fast_processor": theirs["processor_s"] / ours["processor_s"],
+                "relative_rms_difference": float(np.linalg.norm(own - other) / np.linalg.norm(other)),
+            }
+        result["peer"] = peer.facts
+    return result
+
+
+def by_motion(rt: Runtime, grid: Grid, volume: np.ndarray, repeats: int) -> dict[str, dict[str, Seconds]]:
+    """Seconds of forward and adjoint with every motion model, run in turns."""
+    operators = {motion: RayOperator(rt, grid, (PIXELS, PIXELS), tables(motion)) for motion in MOTIONS}
+    frames = operators["static"].forward(volume)
+    runs: dict[str, dict[str, list[Seconds]]] = {m: {"forward": [], "adjoint": []} for m in MOTIONS}
+    for _ in range(repeats):
+        for motion, operator in operators.items():
+            runs[motion]["forward"].append(timed(lambda o=operator: o.forward(volume)))
+            runs[motion]["adjoint"].append(timed(lambda o=operator: o.adjoint(frames)))
+    return {motion: {step: least(times) for step, times in steps.items()} for motion, steps in runs.items()}
+
+
+def print_tables(facts: dict[str, dict]) -> None:
+    print("| operator | ours, s | RTK, s | times as fast | by processor time | relative RMS difference |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name in ("forward", "adjoint") if facts["beside_rtk"] else ():
+        r = facts["beside_rtk"][name]
+        print(
+            f"| {name} | {r['ours']['wall_s']:.3f} | {r['rtk']['wall_s']:.3f} | {r['times_as_fast_wall']:.1f} "
+            f"| {r['times_as_fast_processor']:.1f} | {r['relative_rms_difference']:.1e} |"
+        )
+    static = facts["by_motion"]["static"]
+    print("\n| motion | forward, s | of static | adjoint, s | of static |\n| --- | --- | --- | --- | --- |")
+    for motion, steps in facts["by_motion"].items():
+        cells = [
+            f"{steps[s]['wall_s']:.3f} | {steps[s]['processor_s'] / static[s]['processor_s']:.2f}"
+            for s in steps
+        ]
+        print(f"| {motion} | {' | '.join(cells)} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--peer-python", default=None, help="a Python that has itk-rtk; without it, no comparison"
+    )
+    parser.add_argument("--json", type=Path, default=Path("docs/results/ray_speed.json"))
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device", default=None)
+    arguments = parser.parse_args()
+    rt = Runtime(arguments.device)
+    grid = Grid.cube(VOXELS, VOXELS * VOXEL_MM)
+    inside = np.random.default_rng(0).uniform(0, 1, (VOXELS - 2 * BORDER,) * 3)
+    volume = np.pad(inside, BORDER).astype(np.float32)
+    peer = arguments.peer_python
+    facts = {
+        "device": rt.device.name,
+        "lanes": rt.lanes,
+        "case": f"{VOXELS}^3 voxels, {VIEWS} views of {PIXELS}^2 pixels",
+        "repeats": arguments.repeats,
+        "beside_rtk": beside_rtk(rt, grid, volume, peer, arguments.repeats) if peer else {},
+        "by_motion": by_motion(rt, grid, volume, arguments.repeats),
+    }
+    arguments.json.write_text(json.dumps(facts, indent=1) + "\n")
+    print_tables(facts)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+/* Joseph's samples along LANES rays of one detector line, for the projector and both shapes of its adjoint.
+   Everything is in voxel indices (x, y, z). All of them take axis, planes and weights from here, and fma leaves the
+   compiler no choice of rounding, so a ray has the same samples wherever it is followed. */
+#include "common/lanes.h"
+
+#define RAY_CELL 16    /* floats a cell */
+#define RAY_SOURCE 0
+#define RAY_D00 3      /* from source to pixel (0, 0) */
+#define RAY_EU 6
+#define RAY_EV 9
+#define RAY_WEIGHT 12
+
+#define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does */
+#define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside weigh nothing anyway */
+
+#if RAY_LONG           /* a volume of 2^31 floats or more */
+typedef long index_t;
+#if LANES == 1
+typedef long vindex;
+#define VX_STORE(v, p) (*(p) = (v))
+#define V_INDEX(v) ((long)(v))
+#else
+typedef LANE_TYPE(long, LANES) vindex;
+#define VX_STORE(v, p) LANE_TYPE(vstore, LANES)((v), 0, (p))
+#define V_INDEX(v) LANE_TYPE(convert_long, LANES)(v)
+#endif
+#else
+typedef int index_t;
+typedef vi vindex;
+#define VX_STORE(v, p) VI_STORE(v, p)
+#define V_INDEX(v) V_INT(v)
+#endif
+
+#if LANES == 1
+#define VI_IOTA (0)
+inline int v_least(vi v) { return v; }
+inline int v_largest(vi v) { return v; }
+#elif LANES == 4
+#define VI_IOTA ((vi)(0, 1, 2, 3))
+inline int v_least(vi v) { const int2 b = min(v.lo, v.hi); return min(b.x, b.y); }
+inline int v_largest(vi v) { const int2 b = max(v.lo, v.hi); return max(b.x, b.y); }
+#elif LANES == 8
+#define VI_IOTA ((vi)(0, 1, 2, 3, 4, 5, 6, 7))
+inline int v_least(vi v) { const int4 a = min(v.lo, v.hi); const int2 b = min(a.lo, a.hi); return min(b.x, b.y); }
+inline int v_largest(vi v) { const int4 a = max(v.lo, v.hi); const int2 b = max(a.lo, a.hi); return max(b.x, b.y); }
+#else
+#define VI_IOTA ((vi)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+inline int v_least(vi v)
+{
+    const int8 c = min(v.lo, v.hi);
+    const int4 a = min(c.lo, c.hi);
+    const int2 b = min(a.lo, a.hi);
+    return min(b.x, b.y);
+}
+inline int v_largest(vi v)
+{
+    const int8 c = max(v.lo, v.hi);
+    const int4 a = max(c.lo, c.hi);
+    const int2 b = max(a.lo, a.hi);
+    return max(b.x, b.y);
+}
+#endif
+
+/* a call would copy these structs of vectors through memory, which takes longer than what is done with them */
+#ifdef __clang__
+#define RAY_INLINE inline __attribute__((always_inline))
+#else
+#define RAY_INLINE inline
+#endif
+
+#define LANE(type, v, lane) (((type *)&(v))[lane])
+
+typedef struct { vf x, y, z, step_mm; vi axis; } rays_t;
+
+RAY_INLINE rays_t rays_through(__global const float *cell, const float4 pitch_mm, const vf u, const float v)
+{
+    rays_t r;
+    r.x = fma(u, (vf)(cell[RAY_EU]), (vf)(fma(v, cell[RAY_EV], cell[RAY_D00])));
+    r.y = fma(u, (vf)(cell[RAY_EU + 1]), (vf)(fma(v, cell[RAY_EV + 1], cell[RAY_D00 + 1])));
+    r.z = fma(u, (vf)(cell[RAY_EU + 2]), (vf)(fma(v, cell[RAY_EV + 2], cell[RAY_D00 + 2])));
+    const vf ax = fabs(r.x), ay = fabs(r.y), az = fabs(r.z);
+    r.axis = VI_PICK(VI_PICK(2, 1, ay >= az), 0, (ax >= ay) & (ax >= az));
+    const vf lx = r.x * pitch_mm.x, ly = r.y * pitch_mm.y, lz = r.z * pitch_mm.z;
+    r.step_mm = sqrt(lx * lx + ly * ly + lz * lz) / max(max(ax, ay), az);
+    return r;
+}
+
+/* Rays along one main axis a through a box of voxels: position on plane i is s_b + g_b (i - s_a), likewise c. */
+typedef struct {
+    float sa, sb, sc;
+    vf gb, gc;
+    int a_first, b_first, b_last, c_first, c_last; /* voxels of the box */
+    vi first, last;                                /* planes of each ray */
+    int lo, hi;                                    /* planes of any of them */
+} walk_t;
+
+/* narrows [lo, hi] to the planes where the other coordinate lies in (below, above) */
+RAY_INLINE void clip_planes(const vf g, const float sa, const float sb, const float below, const float above,
+                        vf *lo, vf *hi)
+{
+    const vi oblique = fabs(g) > 1e-9f;
+    const vf per = 1.0f / V_PICK(1.0f, g, oblique);
+    const vf p = sa + (below - sb) * per, q = sa + (above - sb) * per;
+    *lo = V_PICK(*lo, max(*lo, min(p, q) - CLIP_MARGIN), oblique);
+    *hi = V_PICK(*hi, min(*hi, max(p, q) + CLIP_MARGIN), oblique);
+}
+
+/* those of the rays `which` whose main axis is this one; box = (first voxel, number of voxels); 0: none meets it */
+RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int axis, const vi which,
+                      const int4 corner, const int4 size, walk_t *w)
+{
+    const vf da = axis == 0 ? r.x : (axis == 1 ? r.y : r.z);
+    const vf db = axis == 0 ? r.y : r.x, dc = axis == 2 ? r.y : r.z;
+    const int na = axis == 0 ? size.x : (axis == 1 ? size.y : size.z);
+    const int a0 = axis == 0 ? corner.x : (axis == 1 ? corner.y : corner.z);
+    w->a_first = a0;
+    w->b_first = axis == 0 ? corner.y : corner.x;
+    w->c_first = axis == 2 ? corner.y : corner.z;
+    w->b_last = w->b_first + (axis == 0 ? size.y : size.x) - 1;
+    w->c_last = w->c_first + (axis == 2 ? size.y : size.z) - 1;
+    w->sa = cell[RAY_SOURCE + axis];
+    w->sb = cell[RAY_SOURCE + (axis == 0 ? 1 : 0)];
+    w->sc = cell[RAY_SOURCE + (axis == 2 ? 1 : 2)];
+    const vi own = which & (r.axis == axis);
+    const vf inv = 1.0f / V_PICK(1.0f, da, own);
+    w->gb = V_PICK(0.0f, db * inv, own);
+    w->gc = V_PICK(0.0f, dc * inv, own);
+    /* planes between source and detector, then those where both other coordinates touch the box */
+    vf lo = max((vf)(a0), min((vf)(w->sa), w->sa + da)), hi = min((vf)(a0 + na - 1), max((vf)(w->sa), w->sa + da));
+    clip_planes(w->gb, w->sa, w->sb, (float)(w->b_first - 1), (float)(w->b_last + 1), &lo, &hi);
+    clip_planes(w->gc, w->sa, w->sc, (float)(w->c_first - 1), (float)(w->c_last + 1), &lo, &hi);
+    lo = min(lo, (float)(a0 + na));
+    hi = max(hi, (float)(a0 - 1));
+    const vi first = V_INT(ceil(lo)), last = V_INT(floor(hi));
+    const vi some = own & (first <= last);
+    w->first = VI_PICK(a0 + na, first, some);
+    w->last = VI_PICK(a0 - 1, last, some);
+    w->lo = v_least(w->first);
+    w->hi = v_largest(w->last);
+    return w->lo <= w->hi;
+}
+
+/* Whole voxel at or below a position, and the share of the next one; beyond the box it is the zero border's.
+   PoCL's floor is slow: positions start at -1, so cutting off the fraction of position + 1 does the same. */
+RAY_INLINE vi sample_at(const vf g, const float s, const float ahead, const int first, const int last, vf *share)
+{
+    const vf at = min(max(fma(g, (vf)(ahead), (vf)(s)), (float)first - 1.0f), (float)last + 1.0f);
+    const vi whole = min(V_INT(at + 1.0f) - 1, last);
+    *share = at - V_FLOAT(whole);
+    return whole;
+}

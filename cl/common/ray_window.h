@@ -1,0 +1,42 @@
+/* Which pixels may see a box of voxels: how the adjoint finds its cells and pixels without trying all of them. */
+#include "common/ray.h"
+
+typedef struct { vi u_lo, u_hi, v_lo, v_hi; } window_t;
+
+/* narrows [lo, hi] to where (m . p) / depth can be for p in the box; `at` is its value in the middle of the box */
+RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz, const vf dx, const vf dy, const vf dz,
+                             const float4 half_size, const vf widest, const vi ahead, vi *lo, vi *hi)
+{
+    const vf reach = (fabs(mx - at * dx) * half_size.x + fabs(my - at * dy) * half_size.y
+                      + fabs(mz - at * dz) * half_size.z) * widest + 0.01f;
+    const vi from = V_INT(ceil(min(max(at - reach, -1e6f), 1e6f)));
+    const vi to = V_INT(floor(min(max(at + reach, -1e6f), 1e6f)));
+    *lo = VI_PICK(*lo, max(*lo, from), ahead);
+    *hi = VI_PICK(*hi, min(*hi, to), ahead);
+}
+
+/* Pixels that a box of half-size `half_size` about a voxel index `at` may project to in LANES neighbouring cells: a
+   bound and not an estimate, within the detector's columns and each cell's lines. Returns which cells see it.
+   matrix (12, stride) turns a voxel index into u z, v z and z; cell_lines (C, 2); cells from `stop` on do not count. */
+RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global const int *cell_lines, const int width,
+                        const int cell, const int stop, const float4 at, const float4 half_size, window_t *w)
+{
+#define M(k) V_LOAD(matrix + (size_t)(k) * stride + cell)
+    for (int lane = 0; lane < LANES; ++lane) {
+        LANE(int, w->v_lo, lane) = cell_lines[2 * (cell + lane)];
+        LANE(int, w->v_hi, lane) = cell_lines[2 * (cell + lane) + 1] - 1;
+    }
+    w->u_lo = (vi)(0);
+    w->u_hi = (vi)(width - 1);
+    const vf dx = M(8), dy = M(9), dz = M(10);
+    const vf depth = dx * at.x + dy * at.y + dz * at.z + M(11);
+    const vf reach = fabs(dx) * half_size.x + fabs(dy) * half_size.y + fabs(dz) * half_size.z;
+    const vi ahead = depth > reach * 1.001f; /* else the plane of the source cuts the box: no bound */
+    const vf per = 1.0f / V_PICK(1.0f, depth, ahead), widest = 1.0f / V_PICK(1.0f, depth - reach, ahead);
+    window_along((M(0) * at.x + M(1) * at.y + M(2) * at.z + M(3)) * per, M(0), M(1), M(2), dx, dy, dz, half_size,
+                 widest, ahead, &w->u_lo, &w->u_hi);
+    window_along((M(4) * at.x + M(5) * at.y + M(6) * at.z + M(7)) * per, M(4), M(5), M(6), dx, dy, dz, half_size,
+                 widest, ahead, &w->v_lo, &w->v_hi);
+#undef M
+    return (VI_IOTA + cell < stop) & (depth + reach > 0.0f) & (w->u_lo <= w->u_hi) & (w->v_lo <= w->v_hi);
+}

@@ -1,0 +1,244 @@
+"""A scan's projector and its adjoint in one launch each: twins, ⟨Ax, y⟩ = ⟨x, Aᵀy⟩, subsets, repeatable bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import LinearOperator, RayOperator, RayProjector, rays
+from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
+from phyradgs_cl.runtime import Runtime
+
+GRID = Grid((9, 14, 11), (0.21, 0.13, 0.16), (0.1, -0.05, 0.2))
+SHAPE = (13, 18)
+MOTIONS = ("static", "micro-views", "per line", "per line at one time")
+
+
+def noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
+
+
+def tables(
+    motion: str,
+    shape: tuple[int, int] = SHAPE,
+    axis: str = "rows",
+    direction: int = 1,
+    frames: int = 3,
+    source_mm: float = 5.0,
+) -> list[TimeCells]:
+    """Frames around a turn of a detector with an offset that sees a volume of side 2."""
+    pixels_mm = (3.9 / shape[0], 4.1 / shape[1])
+    geometry = ConeGeometry(source_mm, source_mm + 2.5, shape, pixels_mm, (0.1, 0.3))
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.4, 0.9))
+    shutter = Shutter(0.5, 0.4, axis, direction)
+    made = []
+    for frame in range(frames):
+        where = (orbit, shutter, frame, 0.1 + 2.1 * frame, shutter.lines(shape))
+        if motion == "static":
+            made.append(static_cells(*where))
+        elif motion == "micro-views":
+            made.append(micro_view_cells(*where, 5, 2))
+        else:
+            made.append(per_line_cells(*where, 1 if motion == "per line at one time" else 3))
+    return made
+
+
+def mismatch(operator: LinearOperator, seed: int = 71) -> float:
+    """|⟨Ax, y⟩ − ⟨x, Aᵀy⟩| over ⟨Ax, y⟩, and both must be real numbers above zero."""
+    x, y = noise(operator.volume_shape, seed), noise(operator.frames_shape, seed + 1)
+    forward = float(np.vdot(operator.forward(x).astype(np.float64), y))
+    backward = float(np.vdot(operator.adjoint(y).astype(np.float64), x))
+    assert forward > 0 and np.isfinite(backward)
+    return abs(forward - backward) / forward
+
+
+def check_twins(operator: RayOperator) -> None:
+    x, y = noise(operator.volume_shape, 73), noise(operator.frames_shape, 74)
+    grid, cells = operator.grid, operator.tables
+    expected = np.stack([ray_frame(x, grid, table, operator.detector_shape) for table in cells])
+    assert np.abs(operator.forward(x) - expected).max() <= RAYS * expected.max()
+    expected = sum(ray_volume(frame, grid, table) for frame, table in zip(y, cells, strict=True))
+    assert np.abs(operator.adjoint(y) - expected).max() <= RAYS_BACK * expected.max()
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_adjoint_of_every_motion(any_rt, motion, axis, direction) -> None:
+    operator = RayOperator(any_rt, GRID, SHAPE, tables(motion, SHAPE, axis, direction))
+    assert mismatch(operator) <= ADJOINT
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_frames_and_volumes_are_the_twins(any_rt, motion) -> None:
+    check_twins(RayOperator(any_rt, GRID, SHAPE, tables(motion, SHAPE, "columns", -1, frames=2)))
+
+
+@pytest.fixture(scope="module", params=[4, 8])
+def narrow_rt(request: pytest.FixtureRequest) -> Runtime:
+    return Runtime(lanes=request.param)
+
+
+def test_other_vector_widths(narrow_rt) -> None:
+    check_twins(RayOperator(narrow_rt, GRID, SHAPE, tables("micro-views", frames=2)))
+
+
+@pytest.mark.parametrize("motion", ["static", "per line at one time"])
+def test_volumes_of_several_bricks(any_rt, motion) -> None:
+    """Samples between two owners count once; vectors of rays with two main axes; a detector of several vectors."""
+    grid, shape = Grid((17, 70, 37), (0.11, 0.03, 0.05), (0.05, 0.1, -0.1)), (7, 37)
+    operator = RayOperator(any_rt, grid, shape, tables(motion, shape, frames=2))
+    check_twins(operator)
+    assert mismatch(operator) <= ADJOINT
+
+
+def pointing(axis: int) -> TimeCells:
+    """A source before the volume on one axis, and the detector behind: all rays have this main axis."""
+    along, b, c = np.eye(3)[[axis, (axis + 1) % 3, (axis + 2) % 3]]
+    pose = np.concatenate([6 * along + 0.1 * b, -3 * along - 1.2 * b - c, 0.2 * b, 0.2 * c])
+    one = np.ones(1)
+    return TimeCells(pose[None], 0 * one, np.array([0]), np.array([SHAPE[0]]), one, SHAPE[0])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rays_along_each_axis(rt, axis) -> None:
+    operator = RayOperator(rt, GRID, SHAPE, [pointing(axis)])
+    check_twins(operator)
+    assert mismatch(operator) <= ADJOINT
+
+
+@pytest.mark.parametrize("source_mm", [0.4, 0.9, 1.3])
+@pytest.mark.parametrize("motion", ["static", "micro-views"])
+def test_source_inside_or_close_to_the_volume(any_rt, motion, source_mm) -> None:
+    """Planes behind the source do not count, and no bound exists for bricks that its plane cuts."""
+    operator = RayOperator(any_rt, Grid.cube(26, 2.0), SHAPE, tables(motion, frames=2, source_mm=source_mm))
+    assert mismatch(operator) <= ADJOINT
+    check_twins(operator.subset([1]))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (17, 5), (31, 27)])
+def test_odd_detectors(rt, shape) -> None:
+    assert mismatch(RayOperator(rt, GRID, shape, tables("micro-views", shape))) <= ADJOINT
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 16, 1), (3, 1, 33), (24, 25, 24)])
+def test_odd_volumes(any_rt, shape) -> None:
+    grid = Grid(shape, (0.9, 0.11, 0.13))
+    assert mismatch(RayOperator(any_rt, grid, SHAPE, tables("per line"))) <= ADJOINT
+
+
+def test_volume_that_the_detector_does_not_see(rt) -> None:
+    far = Grid((4, 5, 6), (0.1, 0.1, 0.1), (3.0, 0.0, 0.0))
+    operator = RayOperator(rt, far, SHAPE, tables("micro-views"))
+    assert not operator.forward(noise(far.shape, 75)).any()
+    assert not operator.adjoint(noise(operator.frames_shape, 76)).any()
+
+
+def test_lines_without_cells_are_zero_and_give_nothing(rt) -> None:
+    """Tables need not be complete; the lines between cells stay empty in both directions."""
+    whole = tables("per line", frames=1)[0]
+    keep = (whole.line_start < 3) | (whole.line_start > 7)
+    parts = {n: getattr(whole, n)[keep] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
+    operator = RayOperator(rt, GRID, SHAPE, [replace(whole, **parts)])
+    check_twins(operator)
+    assert not operator.forward(noise(GRID.shape, 77))[0, 3:8].any()
+
+
+def test_one_launch_is_the_frames_one_by_one(rt) -> None:
+    cells, volume = tables("micro-views", frames=4), noise(GRID.shape, 78)
+    projector = RayProjector(rt, GRID, SHAPE)
+    on_device = projector.upload_volume(volume)
+    singles = np.stack([projector.forward(on_device, table) for table in cells])
+    np.testing.assert_array_equal(RayOperator(rt, GRID, SHAPE, cells).forward(volume), singles)
+
+
+def test_bits_repeat(any_rt) -> None:
+    operator = RayOperator(any_rt, GRID, SHAPE, tables("per line"))
+    x, y = noise(GRID.shape, 79), noise(operator.frames_shape, 80)
+    np.testing.assert_array_equal(operator.forward(x), operator.forward(x))
+    np.testing.assert_array_equal(operator.adjoint(y), operator.adjoint(y))
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_subsets_are_rows_of_the_operator(rt, axis) -> None:
+    operator = RayOperator(rt, GRID, SHAPE, tables("micro-views", axis=axis, frames=4))
+    x, y = noise(GRID.shape, 81), noise(operator.frames_shape, 82)
+    frames = operator.forward(x)
+    part = operator.subset([3, 0])
+    assert part.frames_shape == (2, *SHAPE) and part.volume_shape == GRID.shape
+    np.testing.assert_array_equal(part.forward(x), frames[[3, 0]])
+    np.testing.assert_array_equal(part.subset([1]).forward(x), frames[:1])
+    only = np.where(np.isin(np.arange(4), [0, 3])[:, None, None], y, 0)
+    np.testing.assert_allclose(part.adjoint(y[[3, 0]]), operator.adjoint(only), rtol=FLOAT32, atol=1e-6)
+    np.testing.assert_array_equal(operator.forward(x), frames)
+
+
+def test_stacks_larger_than_an_allocation(rt, monkeypatch) -> None:
+    cells = tables("micro-views", frames=5)
+    whole = RayOperator(rt, GRID, SHAPE, cells)
+    x, y = noise(GRID.shape, 83), noise(whole.frames_shape, 84)
+    monkeypatch.setattr(rt, "device", replace(rt.device, largest_allocation_bytes=12_000))
+    parts = RayOperator(rt, GRID, SHAPE, cells)
+    monkeypatch.undo()
+    assert 1 < len(parts._batches) < 5
+    np.testing.assert_array_equal(parts.forward(x), whole.forward(x))
+    np.testing.assert_allclose(parts.adjoint(y), whole.adjoint(y), rtol=FLOAT32)
+
+
+def test_indices_of_64_bits(any_rt, monkeypatch) -> None:
+    """What volumes of 2^31 floats need; bit for bit the same on a small one."""
+    operator = RayOperator(any_rt, GRID, SHAPE, tables("micro-views"))
+    x, y = noise(GRID.shape, 85), noise(operator.frames_shape, 86)
+    short = operator.forward(x), operator.adjoint(y)
+    monkeypatch.setattr(rays, "_LONG_FROM", 0)
+    np.testing.assert_allclose(operator.forward(x), short[0], rtol=FLOAT32)
+    np.testing.assert_allclose(operator.adjoint(y), short[1], rtol=FLOAT32, atol=1e-6)
+
+
+def test_bricks_for_little_local_memory(rt, monkeypatch) -> None:
+    grid = Grid((17, 33, 27), (0.11, 0.06, 0.07))
+    operator = RayOperator(rt, grid, SHAPE, tables("micro-views"))
+    y = noise(operator.frames_shape, 89)
+    usual = operator.adjoint(y)
+    monkeypatch.setattr(rays, "_BRICK", (10**6, 1, 1))
+    np.testing.assert_allclose(operator.adjoint(y), usual, rtol=FLOAT32, atol=1e-6)
+
+
+def test_cells_that_serve_a_line() -> None:
+    """Sorted by first line, but of any length, with gaps and with lines that nothing serves."""
+    ranges = np.array([[1, 2], [1, 9], [2, 3], [4, 6], [10, 12], [10, 11]])
+    served = rays.serving(ranges, 14)
+    for line, (first, stop) in enumerate(served):
+        inside = np.flatnonzero((ranges[:, 0] <= line) & (line < ranges[:, 1]))
+        assert all(first <= cell < stop for cell in inside)
+    assert served[0, 0] >= served[0, 1] and served[13, 0] >= served[13, 1]
+
+
+def test_other_arrays_than_float32_in_c_order(rt) -> None:
+    operator = RayOperator(rt, GRID, SHAPE, tables("static"))
+    x, y = noise(GRID.shape, 87), noise(operator.frames_shape, 88)
+    turned = np.asfortranarray(x.astype(np.float64))
+    np.testing.assert_array_equal(operator.forward(turned), operator.forward(x))
+    np.testing.assert_array_equal(operator.adjoint(np.asfortranarray(y)), operator.adjoint(y))
+
+
+def test_refusals(rt) -> None:
+    cells = tables("static")
+    operator = RayOperator(rt, GRID, SHAPE, cells)
+    with pytest.raises(InputError, match="volume"):
+        operator.forward(np.zeros((9, 14, 12), np.float32))
+    with pytest.raises(InputError, match="frames"):
+        operator.adjoint(np.zeros((2, *SHAPE), np.float32))
+    with pytest.raises(InputError, match="subset"):
+        operator.subset([])
+    with pytest.raises(InputError, match="tables"):
+        RayOperator(rt, GRID, SHAPE, [])
+    with pytest.raises(InputError, match="frame 3"):
+        RayOperator(rt, GRID, SHAPE, [*cells, *tables("static", axis="columns")])
