@@ -145,6 +145,8 @@ def test_errors_about_motion_offer_what_the_method_has(method) -> None:
 @pytest.mark.parametrize("key", ["strips", "sub_intervals"])
 def test_counts_belong_to_the_motions_that_have_them(method, key) -> None:
     having = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}}[key]
+    if method == "fdk":  # one pose a line
+        having = set()
     for name in motions_of(method):
         changes = {"motion": name, key: 3}
         if name in having:
