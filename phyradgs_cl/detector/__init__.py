@@ -9,6 +9,7 @@ from phyradgs_cl.detector.noise import (
     tigre_counts,
     tigre_noise,
 )
+from phyradgs_cl.detector.noise_level import noise_level
 
 __all__ = [
     "attenuation_to_counts",
@@ -16,6 +17,7 @@ __all__ = [
     "beer_lambert_counts",
     "beer_lambert_noise",
     "counts_to_attenuation",
+    "noise_level",
     "sample_counts",
     "tigre_counts",
     "tigre_noise",

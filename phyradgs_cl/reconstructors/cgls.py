@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector import noise_level
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.iterative import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.result import (
@@ -22,13 +24,19 @@ from phyradgs_cl.runtime import Runtime
 
 @dataclass(frozen=True)
 class CglsOptions(IterativeOptions):
-    """CGLS is linear in the measurement: there is no ``nonnegative``."""
+    """CGLS does not clip: there is no ``nonnegative``.
+
+    noise_stop: the run ends when the residual falls to this many times the noise of the measurement, which is estimated
+    from it (discrepancy principle, Morozov 1966); below it CGLS fits the noise. 0 runs all iterations.
+    """
 
     iterations: int = 60
     nonnegative: bool = False
+    noise_stop: float = 1.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        checks.within("noise_stop", self.noise_stop, 0, 1e6)
         if self.nonnegative:
             raise InputError("nonnegative", "true", "false for --method cgls", "use sirt or fista-tv")
 
@@ -43,14 +51,23 @@ def cgls(
     resume: State | None = None,
 ) -> Reconstruction:
     """The least-squares volume of a scan in 1/mm, as far as the iterations get. CGLS draws nothing from ``seed``."""
-    return run_iterations("cgls", Cgls, scan, options, rt, report, resume)
+
+    def make(system: System) -> Cgls:
+        pixels = system.measured.size if system.valid is None else np.count_nonzero(system.valid)
+        noise = noise_level(system.measured, system.valid) * np.sqrt(pixels)
+        return Cgls(system, options.noise_stop * noise)
+
+    return run_iterations("cgls", make, scan, options, rt, report, resume)
 
 
 class Cgls:
-    """min ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0; the residual that is reported is the new one."""
+    """min ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0, until the residual's norm is ``enough`` or less.
 
-    def __init__(self, system: System) -> None:
-        self.system = system
+    The residual that is reported is the new one.
+    """
+
+    def __init__(self, system: System, enough: float = 0.0) -> None:
+        self.system, self.enough = system, enough
         self.volume = np.zeros(system.operator.volume_shape, np.float32)
         self.finished: str | None = None
         self.residual = system.measured.astype(np.float32)
@@ -70,7 +87,10 @@ class Cgls:
         gamma = inner(gradient, gradient)
         self.direction = gradient + np.float32(gamma / self.gamma) * self.direction
         self.gamma = gamma
-        return norm(self.residual)
+        length = norm(self.residual)
+        if length <= self.enough:
+            self.finished = "residual as small as the noise"
+        return length
 
     def state(self) -> dict[str, np.ndarray]:
         return {

@@ -155,6 +155,16 @@ def test_cgls_reaches_lsqr(noise) -> None:
     assert norm(algorithm.volume.ravel() - expected) <= KRYLOV * norm(expected)
 
 
+def test_cgls_stops_at_the_noise() -> None:
+    system, _, truth = dense_system(noise=0.3)
+    noise = norm(system.measured - system.operator.forward(truth))
+    algorithm = Cgls(system, enough=noise)
+    residuals = []
+    while not algorithm.finished:
+        residuals.append(algorithm.step())
+    assert residuals[-1] <= noise < residuals[-2]
+
+
 def test_cgls_of_nothing_is_finished_at_once() -> None:
     system, _, _ = dense_system()
     algorithm = Cgls(replace(system, measured=np.zeros(FRAMES)))
@@ -276,9 +286,11 @@ def test_record_and_facts(rt, fly_scan, method) -> None:
 
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_an_interrupted_run_goes_on_with_the_same_bits(rt, fly_scan, method) -> None:
-    changes = (
-        {"iterations": 6} if method in ("sirt", "cgls", "fista-tv") else {"iterations": 6, "order": "random"}
-    )
+    changes: dict[str, object] = {"iterations": 6}
+    if method == "cgls":
+        changes["noise_stop"] = 0
+    if method in ("sart", "os-sart", "asd-pocs"):
+        changes["order"] = "random"
     options = method_options(method, None, changes)
 
     def stop(progress: Progress) -> None:
@@ -293,6 +305,16 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(rt, fly_scan, method) -> 
     assert rest.record[0]["iteration"] == 4
     with pytest.raises(InputError, match="checkpoint"):
         reconstruct(fly_scan, method, rt, options, resume={"iteration": np.array(3)})
+
+
+def test_cgls_of_a_noisy_scan_stops_before_it_fits_the_noise(rt, fly_scan) -> None:
+    peak = float(fly_scan.reference.max())
+    stopped, whole = (
+        run(rt, fly_scan, "cgls", motion="per-row", iterations=60, noise_stop=factor) for factor in (1.1, 0.0)
+    )
+    assert stopped.facts["stopped_by"] == "residual as small as the noise"
+    assert whole.facts["iterations"] == 60
+    assert psnr(stopped.volume, fly_scan.reference, peak) > psnr(whole.volume, fly_scan.reference, peak) + 1
 
 
 def test_a_small_change_ends_the_run(rt, fly_scan) -> None:
@@ -336,6 +358,7 @@ def test_units_do_not_matter(rt, fly_scan, method) -> None:
         ("sirt", {"relaxation": -1.0}, "relaxation"),
         ("cgls", {"nonnegative": True}, "nonnegative"),
         ("cgls", {"iterations": -1}, "iterations"),
+        ("cgls", {"noise_stop": -1.0}, "noise_stop"),
         ("asd-pocs", {"tv_share": -0.1}, "tv_share"),
         ("fista-tv", {"tv_weight": float("nan")}, "tv_weight"),
         ("fista-tv", {"tolerance": 2.0}, "tolerance"),

@@ -1,0 +1,38 @@
+"""How noisy line integrals are, estimated from themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Median of |x| over the standard deviation of a normal x, and the norm of the filter (-1/2, 1, -1/2).
+_MEDIAN_OF_NORMAL, _FILTER_NORM = 0.6745, 1.5**0.5
+_LARGEST_SAMPLE = 1_000_000
+
+
+def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
+    """Standard deviation of the noise of a pixel behind the object, dimensionless.
+
+    From the median of |second differences| along rows, where an object is seen (values above 0): structure is smooth
+    beside white noise, and a median does not mind edges (Donoho and Johnstone, Biometrika 81 (1994) 425, for the idea).
+    Structure that is as fine as a pixel raises the estimate, noise that is correlated along rows lowers it.
+
+    Args:
+        line_integrals: (F, v, u).
+        valid: (F, v, u), False where a value must not be used; None: all may be.
+
+    Returns:
+        0 where nothing can be told: fewer than three columns, or nothing above 0.
+    """
+    if line_integrals.shape[-1] < 3:
+        return 0.0
+    left, middle, right = line_integrals[..., :-2], line_integrals[..., 1:-1], line_integrals[..., 2:]
+    usable = middle > 0
+    if valid is not None:
+        usable = usable & valid[..., :-2] & valid[..., 1:-1] & valid[..., 2:]
+    chosen = np.flatnonzero(usable)
+    chosen = chosen[:: max(1, chosen.size // _LARGEST_SAMPLE)]
+    if chosen.size == 0:
+        return 0.0
+    second = middle.ravel()[chosen] - 0.5 * (left.ravel()[chosen] + right.ravel()[chosen])
+    return float(np.median(np.abs(second))) / (_MEDIAN_OF_NORMAL * _FILTER_NORM)
