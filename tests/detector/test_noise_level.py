@@ -9,9 +9,9 @@ from phyradgs_cl.detector import noise_level
 
 
 def smooth_frames(noise: float, seed: int = 0) -> np.ndarray:
-    """A dome of height 1 over 64 columns, and air around it."""
-    u = np.linspace(-1.5, 1.5, 96)
-    dome = np.sqrt(np.maximum(1 - u**2, 0)) * np.ones((5, 40, 1))
+    """A dome of height 1 over 160 columns, and air around it."""
+    u = np.linspace(-1.2, 1.2, 192)
+    dome = np.maximum(1 - u**2, 0) ** 2 * np.ones((5, 40, 1))
     return (dome + noise * (dome > 0) * np.random.default_rng(seed).normal(size=dome.shape)).astype(
         np.float32
     )
