@@ -309,8 +309,11 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(rt, fly_scan, method) -> 
 
 def test_cgls_of_a_noisy_scan_stops_before_it_fits_the_noise(rt, fly_scan) -> None:
     peak = float(fly_scan.reference.max())
+    rng = np.random.default_rng(0)
+    noisy = fly_scan.projections + 0.15 * rng.standard_normal(fly_scan.projections.shape, np.float32)
+    scan = replace(fly_scan, projections=noisy)
     stopped, whole = (
-        run(rt, fly_scan, "cgls", motion="per-row", iterations=60, noise_stop=factor) for factor in (1.1, 0.0)
+        run(rt, scan, "cgls", motion="per-row", iterations=60, noise_stop=factor) for factor in (1.1, 0.0)
     )
     assert stopped.facts["stopped_by"] == "residual as small as the noise"
     assert whole.facts["iterations"] == 60
