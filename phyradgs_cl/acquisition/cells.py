@@ -96,8 +96,9 @@ def per_line_cells(
     """
     if samples < 1:
         raise InputError("time samples", str(samples), "at least 1")
-    exposure_s = (np.arange(samples) + 0.5) / samples * shutter.exposure_s
-    times = (start_s + shutter.delay_s(lines)[:, None] + exposure_s).ravel()
+    opens_s, closes_s = shutter.line_windows_s(lines).T
+    share = (np.arange(samples) + 0.5) / samples
+    times = (start_s + opens_s[:, None] + share * (closes_s - opens_s)[:, None]).ravel()
     line = np.repeat(np.arange(lines), samples)
     weight = np.full(times.size, 1.0 / samples)
     return _table(trajectory, shutter, frame, times, line, line + 1, weight, lines)

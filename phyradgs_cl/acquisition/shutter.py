@@ -51,6 +51,11 @@ class Shutter:
         order = np.arange(lines) if self.direction > 0 else np.arange(lines)[::-1]
         return order / max(lines - 1, 1) * self.readout_s
 
+    def line_windows_s(self, lines: int) -> np.ndarray:
+        """(lines, 2): when every line index opens and closes, in seconds after the frame's start."""
+        delay = self.delay_s(lines)
+        return np.stack([delay, delay + self.exposure_s], -1)
+
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
         """Line ranges [start, stop) of the strips, in the order in which they are read; may be empty.
 
