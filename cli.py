@@ -32,7 +32,7 @@ from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.reconstructors.interrupt import InterruptedAfterwards
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device, list_devices
 from phyradgs_cl.runtime.context import default_lanes
-from phyradgs_cl.settings import device_wish, file_parser, offset_pair, run_settings
+from phyradgs_cl.settings import device_wish, file_parser, offset_pair, pulse_pair, run_settings
 from phyradgs_cl.simulation import SimulationOptions
 from phyradgs_cl.workflow import (
     ReconstructionJob,
@@ -114,6 +114,7 @@ class MotionName(str, Enum):
     static_start = "static-start"
     micro_views = "micro-views"
     per_row = "per-row"
+    exact = "exact"
 
 
 def file_option(*names: str, help: str, show_default: bool | str = True) -> Any:
@@ -176,6 +177,21 @@ def simulate_command(
     ] = None,
     readout_direction: Annotated[
         int | None, typer.Option(help="1 reads index 0 first, -1 last.", show_default="scanner's")
+    ] = None,
+    pulse: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START,LENGTH",
+            help="When the beam is on, after a frame's start, in shares of the exposure.",
+            show_default="scanner's: always on",
+        ),
+    ] = None,
+    lag: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of a recorded frame that comes from the frames before, 0 to 0.9.",
+            show_default="scanner's: 0",
+        ),
     ] = None,
     detector_model: Annotated[
         DetectorModel,
@@ -245,6 +261,7 @@ def simulate_command(
             views=views,
             exposure_deg=exposure_deg,
             readout_ratio=readout_ratio,
+            pulse=pulse_pair("--pulse", pulse),
             start_deg=start_deg,
         ),
         readout_axis=readout_axis or described.readout_axis,
@@ -255,6 +272,7 @@ def simulate_command(
         dose=dose,
         electronic_noise=electronic_noise,
         jitter_deg=0.0 if jitter_deg is None else jitter_deg,
+        lag=described.lag if lag is None else lag,
         time_samples=time_samples,
         seed=seed,
     )
@@ -284,7 +302,8 @@ def reconstruct_command(
         MotionName | None,
         typer.Option(
             help="How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
-            "or every line at its own times (per-row); not every method has all of them.",
+            "every line at its own times (per-row), or splats that move while lines integrate (exact); "
+            "not every method has all of them.",
             show_default="micro-views for phyradgs, else static",
         ),
     ] = None,
@@ -293,6 +312,16 @@ def reconstruct_command(
     ] = None,
     sub_intervals: Annotated[
         int | None, typer.Option(help="Sub-intervals N of an exposure (motion blur).", show_default="5")
+    ] = None,
+    segments: Annotated[
+        int | None,
+        typer.Option(help="Segments of a frame (motion exact); 0: by the time error.", show_default="0"),
+    ] = None,
+    time_error: Annotated[
+        float | None,
+        typer.Option(
+            help="Relative error that averaging over time may leave (motion exact).", show_default="0.005"
+        ),
     ] = None,
     iterations: Annotated[
         int | None,
@@ -331,6 +360,20 @@ def reconstruct_command(
             "Docs: methods.md.",
         ),
     ] = None,
+    detector_model: Annotated[
+        DetectorModel | None,
+        typer.Option(
+            help="What is averaged over an exposure: line integrals (log) or intensity; iterative methods.",
+            show_default="the scan's",
+        ),
+    ] = None,
+    ignore_lag: Annotated[
+        bool, typer.Option("--ignore-lag", help="Leave the lag that the scan file states in the frames.")
+    ] = False,
+    median_filter: Annotated[
+        int | None,
+        typer.Option(help="Median filter of the frames: 3 or 5 pixels a side, 0 none.", show_default="0"),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoint of an interrupted run.")
     ] = False,
@@ -342,10 +385,15 @@ def reconstruct_command(
         "motion": motion.value if motion else None,
         "strips": strips,
         "sub_intervals": sub_intervals,
+        "segments": segments,
+        "time_error": time_error,
         "iterations": iterations,
         "gaussians": gaussians,
         "seed": seed,
         "preset": preset,
+        "detector_model": detector_model.value if detector_model else None,
+        "ignore_lag": True if ignore_lag else None,
+        "median_filter": median_filter,
         "device": device,
     }
     settings = run_settings(config, given, assignments or [])
@@ -358,6 +406,7 @@ def reconstruct_command(
         changes=settings.changes,
         resume=resume,
         config=config,
+        before=settings.before,
     )
     with Ticker("iteration") as ticker:
         result, metrics = run_reconstruction(job, lambda: Runtime(settings.device), ticker.progress)

@@ -1,4 +1,4 @@
-/* L1 + D-SSIM of one frame and its gradient, as separable passes over images with zero padding:
+/* L1 + transmission-weighted squares + D-SSIM of one frame and its gradient, as separable passes over images with zero padding:
    guard floats, then (lines, pitch), pitch at least width + guard and everything past width zero, so that
    a window may reach past either end of a line. Twin: objective/image_terms.py. */
 #include "common/lanes.h"
@@ -43,14 +43,16 @@ __kernel void ssim_map(
     __global const float *moments, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,
     const int lines, const int width, const int pitch, const float c1, const float c2,
+    __global const float *transmission, /* read only if use_transmission */
+    const int use_transmission,
     __global float *partials,        /* 3 images */
-    __global float *line_sums)       /* (lines, 4): ssim, |x - y|, masked pixels, 0 */
+    __global float *line_sums)       /* (lines, 4): ssim, |x - y|, masked pixels, transmission (x - y)^2 */
 {
     const int v = (int)get_global_id(0);
     if (v >= lines)
         return;
     const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
-    vf ssim_sum = (vf)(0.0f), l1_sum = ssim_sum, pixels = ssim_sum;
+    vf ssim_sum = (vf)(0.0f), l1_sum = ssim_sum, pixels = ssim_sum, squares = ssim_sum;
     for (int u = 0; u < width; u += LANES) {
         const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
         vf m[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
@@ -73,13 +75,16 @@ __kernel void ssim_map(
         V_STORE(V_PICK(0.0f, by_xy, inside), partials + 2 * image + at);
         const vf weight = V_LOAD(mask + at);
         ssim_sum += V_PICK(0.0f, ssim, inside);
-        l1_sum += weight * fabs(V_LOAD(rendered + at) - V_LOAD(measured + at));
+        const vf difference = V_LOAD(rendered + at) - V_LOAD(measured + at);
+        l1_sum += weight * fabs(difference);
+        if (use_transmission)
+            squares += weight * V_LOAD(transmission + at) * difference * difference;
         pixels += weight;
     }
     line_sums[4 * v] = v_sum(ssim_sum);
     line_sums[4 * v + 1] = v_sum(l1_sum);
     line_sums[4 * v + 2] = v_sum(pixels);
-    line_sums[4 * v + 3] = 0.0f;
+    line_sums[4 * v + 3] = v_sum(squares);
 }
 
 /* rows pass of the three derivative images */
@@ -99,11 +104,13 @@ __kernel void ssim_spread(
     }
 }
 
-/* columns pass, and the gradient l1_weight sign(x - y) - ssim_weight dSSIM/dx */
+/* columns pass, and the gradient l1_weight sign(x - y) + poisson_weight transmission (x - y) - ssim_weight dSSIM/dx */
 __kernel void image_gradient(
     __global const float *spread, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,
     const int lines, const int width, const int pitch, const float l1_weight, const float ssim_weight,
+    __global const float *transmission, /* read only if poisson_weight is not 0 */
+    const float poisson_weight,
     __global float *gradient)        /* guard, then (lines, pitch) */
 {
     const int v = (int)get_global_id(0);
@@ -126,6 +133,9 @@ __kernel void image_gradient(
         const vf by_ssim = m[0] + 2.0f * weight * x * m[1] + weight * y * m[2];
         const vf difference = x - y;
         const vf sign_of = V_PICK(V_PICK(0.0f, -1.0f, difference < 0.0f), 1.0f, difference > 0.0f);
-        V_STORE(weight * (l1_weight * sign_of - ssim_weight * by_ssim), gradient + at);
+        vf by_data = l1_weight * sign_of;
+        if (poisson_weight != 0.0f)
+            by_data += poisson_weight * V_LOAD(transmission + at) * difference;
+        V_STORE(weight * (by_data - ssim_weight * by_ssim), gradient + at);
     }
 }

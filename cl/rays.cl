@@ -4,6 +4,10 @@
 #include "common/ray.h"
 #include "common/ray_window.h"
 
+#define AVERAGE_LOG 0       /* sum of w p */
+#define AVERAGE_INTENSITY 1 /* -log of the sum of w exp(-p) */
+#define AVERAGE_GAP 2       /* the first less the second, from differences between cells: no cancellation */
+
 __kernel void rays_forward(
     __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
     __global const float *cells,      /* (C, RAY_CELL), frame after frame */
@@ -12,7 +16,7 @@ __kernel void rays_forward(
     __global const int *frame_list,   /* which frames */
     const int4 shape, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int intensity,              /* average transmitted intensity instead of line integrals */
+    const int average,                /* of a line's cells: AVERAGE_... */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);
@@ -22,7 +26,9 @@ __kernel void rays_forward(
     __global const float *body = volume + IMAGE_GUARD + (sy + sz) * BORDER;
     const size_t line = (size_t)frame_list[n] * lines + v;
     const vi real = VI_IOTA + u < width;
-    vf total = (vf)(0.0f);
+    vf total = (vf)(0.0f);            /* of w p, or of w (p - first) */
+    vf light = (vf)(0.0f), first = (vf)(0.0f); /* of w (exp(first - p) - 1), with p of the line's first cell */
+    int any = 0;
     for (int c = line_cells[2 * line]; c < line_cells[2 * line + 1]; ++c) {
         if (v < cell_lines[2 * c] || v >= cell_lines[2 * c + 1])
             continue;
@@ -53,10 +59,19 @@ __kernel void rays_forward(
             }
         }
         p *= r.step_mm;
-        total += cell[RAY_WEIGHT] * (intensity ? exp(-p) : p);
+        if (average == AVERAGE_LOG) {
+            total += cell[RAY_WEIGHT] * p;
+            continue;
+        }
+        first = any ? first : p;
+        any = 1;
+        total += cell[RAY_WEIGHT] * (p - first);
+        light += cell[RAY_WEIGHT] * expm1(min(first - p, 80.0f)); /* 80: finite in float32 */
     }
-    if (intensity)
-        total = -log(max(total, 1e-37f));
+    if (average != AVERAGE_LOG && any) {
+        const vf brighter = log1p(max(light, -0.9999999f));
+        total = average == AVERAGE_GAP ? total + brighter : first - brighter;
+    }
     V_STORE(V_PICK(0.0f, total, real), image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u);
 }
 

@@ -4,12 +4,33 @@
 #include "common/gradient.h"
 #include "common/splat.h"
 
+#define SUMS 16
+#if MOVING
+#define SUM_COUNT 12
+#define TURNED 4 /* what the record keeps of S: (along, across) by (u, v) */
+#define POSES 3
+#else
+#define SUM_COUNT 10
+#define TURNED 0
+#define POSES 1
+#endif
+
+/* from the gradient by (u0, v0) and by the depth z to that by the mean: u0 = (row 0 . x) / z, v0 = (row 1 . x) / z */
+inline void add_by_centre(v3 *by_mean, __global const coefficient *m, const vf u0, const vf v0, const vf inv_z,
+                          const vf by_u0, const vf by_v0, const vf by_z)
+{
+    const vf cu = by_u0 * inv_z, cv = by_v0 * inv_z, cz = by_z - cu * u0 - cv * v0;
+    by_mean->x += cu * COEFFICIENT(m[0]) + cv * COEFFICIENT(m[4]) + cz * COEFFICIENT(m[8]);
+    by_mean->y += cu * COEFFICIENT(m[1]) + cv * COEFFICIENT(m[5]) + cz * COEFFICIENT(m[9]);
+    by_mean->z += cu * COEFFICIENT(m[2]) + cv * COEFFICIENT(m[6]) + cz * COEFFICIENT(m[10]);
+}
+
 __kernel void splat_chain(
     __global const float *gaussians,      /* (11, stride) */
     __global const float *cells,          /* (C, CELL) */
-    __global const coefficient *matrices, /* (C, 12) */
+    __global const coefficient *matrices, /* (C, POSES, 12) */
     __global const float *records,        /* (stride, C, RECORD) */
-    __global const float *sums,           /* (stride, C, RECORD) */
+    __global const float *sums,           /* (stride, C, SUMS) */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
     __global float *gradients)            /* (13, stride) */
@@ -32,26 +53,47 @@ __kernel void splat_chain(
     vf by_log_density = zero, by_u0 = zero, by_v0 = zero;
 
     for (int c = 0; c < cell_count; ++c) {
-        float fields[10 * LANES];
+        float fields[(SUM_COUNT + TURNED) * LANES];
         int drawn = 0;
         for (int lane = 0; lane < LANES; ++lane) {
-            const size_t at = ((size_t)(first + lane) * cell_count + c) * RECORD;
-            __global const int *whole = (__global const int *)(records + at);
+            const size_t at = (size_t)(first + lane) * cell_count + c;
+            __global const float *rec = records + at * RECORD;
+            __global const int *whole = (__global const int *)rec;
             const int here = first + lane < count && whole[REC_V_HI] >= whole[REC_V_LO];
             drawn |= here;
-            for (int f = 0; f < 10; ++f)
-                fields[f * LANES + lane] = here ? sums[at + f] : 0.0f;
+            for (int f = 0; f < SUM_COUNT; ++f)
+                fields[f * LANES + lane] = here ? sums[at * SUMS + f] : 0.0f;
+#if MOVING
+            fields[12 * LANES + lane] = here ? rec[REC_ALONG_U] : 1.0f;
+            fields[13 * LANES + lane] = here ? rec[REC_ALONG_V] : 0.0f;
+            fields[14 * LANES + lane] = here ? rec[REC_ACROSS_U] : 0.0f;
+            fields[15 * LANES + lane] = here ? rec[REC_ACROSS_V] : 1.0f;
+#endif
         }
         if (!drawn)
             continue;
         const vf w = V_LOAD(fields), by_ik = V_LOAD(fields + LANES);
+#if MOVING
+        /* by S: with (along, across) = V D, D D' = V^-1 (..)(..)' V^-T */
+        const vf zz = V_LOAD(fields + 2 * LANES), zc = V_LOAD(fields + 3 * LANES), cc = V_LOAD(fields + 4 * LANES);
+        const vf along_u = V_LOAD(fields + 12 * LANES), along_v = V_LOAD(fields + 13 * LANES);
+        const vf across_u = V_LOAD(fields + 14 * LANES), across_v = V_LOAD(fields + 15 * LANES);
+        const vf per = 1.0f / (along_u * across_v - along_v * across_u);
+        const vf uz = across_v * per, uc = -along_v * per, vz = -across_u * per, vc = along_u * per;
+        const vf s_uu = uz * (uz * zz + 2.0f * uc * zc) + uc * uc * cc;
+        const vf s_uv = 2.0f * (uz * (vz * zz + vc * zc) + uc * (vz * zc + vc * cc));
+        const vf s_vv = vz * (vz * zz + 2.0f * vc * zc) + vc * vc * cc;
+        const vf s_z = V_LOAD(fields + 5 * LANES), s_c = V_LOAD(fields + 6 * LANES);
+        const vf s_tz = V_LOAD(fields + 10 * LANES), s_tc = V_LOAD(fields + 11 * LANES);
+#else
         const vf s_uu = V_LOAD(fields + 2 * LANES), s_uv = 2.0f * V_LOAD(fields + 3 * LANES);
         const vf s_vv = V_LOAD(fields + 4 * LANES);
         const vf s_u = V_LOAD(fields + 5 * LANES), s_v = V_LOAD(fields + 6 * LANES);
+#endif
         const vf s_b = V_LOAD(fields + 7 * LANES), by_b1 = V_LOAD(fields + 8 * LANES), by_b2 = V_LOAD(fields + 9 * LANES);
 
         __global const float *cell = cells + c * CELL;
-        __global const coefficient *m = matrices + c * 12;
+        __global const coefficient *m = matrices + c * POSES * 12;
         const vf z = wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z));
         const vf inv_z = 1.0f / z;
         const vf u0 = wide_value(wide_dot(m, mean.x, mean.y, mean.z)) * inv_z;
@@ -103,20 +145,36 @@ __kernel void splat_chain(
         by_ray = v3_add(by_ray, by_white_s);
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
 
+#if MOVING
+        const vf g_u0 = -(2.0f * (along_u * s_z + across_u * s_c) + b1 * s_b);
+        const vf g_v0 = -(2.0f * (along_v * s_z + across_v * s_c) + b2 * s_b);
+#else
         const vf g_u0 = -(2.0f * (s11 * s_u + s12 * s_v) + b1 * s_b);
         const vf g_v0 = -(2.0f * (s12 * s_u + s22 * s_v) + b2 * s_b);
+#endif
         torque = v3_add(torque, v3_add(v3_cross(by_ray, ray), v3_add(v3_cross(by_eu, eu), v3_cross(by_ev, ev))));
         by_scale = v3_add(by_scale, by_s);
         by_log_density += w;
         by_u0 += g_u0;
         by_v0 += g_v0;
 
-        /* u0 = (row 0 . x) / z, v0 = (row 1 . x) / z, z = row 2 . x */
-        const vf cu = g_u0 * inv_z, cv = g_v0 * inv_z, cz = by_z - cu * u0 - cv * v0;
-        const v3 world = to_world(axes, by_ray);
-        by_mean.x += world.x + cu * COEFFICIENT(m[0]) + cv * COEFFICIENT(m[4]) + cz * COEFFICIENT(m[8]);
-        by_mean.y += world.y + cu * COEFFICIENT(m[1]) + cv * COEFFICIENT(m[5]) + cz * COEFFICIENT(m[9]);
-        by_mean.z += world.z + cu * COEFFICIENT(m[2]) + cv * COEFFICIENT(m[6]) + cz * COEFFICIENT(m[10]);
+        by_mean = v3_add(by_mean, to_world(axes, by_ray));
+#if MOVING
+        /* the centre is the mean of the path's parabola, (end 0 + 4 middle + end 1) / 6; the path end 1 - end 0 */
+        add_by_centre(&by_mean, m, u0, v0, inv_z, 0.66666666667f * g_u0, 0.66666666667f * g_v0, by_z);
+        const vf g_path_u = -2.0f * (along_u * s_tz + across_u * s_tc);
+        const vf g_path_v = -2.0f * (along_v * s_tz + across_v * s_tc);
+        for (int end = 0; end < 2; ++end) {
+            __global const coefficient *n = m + 12 * (end + 1);
+            const float sign = end ? 1.0f : -1.0f;
+            const vf inv = 1.0f / wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z));
+            add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,
+                          wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv,
+                          0.16666666667f * g_u0 + sign * g_path_u, 0.16666666667f * g_v0 + sign * g_path_v, zero);
+        }
+#else
+        add_by_centre(&by_mean, m, u0, v0, inv_z, g_u0, g_v0, by_z);
+#endif
     }
     __global float *out = gradients + first;
     gradient_store(out, stride, 0, by_mean, by_scale, torque, qw, qx, qy, qz, by_log_density / density);

@@ -1,14 +1,82 @@
 /* Multi-pose preparation: every Gaussian seen from every time cell of a frame, in one launch.
-   A work-item takes LANES Gaussians and walks the cells. Twin: operators/twins/splat.py. */
+   A work-item takes LANES Gaussians and walks the cells. With MOVING a cell is a segment of the frame in which the
+   centre moves. Twins: operators/twins/splat.py, operators/twins/splat_moving.py. */
 #include "common/precise.h"
 #include "common/gaussian.h"
-#include "common/splat.h"
+#include "common/splat_moving.h"
+
+#if MOVING
+#define POSES 3 /* the middle of the segment and its two ends */
+#define FIELDS 12
+
+typedef struct { vf path_u, path_v, shift_u, shift_v; vi in_front; } moved_ends;
+
+/* The path of the centre over the segment, and what to add to the centre at mid-time so that the straight path is right
+   in the mean: a path bent by s t^2 has the mean s/12. `whole`, `rest`: the centre at mid-time. */
+SPLAT_INLINE moved_ends moved_to_ends(__global const coefficient *m, const v3 mean, const vf u_whole, const vf u_rest,
+                                      const vf v_whole, const vf v_rest)
+{
+    moved_ends r;
+    vf u[2], v[2];
+    r.in_front = (vi)(-1);
+    for (int end = 0; end < 2; ++end, m += 12) {
+        const vwide depth = wide_dot(m + 8, mean.x, mean.y, mean.z);
+        vf u_part, v_part;
+        const vf u_at = wide_ratio(wide_dot(m, mean.x, mean.y, mean.z), depth, &u_part);
+        const vf v_at = wide_ratio(wide_dot(m + 4, mean.x, mean.y, mean.z), depth, &v_part);
+        u[end] = (u_at - u_whole) + (u_part - u_rest);
+        v[end] = (v_at - v_whole) + (v_part - v_rest);
+        r.in_front &= wide_value(depth) > 0.0f;
+    }
+    r.path_u = u[1] - u[0];
+    r.path_v = v[1] - v[0];
+    r.shift_u = (u[0] + u[1]) * (1.0f / 6.0f);
+    r.shift_v = (v[0] + v[1]) * (1.0f / 6.0f);
+    return r;
+}
+
+/* narrows [lo, hi] to the pixels within `reach` of the centre's path between two times */
+SPLAT_INLINE void segment_box(const vf whole, const vf rest, const vf path, const vf reach, const vf early,
+                              const vf late, vi *lo, vi *hi)
+{
+    const vf from = path * early, to = path * late, far = (vf)(4e6f);
+    *lo = max(*lo, V_INT(ceil(clamp(whole + (rest + min(from, to) - reach), -far, far))));
+    *hi = min(*hi, V_INT(floor(clamp(whole + (rest + max(from, to) + reach), -far, far))));
+}
+
+/* Earliest and latest time at which any of the lines lo..hi integrates. Windows open and close in the order of the
+   lines, so that the two outermost lines tell. */
+SPLAT_INLINE void times_of_lines(__global const float *times, const int pitch, const vi lo, const vi hi,
+                                 vf *early, vf *late)
+{
+    float from[LANES], to[LANES];
+    int first[LANES], last[LANES];
+    VI_STORE(lo, first);
+    VI_STORE(hi, last);
+    for (int lane = 0; lane < LANES; ++lane) {
+        from[lane] = to[lane] = 0.0f;
+        if (last[lane] < first[lane])
+            continue;
+        const float middle_a = times[first[lane]], half_a = times[TIME_HALF * pitch + first[lane]];
+        const float middle_b = times[last[lane]], half_b = times[TIME_HALF * pitch + last[lane]];
+        from[lane] = min(middle_a - half_a, middle_b - half_b);
+        to[lane] = max(middle_a + half_a, middle_b + half_b);
+    }
+    *early = V_LOAD(from);
+    *late = V_LOAD(to);
+}
+#else
+#define POSES 1
+#define FIELDS 9
+#endif
 
 __kernel void splat_prepare(
     __global const float *gaussians,      /* (11, stride) */
     __global const float *cells,          /* (C, CELL) */
-    __global const coefficient *matrices, /* (C, 12): rows give u z, v z and z of a world point */
+    __global const coefficient *matrices, /* (C, POSES, 12): rows give u z, v z and z of a world point */
     __global const int *cell_lines,       /* (C, 2): first line, line after the last */
+    __global const float *line_times,     /* MOVING: (C, TIME_ROWS, time_pitch) */
+    const int time_pitch,
     const int cell_count,
     const int count,
     const int stride,
@@ -35,13 +103,18 @@ __kernel void splat_prepare(
 
     for (int c = 0; c < cell_count; ++c) {
         __global const float *cell = cells + c * CELL;
-        __global const coefficient *m = matrices + c * 12;
+        __global const coefficient *m = matrices + c * POSES * 12;
         const int line_first = cell_lines[2 * c], line_last = cell_lines[2 * c + 1] - 1;
         vf u_rest, v_rest;
         const vwide depth = wide_dot(m + 8, mean.x, mean.y, mean.z);
         const vf u_whole = wide_ratio(wide_dot(m, mean.x, mean.y, mean.z), depth, &u_rest);
         const vf v_whole = wide_ratio(wide_dot(m + 4, mean.x, mean.y, mean.z), depth, &v_rest);
         const vf z = wide_value(depth);
+#if MOVING
+        const moved_ends ends = moved_to_ends(m + 12, mean, u_whole, u_rest, v_whole, v_rest);
+        u_rest += ends.shift_u;
+        v_rest += ends.shift_v;
+#endif
 
         const v3 ray = to_local(axes, v3_make(mean.x - cell[CELL_SOURCE], mean.y - cell[CELL_SOURCE + 1],
                                               mean.z - cell[CELL_SOURCE + 2]));
@@ -73,6 +146,16 @@ __kernel void splat_prepare(
 
         /* the ellipse q <= cutoff2 is D'TD - 2 c b.D - c <= 0 with T = S (1 - c/kappa) - c b b' */
         vi drawn = exists & (z > 0.0f) & (kappa > 0.0f);
+#if MOVING
+        drawn &= ends.in_front;
+        const vf pu = ends.path_u, pv = ends.path_v;
+        const vf wide_u = l11 * pu + l12 * pv, wide_v = l22 * pv;
+        const vf speed = sqrt(wide_u * wide_u + wide_v * wide_v);
+        const vi moves = speed > 1e-6f; /* else any direction will do */
+        const vf inv_speed = 1.0f / V_PICK(1.0f, speed, moves);
+        const vf cosine = V_PICK(1.0f, wide_u * inv_speed, moves), sine = V_PICK(0.0f, wide_v * inv_speed, moves);
+        vf reach2 = (vf)(MAXFLOAT);
+#endif
         vi u_lo = (vi)(0), u_hi = (vi)(width - 1);
         vi v_lo = (vi)(line_first), v_hi = (vi)(line_last);
         if (cutoff2 > 0.0f) {
@@ -90,11 +173,25 @@ __kernel void splat_prepare(
             const vf level = cutoff2 * (1.0f + b1 * cu + b2 * cv);
             const vf ru = sqrt(level * t22 * inv_t) * 1.0001f + 0.002f;
             const vf rv = sqrt(level * t11 * inv_t) * 1.0001f + 0.002f;
+#if MOVING
+            /* Q is kept from the middle of the segment: both the box and the reach allow for what it changes by */
+            const vf tilt = fabs(b1) * (fabs(cu) + ru + 0.75f * fabs(pu)) + fabs(b2) * (fabs(cv) + rv + 0.75f * fabs(pv));
+            const vf farthest = sqrt(cutoff2) + 0.75f * speed;
+            const vf slack = (1.0f + 1.1f * tilt) * (1.0f + 1.1f * tilt) / max(1.0f - 1.2f * farthest * farthest * ik, 0.1f);
+            reach2 = cutoff2 * slack * 1.0001f;
+            const vf root = sqrt(reach2 / (l11 * l11 * l22 * l22));
+            const vf half_u = root * sqrt(l12 * l12 + l22 * l22) + 0.002f, half_v = root * l11 + 0.002f;
+            vf early = (vf)(-0.75f), late = (vf)(0.75f); /* lines may stay a quarter of a segment longer */
+            segment_box(v_whole, v_rest, pv, half_v, early, late, &v_lo, &v_hi);
+            times_of_lines(line_times + (size_t)c * TIME_ROWS * time_pitch, time_pitch, v_lo, v_hi, &early, &late);
+            segment_box(u_whole, u_rest, pu, half_u, early, late, &u_lo, &u_hi);
+#else
             const vf far = (vf)(4e6f);
             u_lo = max(u_lo, V_INT(ceil(clamp(u_whole + (u_rest + cu - ru), -far, far))));
             u_hi = min(u_hi, V_INT(floor(clamp(u_whole + (u_rest + cu + ru), -far, far))));
             v_lo = max(v_lo, V_INT(ceil(clamp(v_whole + (v_rest + cv - rv), -far, far))));
             v_hi = min(v_hi, V_INT(floor(clamp(v_whole + (v_rest + cv + rv), -far, far))));
+#endif
         }
         drawn &= (u_hi >= u_lo) & (v_hi >= v_lo);
         u_lo = VI_PICK(1, u_lo, drawn);
@@ -107,16 +204,25 @@ __kernel void splat_prepare(
         v_max = VI_PICK(v_max, max(v_max, v_hi), drawn);
 
         /* from one row a field to one record a Gaussian */
-        float fields[9 * LANES];
+        float fields[FIELDS * LANES];
         int bounds[6 * LANES];
         VI_STORE(v_lo, bounds + 4 * LANES);
         VI_STORE(v_hi, bounds + 5 * LANES);
         if (V_ANY(drawn)) {
             V_STORE(u_rest, fields);
             V_STORE(v_rest, fields + LANES);
+#if MOVING
+            V_STORE(l11 * cosine, fields + 2 * LANES);
+            V_STORE(l12 * cosine + l22 * sine, fields + 3 * LANES);
+            V_STORE(l22 * cosine - l12 * sine, fields + 4 * LANES);
+            V_STORE(l11 * -sine, fields + 9 * LANES);
+            V_STORE(speed, fields + 10 * LANES);
+            V_STORE(reach2, fields + 11 * LANES);
+#else
             V_STORE(l11, fields + 2 * LANES);
             V_STORE(l12, fields + 3 * LANES);
             V_STORE(l22, fields + 4 * LANES);
+#endif
             V_STORE(b1, fields + 5 * LANES);
             V_STORE(b2, fields + 6 * LANES);
             V_STORE(ik, fields + 7 * LANES);
@@ -133,6 +239,8 @@ __kernel void splat_prepare(
             if (hi >= bounds[4 * LANES + lane]) {
                 for (int f = 0; f < 9; ++f)
                     rec[f] = fields[f * LANES + lane];
+                for (int f = 9; f < FIELDS; ++f)
+                    rec[f + 6] = fields[f * LANES + lane];
                 for (int f = 0; f < 6; ++f)
                     whole[9 + f] = bounds[f * LANES + lane];
             } else {

@@ -7,12 +7,13 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors import InputOptions, input_options
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -25,13 +26,17 @@ LARGEST_OFFSET_MM = 1e6
 
 @dataclass(frozen=True)
 class RunSettings:
-    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked."""
+    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked.
+
+    ``before``: what is done to the scan's frames first, whatever the method.
+    """
 
     method: str
     preset: str | None
     seed: int
     device: str | None
     changes: Mapping[str, Any]
+    before: InputOptions = InputOptions()
 
 
 def run_settings(
@@ -54,7 +59,9 @@ def run_settings(
         device = str(device)  # in TOML an index is a number
     seed = _seed(settings.pop("seed", 0), culprits.get("seed", "--seed"))
     wish = device_wish(device, culprits.get("device", "--device"))
-    return RunSettings("phyradgs" if method is None else method, preset, seed, wish, settings)
+    names = [field.name for field in fields(InputOptions)]
+    before = input_options({name: settings.pop(name) for name in names if name in settings})
+    return RunSettings("phyradgs" if method is None else method, preset, seed, wish, settings, before)
 
 
 def read_config(path: Path | None) -> dict[str, Any]:
@@ -122,6 +129,18 @@ def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:
     if not all(math.isfinite(x) and abs(x) <= LARGEST_OFFSET_MM for x in (v_mm, u_mm)):
         raise InputError(option, repr(text), f"two lengths of at most {LARGEST_OFFSET_MM:g} mm")
     return v_mm, u_mm
+
+
+def pulse_pair(option: str, text: str | None) -> tuple[float, float] | None:
+    """When the beam is on, "START,LENGTH" in shares of the exposure; the protocol checks that a frame sees it."""
+    if text is None:
+        return None
+    try:
+        start, length = (float(part) for part in text.split(","))
+    except ValueError:
+        expected = "two numbers START,LENGTH in shares of the exposure"
+        raise InputError(option, repr(text), expected, "write for example 0.86,0.14") from None
+    return start, length
 
 
 def _word(settings: dict[str, Any], key: str, culprits: Mapping[str, str]) -> str | None:

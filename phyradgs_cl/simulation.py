@@ -11,9 +11,10 @@ import numpy as np
 from skimage.transform import resize_local_mean
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
-from phyradgs_cl.detector import average, beer_lambert_noise, tigre_noise
+from phyradgs_cl.acquisition.scan import LARGEST_LAG
+from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector
@@ -40,6 +41,7 @@ class SimulationOptions:
 
     time_samples: midpoint samples a line in its own exposure; 0 chooses them so that the edge of the volume
     moves at most half a voxel of ``grid`` between two of them (see docs/mathematics.md for the error).
+    dose: photons of a pixel without object, on a line that sees the whole pulse. lag: λ of detector/lag.py.
     """
 
     protocol: Protocol = Protocol()
@@ -51,6 +53,7 @@ class SimulationOptions:
     dose: float = 1e4
     electronic_noise: float = 10.0
     jitter_deg: float = 0.0
+    lag: float = 0.0
     time_samples: int = 0
     seed: int = 0
 
@@ -60,6 +63,7 @@ class SimulationOptions:
         checks.within("--peak", self.peak, 0, LARGEST_PEAK)
         checks.within("--electronic-noise (counts)", self.electronic_noise, 0, LARGEST_ELECTRONIC_NOISE)
         checks.within("--dose (photons a pixel)", self.dose, SMALLEST_DOSE, LARGEST_DOSE)
+        checks.within("--lag", self.lag, 0, LARGEST_LAG)
         checks.within("--jitter-deg", self.jitter_deg, 0, 360)
         checks.within("--time-samples", self.time_samples, 0, 10_000)
         checks.within("--seed", self.seed, 0, 2**63)
@@ -109,7 +113,7 @@ def simulate(
     if frames.max() <= 0:
         log.warning("no ray meets anything that attenuates: all %d frames are empty", protocol.views)
     return Scan(
-        projections=_with_noise(frames, options, rng),
+        projections=_recorded(frames, options, shutter, rng),
         geometry=geometry,
         trajectory=trajectory,
         shutter=shutter,
@@ -117,6 +121,7 @@ def simulate(
         grid=grid,
         is_fly=protocol.is_fly,
         detector_model=options.detector_model,
+        lag=options.lag,
         reference=None if reference is None else (reference * factor).astype(np.float32),
         title=title,
         provenance={"attenuation_factor": factor, "time_samples": samples},
@@ -243,9 +248,24 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
-def _with_noise(frames: np.ndarray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:
-    if options.noise == "tigre":
-        return tigre_noise(frames, options.dose, options.electronic_noise, rng)
+def _recorded(
+    frames: np.ndarray, options: SimulationOptions, shutter: Shutter, rng: np.random.Generator
+) -> np.ndarray:
+    """What the panel shows of frames (F, v, u): light, noise and lag; lines without light are 0 (and masked)."""
+    share = shutter.lit_share(shutter.lines(frames.shape[1:]))
+    share = share[:, None] if shutter.axis == "rows" else share
+    recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
+    return recorded if np.all(share > 0) else recorded * (share > 0)
+
+
+def _with_noise(
+    frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """TIGRE's counts are no real intensities, so there the lag comes first; photons are mixed by the panel itself."""
     if options.noise == "beer":
-        return beer_lambert_noise(frames, options.dose, options.electronic_noise, rng)
+        return beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
+    if options.lag > 0:
+        frames = lagged(frames, options.lag).astype(np.float32)
+    if options.noise == "tigre":
+        return tigre_noise(frames, options.dose, options.electronic_noise, rng, light)
     return frames

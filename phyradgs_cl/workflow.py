@@ -8,7 +8,7 @@ import logging
 import platform
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from phyradgs_cl.metrics import compare, slices_png
 from phyradgs_cl.phantoms import load_volume
 from phyradgs_cl.reconstructors import (
     METHODS,
+    InputOptions,
     ProgressReport,
     Reconstruction,
     State,
@@ -92,10 +93,11 @@ def load_scanner_for(job: SimulationJob) -> Scanner:
     return Scanner(**{**changes, "geometry": geometry})
 
 
-def make_scan_protocol(name: str, scanner: Scanner, **changes: float | int | None) -> Protocol:
-    """A named protocol with the command's changes, and the scanner's readout ratio where the command has none."""
-    if changes.get("readout_ratio") is None:
-        changes["readout_ratio"] = scanner.readout_ratio
+def make_scan_protocol(name: str, scanner: Scanner, **changes: Any) -> Protocol:
+    """A named protocol with the command's changes, and the scanner's readout and pulse where the command has none."""
+    for key in ("readout_ratio", "pulse"):
+        if changes.get(key) is None:
+            changes[key] = getattr(scanner, key)
     return make_protocol(name, **changes)
 
 
@@ -164,6 +166,7 @@ class ReconstructionJob:
     seed: int = 0
     resume: bool = False
     config: Path | None = None
+    before: InputOptions = InputOptions()
 
 
 @np.errstate(all="ignore")
@@ -179,9 +182,11 @@ def run_reconstruction(
     _refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
     scan = load_scan(job.scan)
     scan.check_timing()
-    if scan.detector_model == "intensity":
+    if scan.detector_model == "intensity" and not hasattr(options, "detector_model"):
         log.warning(
-            "%s averages intensity over an exposure; reconstruction averages line integrals", job.scan
+            "%s averages intensity over an exposure; --method %s averages line integrals",
+            job.scan,
+            job.method,
         )
     if (largest := float(scan.projections.max())) <= 0:
         found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
@@ -189,7 +194,7 @@ def run_reconstruction(
     rt = make_runtime()
     scan_hash = sha256_of(job.scan)
     fingerprint = _fingerprint(scan_hash, job, options)
-    extra: dict[str, Any] = {}
+    extra: dict[str, Any] = {"before": job.before}
     if job.resume:
         extra["resume"] = _resumed(job, fingerprint)
     result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=report, **extra)
@@ -222,6 +227,7 @@ def _provenance(
         "device": rt.device.name,
         "device_version": rt.device.version,
         "seed": job.seed,
+        "input": asdict(job.before),
         "scan": str(job.scan),
         "scan_sha256": scan_hash,
         "record": result.record,
@@ -229,7 +235,7 @@ def _provenance(
 
 
 def _fingerprint(scan_hash: str, job: ReconstructionJob, options: object) -> str:
-    text = json.dumps([scan_hash, job.method, repr(options), job.seed])
+    text = json.dumps([scan_hash, job.method, repr(options), repr(job.before), job.seed])
     return hashlib.sha256(text.encode()).hexdigest()
 
 

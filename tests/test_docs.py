@@ -27,7 +27,7 @@ def option_names(options: Any, prefix: str = "") -> Iterator[str]:
     for field in fields(options):
         value = getattr(options, field.name)
         if field.name == "motion":
-            yield from ("strips", "sub_intervals")
+            yield from ("strips", "sub_intervals", "segments", "time_error")
         elif is_dataclass(value):
             yield from option_names(value, f"{field.name}.")
         else:

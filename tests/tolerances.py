@@ -24,6 +24,18 @@ MERGED_FRAME = 1e-5  # Eq. 3 in one launch: a sum of splats, no other error than
 BRUTE_FORCE = 1e-5  # per-line cells at the brute force's own times: the same sums in another order
 STANDING_PICTURE = 1e-5  # frames that must not depend on time differ by rounding alone
 
+# --- splats that move through a segment ------------------------------------------------------------------------
+# of the peak, against quadrature in time, with the rules' bound out of the way: float32 and the polynomial of erf
+SPLAT_MOVING = 1e-5  # measured 2e-6
+# of the still peak, the worst pixel over ``time_error``: the remainders of the rules are cut at twice that (0.2 to 2)
+TIME_RULE = 2.2
+# float32 may decide differently about pixels this close to the edge of the path's outline
+CUTOFF_EDGE_MOVING = 1e-3
+MOVING_GRADIENT = 1e-4  # goal 1e-3; at rest 3e-7, at 50 pixels a segment 3e-6
+# error over that of a quarter as many segments: straight paths and constant conics are second order (0.09)
+SEGMENTS_ORDER = 0.16
+EXACT_OVER_MICRO_VIEWS = 1 / 3  # goal of the design at equal time; at the default bound 0.1 to 0.2
+
 # --- gradients -----------------------------------------------------------------------------------------------
 GRADIENT = 1e-4  # goal 1e-3; float32 sums over a footprint leave 1e-6 to 2e-5
 FINITE_DIFFERENCE_STEP = 1e-6  # in units of 1: truncation 1e-10, cancellation 1e-10 in float64

@@ -14,6 +14,12 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
 
+_INSTANT = 1e-9  # of the frame's span: shorter windows are moments
+_OVERHANG = 0.1  # of a segment: how far a line may stay in a segment beyond its end
+_TURN_SAMPLES = 32
+_TURN_FACTOR = 0.32  # relative error per squared radian
+_MOST_SEGMENTS = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class TimeCells:
@@ -22,6 +28,10 @@ class TimeCells:
     pose (C, 12) mm, in the detector's own rows and columns whatever the readout axis; time_s (C,);
     line_start, line_stop (C,) along the readout ``axis`` of ``lines`` lines; weight (C,).
     Cells are sorted by line_start, so that the cells that serve a line are neighbours.
+
+    Cells with motion are segments of the frame: ``end_poses`` (C, 2, 12) at their two ends, and ``line_times``
+    (C, 3, lines), which say of every line the middle and half the length of its window's part in the segment, in units of
+    the segment's length from its mid-time, and the share of its window that this part is. ``weight`` is 1 then.
     """
 
     pose: np.ndarray
@@ -31,6 +41,8 @@ class TimeCells:
     weight: np.ndarray
     lines: int
     axis: str = "rows"
+    end_poses: np.ndarray | None = None
+    line_times: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -39,6 +51,8 @@ class TimeCells:
     def line_weights(self) -> np.ndarray:
         """Sum of weights (lines,) that each line receives; 1 for a complete table."""
         total = np.zeros(self.lines)
+        if self.line_times is not None:
+            return self.weight @ self.line_times[:, 2]
         for start, stop, weight in zip(self.line_start, self.line_stop, self.weight, strict=True):
             total[start:stop] += weight
         return total
@@ -47,15 +61,15 @@ class TimeCells:
 def static_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """One cell at the middle of the frame's whole window: the best a frozen gantry can do."""
-    return _single_cell(trajectory, shutter, frame, start_s + shutter.span_s / 2, lines)
+    """One cell at the middle of the frame's lit span: the best a frozen gantry can do."""
+    return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
     """One cell at the frame's first pose; the volume comes out rotated by half the span."""
-    return _single_cell(trajectory, shutter, frame, start_s, lines)
+    return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
 def micro_view_cells(
@@ -69,15 +83,18 @@ def micro_view_cells(
 ) -> TimeCells:
     """M strips × N sub-intervals, t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
 
-    Strips without a line (M larger than the number of lines) are left out.
+    With a pulsed beam the N sub-intervals share the lit part of the strip's window. Strips without a line
+    (M larger than the number of lines) are left out.
     """
     if strips < 1 or sub_intervals < 1:
         raise InputError("strips × sub-intervals", f"{strips} × {sub_intervals}", "two counts of at least 1")
-    exposure_s = (np.arange(sub_intervals) + 0.5) / sub_intervals * shutter.exposure_s
+    share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     time_s, first, last = [], [], []
     for strip, (line_start, line_stop) in enumerate(shutter.strip_ranges(lines, strips)):
         if line_stop > line_start:
-            time_s.append(start_s + (strip + 0.5) / strips * shutter.readout_s + exposure_s)
+            opens_s = (strip + 0.5) / strips * shutter.readout_s
+            first_s, last_s = shutter.in_pulse(np.array([opens_s, opens_s + shutter.exposure_s]))
+            time_s.append(start_s + first_s + share * (last_s - first_s))
             first.append(np.full(sub_intervals, line_start))
             last.append(np.full(sub_intervals, line_stop))
     times = np.concatenate(time_s)
@@ -102,6 +119,101 @@ def per_line_cells(
     line = np.repeat(np.arange(lines), samples)
     weight = np.full(times.size, 1.0 / samples)
     return _table(trajectory, shutter, frame, times, line, line + 1, weight, lines)
+
+
+def exact_cells(
+    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
+) -> TimeCells:
+    """K equal segments of the frame's lit span, in each of which every line integrates over its own window.
+
+    ``segments`` is K. Splats move from a segment's first pose to its last; see docs/mathematics.md. A gantry at rest,
+    or a frame that takes no time, gives the one cell of ``static_cells``.
+    """
+    if segments < 1:
+        raise InputError("segments", str(segments), "at least 1")
+    first_s, last_s = shutter.lit_span_s
+    if last_s <= first_s:
+        return static_cells(trajectory, shutter, frame, start_s, lines)
+    edges_s = np.linspace(first_s, last_s, segments + 1)
+    times = _line_times(shutter.line_windows_s(lines), edges_s)
+    served = times[:, 2] > 0
+    kept = np.flatnonzero(served.any(axis=1))
+    middle_s = start_s + (edges_s[:-1] + edges_s[1:])[kept] / 2
+    line_start = served[kept].argmax(axis=1)
+    line_stop = lines - served[kept, ::-1].argmax(axis=1)
+    order = np.argsort(line_start, kind="stable")
+    ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[kept][order]
+    pose, end_poses = trajectory.pose(frame, middle_s[order]), trajectory.pose(frame, ends_s)
+    if np.all(end_poses == pose[0]) and np.all(pose == pose[0]):
+        return static_cells(trajectory, shutter, frame, start_s, lines)
+    return TimeCells(
+        pose=pose,
+        time_s=middle_s[order],
+        line_start=line_start[order].astype(np.int32),
+        line_stop=line_stop[order].astype(np.int32),
+        weight=np.ones(order.size),
+        lines=lines,
+        axis=shutter.axis,
+        end_poses=end_poses,
+        line_times=times[kept][order],
+    )
+
+
+def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
+    """``TimeCells.line_times`` (K, 3, lines) from the lines' windows (lines, 2) and the segments' edges (K + 1,).
+
+    A line that would reach only a little way into a segment stays in the one beside it, which is then left a little
+    late (or entered early): fewer footprints for a path that is straight for a little longer.
+    """
+    length_s = edges_s[1] - edges_s[0]
+    count = len(edges_s) - 1
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments from the first light
+    first, last = _kept_segments(opens, closes, count)
+    index = np.arange(count)[:, None]
+    start = np.where(index == first, opens, index)
+    stop = np.where(index == last, closes, index + 1)
+    served = (index >= first) & (index <= last)
+    instant = closes - opens <= _INSTANT * count
+    share = np.where(instant, 1.0, (stop - start) / np.where(instant, 1.0, closes - opens))
+    rows = ((start + stop) / 2 - index - 0.5, (stop - start) / 2, share)
+    return np.stack([np.where(served, row, 0.0) for row in rows], 1)
+
+
+def _kept_segments(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """First and last segment (lines,) of every line, less those that it reaches into by no more than ``_OVERHANG``."""
+    first = np.clip(np.floor(opens), 0, count - 1)
+    last = np.clip(np.ceil(closes) - 1, first, count - 1)
+    first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
+    last = np.where((first < last) & (closes - last <= _OVERHANG), last - 1, last)
+    return first, last
+
+
+def segments_for(
+    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, time_error: float
+) -> int:
+    """How many segments keep the error of straight paths and constant conics below ``time_error`` (relative, RMS).
+
+    Both grow with the square of the angle by which the view turns in a segment; the factor is measured
+    (benchmarks/time_exact.py), for Gaussians of 0.5 to 4 % of the half-width. The fastest part of the frame counts.
+    """
+    first_s, last_s = shutter.lit_span_s
+    time_s = start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1)
+    pose = trajectory.pose(frame, time_s)
+    fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
+    return int(np.clip(np.ceil(fastest_rad * np.sqrt(_TURN_FACTOR / time_error)), 1, _MOST_SEGMENTS))
+
+
+def _turns_rad(pose: np.ndarray) -> np.ndarray:
+    """Angles (T − 1,) between successive poses (T, 12): of the source about the origin, or of the detector if larger."""
+    u_hat = pose[:, 6:9] / np.linalg.norm(pose[:, 6:9], axis=1, keepdims=True)
+    normal = np.cross(u_hat, pose[:, 9:12])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
+    steps = [
+        2 * np.arcsin(np.linalg.norm(np.diff(x, axis=0), axis=1).clip(0, 2) / 2)
+        for x in (u_hat, normal, source)
+    ]
+    return np.max(steps, axis=0)
 
 
 def _single_cell(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ class Protocol:
     """A full turn of ``views`` frames, each exposing ``exposure_deg`` (paper, section 3.1).
 
     The gantry turns at constant speed, so an exposure of 1 s fixes it; ``readout_ratio`` is T_ro/T_exp.
+    ``pulse``: when the beam is on, as (start after the frame's start, length) in shares of the exposure; None always.
     """
 
     views: int = 25
@@ -26,6 +28,7 @@ class Protocol:
     start_deg: float = 0.0
     exposure_s: float = 1.0
     is_fly: bool = True
+    pulse: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         checks.within("views", self.views, 1, 100_000)
@@ -36,13 +39,26 @@ class Protocol:
             raise InputError("exposure arc", f"{self.exposure_deg}°", "an angle of at least 0°")
         if not (np.isfinite(self.readout_ratio) and self.readout_ratio >= 0):
             raise InputError("readout ratio", str(self.readout_ratio), "T_ro/T_exp of at least 0")
+        if self.pulse is not None:
+            self._check_pulse(*self.pulse)
+
+    def _check_pulse(self, start: float, length: float) -> None:
+        last = 1 + self.readout_ratio
+        fits = np.isfinite(start) and np.isfinite(length) and start < last and start + length > 0
+        if not (fits and length > 0):
+            expected = (
+                f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
+            )
+            raise InputError("pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
 
     @property
     def step_deg(self) -> float:
         return 360.0 / self.views
 
     def shutter(self, axis: str = "rows", direction: int = 1) -> Shutter:
-        return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction)
+        start, length = self.pulse or (0.0, 0.0)
+        pulse_s = (start * self.exposure_s, length * self.exposure_s) if self.pulse else None
+        return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
         """Opening times (F,): the gantry needs step/arc exposures from frame to frame."""
@@ -64,7 +80,7 @@ class Protocol:
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)
         if not self.is_fly:
-            middle = first + arc_rad * (1 + self.readout_ratio) / 2
+            middle = first + arc_rad * self.shutter().middle_s / self.exposure_s
             return CircularOrbit(geometry, FrameSweeps(self.frame_start_s(), self.exposure_s, middle, middle))
         if jitter_deg > 0:
             if arc_rad == 0:
@@ -94,7 +110,7 @@ PROTOCOLS = {
 }
 
 
-def make_protocol(name: str, **changes: float | int | bool | None) -> Protocol:
+def make_protocol(name: str, **changes: Any) -> Protocol:
     """A named protocol with the options that are not None replaced."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")

@@ -13,6 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
 DETECTOR_MODELS = ("log", "intensity")
+LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,8 @@ class Scan:
 
     projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read
     line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
+    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
+    projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
     ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
     """
 
@@ -36,6 +39,7 @@ class Scan:
     reference: np.ndarray | None = None
     title: str = "cone-beam scan"
     provenance: dict[str, object] = field(default_factory=dict)
+    lag: float = 0.0
 
     def __post_init__(self) -> None:
         frames = len(self.projections)
@@ -50,8 +54,20 @@ class Scan:
             raise InputError("frame_start_s", f"shape {np.shape(self.frame_start_s)}", f"({frames},)")
         if self.detector_model not in DETECTOR_MODELS:
             raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
+        if not 0 <= self.lag <= LARGEST_LAG:
+            raise InputError("lag", f"{self.lag:g}", f"a share from 0 to {LARGEST_LAG}")
         if self.reference is not None and self.reference.shape != self.grid.shape:
             raise InputError("reference", f"shape {self.reference.shape}", f"the grid's {self.grid.shape}")
+        self._mask_dark_lines()
+
+    def _mask_dark_lines(self) -> None:
+        dark = self.shutter.lit_share(self.lines) == 0
+        if not dark.any():
+            return
+        by_row = self.shutter.axis == "rows"
+        unlit = np.broadcast_to(dark[:, None] if by_row else dark, self.geometry.detector_shape)
+        mask = unlit if self.pixel_mask is None else (np.asarray(self.pixel_mask) != 0) | unlit
+        object.__setattr__(self, "pixel_mask", mask)
 
     @property
     def frames(self) -> int:
@@ -64,6 +80,6 @@ class Scan:
 
     def check_timing(self) -> None:
         """Asks the trajectory for the ends of every frame's window, so that a short table is named early."""
-        last_s = self.shutter.span_s * (1.0 if self.is_fly else 0.5)  # a standing gantry is asked mid-window
+        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))

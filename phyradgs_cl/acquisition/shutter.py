@@ -9,6 +9,7 @@ import numpy as np
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
+_DARK = 1e-9  # of the longest lit window: less is what rounding leaves of a line that the pulse misses
 
 
 @dataclass(frozen=True)
@@ -17,13 +18,15 @@ class Shutter:
 
     Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``.
     ``axis`` says what is read out at one time; ``direction`` +1 reads index 0 first, −1 last. A readout of
-    zero is a global shutter.
+    zero is a global shutter. ``pulse_s`` (start after the frame's start, length) is when the beam is on, None
+    always: a line sees the part of its window that lies in the pulse, and some lines may see nothing.
     """
 
     exposure_s: float
     readout_s: float = 0.0
     axis: str = "rows"
     direction: int = 1
+    pulse_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
@@ -36,11 +39,45 @@ class Shutter:
             raise InputError(
                 "readout direction", str(self.direction), "1 (index 0 first) or -1 (index 0 last)"
             )
+        if self.pulse_s is not None:
+            self._check_pulse(*self.pulse_s)
+
+    def _check_pulse(self, start_s: float, length_s: float) -> None:
+        if not (np.isfinite(start_s) and np.isfinite(length_s) and length_s > 0):
+            found = f"start {start_s} s, length {length_s} s"
+            raise InputError("pulse_s", found, "a finite start and a length above 0 s")
+        if start_s >= self.span_s or start_s + length_s <= 0:
+            found = f"{start_s:g} to {start_s + length_s:g} s"
+            expected = f"a pulse that meets the frame's window, 0 to {self.span_s:g} s"
+            raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     @property
     def span_s(self) -> float:
         """From the first line's opening to the last line's closing."""
         return self.exposure_s + self.readout_s
+
+    @property
+    def lit_span_s(self) -> tuple[float, float]:
+        """From the first light to the last, in seconds after the frame's start: the span without a pulse."""
+        first_s, last_s = self.in_pulse(np.array([0.0, self.span_s]))
+        return float(first_s), float(last_s)
+
+    @property
+    def middle_s(self) -> float:
+        """The middle of the lit span: when a single pose says most about a frame."""
+        first_s, last_s = self.lit_span_s
+        return first_s + (last_s - first_s) / 2
+
+    def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
+        """Times (...) after the frame's start, those without beam moved to the nearest moment with beam.
+
+        The two ends of a window become those of its part in the pulse; of a window that the pulse misses they
+        become one moment, so that it has a place in time though it has no length.
+        """
+        if self.pulse_s is None:
+            return time_s
+        start_s, length_s = self.pulse_s
+        return np.clip(time_s, start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
         """How many lines a (rows, columns) detector has along the readout axis."""
@@ -52,9 +89,23 @@ class Shutter:
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """(lines, 2): when every line index opens and closes, in seconds after the frame's start."""
+        """(lines, 2): when light begins and ends on every line index, in seconds after the frame's start.
+
+        Without a pulse that is from opening to closing; a line that the pulse misses has two equal times.
+        """
         delay = self.delay_s(lines)
-        return np.stack([delay, delay + self.exposure_s], -1)
+        return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
+
+    def lit_share(self, lines: int) -> np.ndarray:
+        """Share (lines,) of the longest lit window that each line index sees: 1 everywhere without a pulse."""
+        if self.pulse_s is None:
+            return np.ones(lines)
+        seen_s = np.diff(self.line_windows_s(lines))[:, 0]
+        longest_s = seen_s.max()
+        if longest_s <= 0:
+            found = f"{self.pulse_s[0]:g} to {sum(self.pulse_s):g} s, while no line is open"
+            raise InputError("pulse_s", found, "a pulse that meets the window of a line", "correct the pulse")
+        return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
         """Line ranges [start, stop) of the strips, in the order in which they are read; may be empty.

@@ -2,6 +2,7 @@
 
 from phyradgs_cl.detector.attenuation import attenuation_to_counts, counts_to_attenuation
 from phyradgs_cl.detector.average import average
+from phyradgs_cl.detector.lag import add_lag, lagged, remove_lag, without_lag
 from phyradgs_cl.detector.noise import (
     beer_lambert_counts,
     beer_lambert_noise,
@@ -10,15 +11,21 @@ from phyradgs_cl.detector.noise import (
     tigre_noise,
 )
 from phyradgs_cl.detector.noise_level import noise_level
+from phyradgs_cl.detector.transmission import transmission_weights
 
 __all__ = [
+    "add_lag",
     "attenuation_to_counts",
     "average",
     "beer_lambert_counts",
     "beer_lambert_noise",
     "counts_to_attenuation",
+    "lagged",
     "noise_level",
+    "remove_lag",
     "sample_counts",
     "tigre_counts",
     "tigre_noise",
+    "transmission_weights",
+    "without_lag",
 ]

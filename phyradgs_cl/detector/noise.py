@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.checks import at_least, finite, positive
+from phyradgs_cl.detector.lag import add_lag
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,11 @@ def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Gener
 
 
 def tigre_noise(
-    line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator
+    line_integrals: ArrayLike,
+    dose: float,
+    electronic_noise: float,
+    rng: np.random.Generator,
+    light: ArrayLike = 1.0,
 ) -> NDArray[np.float32]:
     """Noisy line integrals -ln(counts/dose) · m after TIGRE's scaling; negatives become 0.
 
@@ -72,6 +77,8 @@ def tigre_noise(
         dose: counts of an unattenuated pixel; the published scans have 1e4.
         electronic_noise: standard deviation in counts; the published scans have 10.
         rng: source of randomness.
+        light: share of the dose that each pixel gets, above 0, broadcast to (F, v, u): a pulse may miss part of a
+            line's window.
 
     Returns:
         (F, v, u) float32, finite at any dose.
@@ -81,20 +88,31 @@ def tigre_noise(
     """
     _check(line_integrals, dose, electronic_noise)
     expected, scale = tigre_counts(line_integrals, dose)
-    p = _log_ratio(sample_counts(expected, electronic_noise, rng), dose) * scale
+    share = np.asarray(light, dtype=np.float64)
+    p = _log_ratio(sample_counts(expected * share, electronic_noise, rng), dose * share) * scale
     return np.maximum(p, 0.0).astype(np.float32)
 
 
 def beer_lambert_noise(
-    line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator
+    line_integrals: ArrayLike,
+    dose: float,
+    electronic_noise: float,
+    rng: np.random.Generator,
+    light: ArrayLike = 1.0,
+    lag: float = 0.0,
 ) -> NDArray[np.float32]:
     """Noisy line integrals -ln(counts/dose), counts clamped at `COUNT_FLOOR`; negatives are kept.
 
-    Arguments, result and errors as in `tigre_noise`. Clipping negatives would make air attenuate.
+    Arguments, result and errors as in `tigre_noise`. Clipping negatives would make air attenuate. A panel with the
+    `lag` λ mixes the photons of successive frames; electronic noise comes after it.
     """
     _check(line_integrals, dose, electronic_noise)
     expected = beer_lambert_counts(line_integrals, dose)
-    return _log_ratio(sample_counts(expected, electronic_noise, rng), dose).astype(np.float32)
+    share = np.asarray(light, dtype=np.float64)
+    counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)
+    if electronic_noise > 0:
+        counts += rng.normal(0.0, electronic_noise, counts.shape)
+    return _log_ratio(counts, dose * share).astype(np.float32)
 
 
 def _attenuated(p: Array, dose: float) -> Array:
@@ -102,7 +120,7 @@ def _attenuated(p: Array, dose: float) -> Array:
     return np.exp(np.minimum(np.log(dose) - p, 700.0))
 
 
-def _log_ratio(counts: Array, dose: float) -> Array:
+def _log_ratio(counts: Array, dose: float | Array) -> Array:
     return np.log(dose) - np.log(np.maximum(counts, COUNT_FLOOR))
 
 

@@ -94,7 +94,22 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
         number = read_number(source, direction, known=KNOWN)
         checks.one_of(source.name(direction), number, (1, -1))
         way = int(number)
-    return Shutter(exposure_s, readout_s, word, way)
+    pulse_s = _read_pulse(source, entry, exposure_s + readout_s)
+    return Shutter(exposure_s, readout_s, word, way, pulse_s)
+
+
+def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, float] | None:
+    """When the beam is on (start, length) in s after a frame's start, or None: always."""
+    start, length = f"{entry}/{schema.EXTRA}/pulse_start", f"{entry}/{schema.EXTRA}/pulse_length"
+    if source.optional(start, KNOWN) is None and source.optional(length, KNOWN) is None:
+        return None
+    start_s = read_number(source, start, TIME, KNOWN)
+    length_s = read_length(source, length, TIME, KNOWN)
+    if start_s >= span_s or start_s + length_s <= 0:
+        found = f"a pulse from {start_s:g} to {start_s + length_s:g} s"
+        expected = f"one that meets the frame's window, 0 to {span_s:g} s"
+        raise InputError(source.name(start), found, expected, "correct the pulse, or remove both datasets")
+    return start_s, length_s
 
 
 def _read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:

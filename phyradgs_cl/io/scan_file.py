@@ -69,6 +69,7 @@ def scan_summary(path: str | Path) -> dict[str, object]:
         **_geometry_facts(scan),
         **_timing_facts(scan),
         "detector_model": scan.detector_model,
+        **_panel_facts(scan),
         "pixel_mask": header.mask_shape is not None,
         "grid_shape": scan.grid.shape,
         "grid_voxel_size_mm": scan.grid.voxel_size_mm,
@@ -109,6 +110,17 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
         marks_s = scan.frame_start_s[0] + np.array([0.0, shutter.exposure_s, shutter.span_s])
         first, closed, done = np.rad2deg(scan.trajectory.angle_rad(0, marks_s)).tolist()
         facts["exposure_arc_deg"], facts["span_arc_deg"] = closed - first, done - first
+    return facts
+
+
+def _panel_facts(scan: Scan) -> dict[str, object]:
+    """Pulse and lag, where there are any."""
+    facts: dict[str, object] = {}
+    if scan.shutter.pulse_s is not None:
+        facts["pulse_start_s"], facts["pulse_length_s"] = scan.shutter.pulse_s
+        facts["dark_lines"] = int(np.count_nonzero(scan.shutter.lit_share(scan.lines) == 0))
+    if scan.lag > 0:
+        facts["lag"] = scan.lag
     return facts
 
 

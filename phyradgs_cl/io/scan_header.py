@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import h5py
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Scan
-from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import scan_schema as schema
-from phyradgs_cl.io.datasets import read_attribute, read_word
+from phyradgs_cl.io.datasets import read_attribute, read_number, read_word
 from phyradgs_cl.io.grid_io import default_grid, read_grid
 from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.scan_detector import (
@@ -88,6 +89,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         detector_model=_read_model(source, entry),
         title=_optional_word(source, f"{entry}/title", "cone-beam scan"),
         provenance=_read_provenance(source, entry),
+        lag=_read_lag(source, entry),
     )
     scan.check_timing()
     mask_shape = check_mask(source, entry, data.shape)
@@ -124,6 +126,15 @@ def _read_model(source: Hdf5Source, entry: str) -> str:
     if source.optional(address, KNOWN) is None:
         return "log"
     return read_word(source, address, DETECTOR_MODELS, KNOWN)
+
+
+def _read_lag(source: Hdf5Source, entry: str) -> float:
+    address = f"{entry}/{schema.EXTRA}/lag"
+    if source.optional(address, KNOWN) is None:
+        return 0.0
+    lag = read_number(source, address, known=KNOWN)
+    checks.within(source.name(address), lag, 0, LARGEST_LAG)
+    return lag
 
 
 def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:

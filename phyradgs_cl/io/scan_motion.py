@@ -83,7 +83,7 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
         last_deg = np.rad2deg(last_rad)[frame_of]
         write_number(sample, "rotation_angle_end", last_deg, "degree", rotates="gantry")
     if isinstance(scan.trajectory, PoseTable):
-        _write_poses(entry, scan.trajectory, 0.0 if scan.is_fly else scan.shutter.span_s / 2)
+        _write_poses(entry, scan.trajectory, 0.0 if scan.is_fly else scan.shutter.middle_s)
     elif scan.is_fly and isinstance(scan.trajectory.kinematics, (EncoderTable, SpeedRamp)):
         _write_kinematics(entry, *_angle_table(scan))
 
@@ -104,7 +104,7 @@ def _write_kinematics(entry: h5py.Group, time_s: np.ndarray, angle_rad: np.ndarr
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """Gantry angles (F,) as each exposure starts and ends; both at mid-window if the gantry stands."""
     shutter = scan.shutter
-    offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.span_s / 2] * 2)
+    offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
     pairs = np.array(
         [_angles(scan, frame, start_s + offsets_s) for frame, start_s in enumerate(scan.frame_start_s)]
     )

@@ -102,6 +102,8 @@ def _write_instrument(
     write_number(detector, "y_pixel_size", pitch_v_mm, "mm")
     write_number(detector, "distance", geometry.source_to_detector_mm - geometry.source_to_axis_mm, "mm")
     exposure_s, readout_s = _stored_durations(scan)
+    if exposure_s + readout_s < scan.shutter.span_s:
+        _log.warning("a stop-and-shoot scan with a pose table is stored without exposure and readout times")
     write_number(detector, "count_time", exposure_s, "s")
     write_number(detector, "detector_readout_time", readout_s, "s")
     write_number(detector, "frame_start_time", np.asarray(scan.frame_start_s, np.float64)[frame_of], "s")
@@ -112,9 +114,8 @@ def _write_instrument(
 
 
 def _stored_durations(scan: Scan) -> tuple[float, float]:
-    """Exposure and readout in s; 0 for a gantry that stops along a pose table, or it would read as moving."""
-    if not scan.is_fly and isinstance(scan.trajectory, PoseTable) and scan.shutter.span_s > 0:
-        _log.warning("a stop-and-shoot scan with a pose table is stored without exposure and readout times")
+    """Exposure and readout in s, as stored; 0 for a gantry that stops along a pose table, or it would read as moving."""
+    if not scan.is_fly and isinstance(scan.trajectory, PoseTable):
         return 0.0, 0.0
     return scan.shutter.exposure_s, scan.shutter.readout_s
 
@@ -125,6 +126,12 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
     write_number(extra, "readout_direction", scan.shutter.direction)
     write_number(extra, "detector_offset", scan.geometry.detector_offset_mm, "mm")
     extra["detector_model"] = scan.detector_model
+    if scan.lag > 0:
+        write_number(extra, "lag", scan.lag)
+    if scan.shutter.pulse_s is not None and _stored_durations(scan)[0] > 0:
+        start_s, length_s = scan.shutter.pulse_s
+        write_number(extra, "pulse_start", start_s, "s")
+        write_number(extra, "pulse_length", length_s, "s")
     if scan.provenance:
         extra["provenance"] = json.dumps(scan.provenance, default=str)
     write_grid(extra, scan.grid)

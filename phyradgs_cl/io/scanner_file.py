@@ -11,6 +11,7 @@ from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -23,7 +24,11 @@ else:
 
 _TABLES: dict[str, tuple[str, ...]] = {
     "source": ("to_axis_mm", "to_detector_mm"),
-    "detector": ("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"),
+    "detector": (
+        *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"),
+        "lag",
+    ),
+    "beam": ("pulse_start", "pulse_length"),
     "volume": ("shape", "size_mm", "offset_mm"),
     "readout": ("axis", "direction", "ratio"),
 }
@@ -34,7 +39,8 @@ _WORDS = ("title",)
 class Scanner:
     """A scanner: where things stand, what volume it images, and how its panel is read by default.
 
-    ``readout_ratio`` is T_ro/T_exp, or None if the file leaves it to the protocol.
+    ``readout_ratio`` is T_ro/T_exp, or None if the file leaves it to the protocol. ``pulse`` is when the beam is on
+    in a frame (start, length; shares of the exposure), None always; ``lag`` the panel's λ (detector/lag.py).
     """
 
     name: str
@@ -43,6 +49,8 @@ class Scanner:
     readout_axis: str = "rows"
     readout_direction: int = 1
     readout_ratio: float | None = None
+    pulse: tuple[float, float] | None = None
+    lag: float = 0.0
 
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
@@ -104,7 +112,10 @@ def _scanner(path: Path, content: dict[str, object]) -> Scanner:
     checks.one_of(readout.culprit("direction"), direction, (1, -1))
     ratio = readout.number("ratio", minimum=0.0) if readout.get("ratio", None) is not None else None
     grid = _grid(tables["volume"]) if "volume" in content else default_grid(geometry)
-    return Scanner(path.stem, geometry, grid, str(axis), int(direction), ratio)
+    lag = tables["detector"].number("lag", 0.0)
+    checks.within(tables["detector"].culprit("lag"), lag, 0, LARGEST_LAG)
+    pulse = _pulse(tables["beam"]) if "beam" in content else None
+    return Scanner(path.stem, geometry, grid, str(axis), int(direction), ratio, pulse, lag)
 
 
 def _geometry(source: _Table, detector: _Table) -> ConeGeometry:
@@ -119,6 +130,13 @@ def _geometry(source: _Table, detector: _Table) -> ConeGeometry:
         (detector.positive("pixel_size_v_mm"), detector.positive("pixel_size_u_mm")),
         (detector.number("offset_v_mm", 0.0), detector.number("offset_u_mm", 0.0)),
     )
+
+
+def _pulse(beam: _Table) -> tuple[float, float]:
+    start, length = beam.number("pulse_start"), beam.number("pulse_length")
+    if length <= 0:
+        raise InputError(beam.culprit("pulse_length"), f"{length:g}", "a share of the exposure above 0")
+    return start, length
 
 
 def _grid(volume: _Table) -> Grid:

@@ -1,5 +1,7 @@
 """Image terms of the objective (paper, Eq. 4): L1 + λ (1 − SSIM) of one frame, with their gradient.
 
+Beside them a term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t (detector/transmission.py), off by default.
+
 Eq. 4 prints "+ SSIM"; what is minimised, there and here, is 1 − SSIM. SSIM is Wang et al. 2004 (IEEE Trans.
 Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01², C2 = 0.03².
 """
@@ -20,9 +22,18 @@ _GUARD = 16
 class ImageLoss:
     """Loss and gradient of a frame of ``lines`` lines by ``width`` pixels, in the padded image layout."""
 
-    def __init__(self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float) -> None:
+    def __init__(
+        self,
+        rt: Runtime,
+        lines: int,
+        width: int,
+        pitch: int,
+        ssim_weight: float,
+        l1_weight: float = 1.0,
+        poisson_weight: float = 0.0,
+    ) -> None:
         self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
-        self.ssim_weight = ssim_weight
+        self.ssim_weight, self.l1_weight, self.poisson_weight = ssim_weight, l1_weight, poisson_weight
         image = _GUARD + lines * pitch
         self._moments = rt.zeros(5 * image + _GUARD)
         self._partials = rt.zeros(3 * image + _GUARD)
@@ -32,10 +43,20 @@ class ImageLoss:
         self.gradient = rt.zeros(image + _GUARD)
 
     def evaluate(
-        self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
+        self,
+        rendered: DeviceArray,
+        measured: DeviceArray,
+        mask: DeviceArray,
+        pixels: float,
+        transmission: DeviceArray | None = None,
     ) -> DeviceArray:
-        """dL/drendered, until the next call; ``mask`` is 1 where a pixel counts and ``pixels`` its sum."""
+        """dL/drendered, until the next call; ``mask`` is 1 where a pixel counts and ``pixels`` its sum.
+
+        ``transmission`` weighs pixels in the Poisson term and is needed where that has a weight.
+        """
         rt = self.rt
+        poisson = 0.0 if transmission is None else self.poisson_weight
+        weights = mask if transmission is None else transmission  # the kernels do not look without a weight
         vectors = -(-self.width // rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
@@ -53,6 +74,8 @@ class ImageLoss:
             *size,
             np.float32(C1),
             np.float32(C2),
+            weights,
+            np.int32(poisson != 0),
             self._partials,
             self._line_sums,
             group=group,
@@ -72,8 +95,10 @@ class ImageLoss:
             self._spread,
             *images,
             *size,
-            np.float32(1.0 / max(pixels, 1.0)),
+            np.float32(self.l1_weight / max(pixels, 1.0)),
             np.float32(self.ssim_weight / (self.lines * self.width)),
+            weights,
+            np.float32(poisson / max(pixels, 1.0)),
             self.gradient,
             group=group,
         )
@@ -81,12 +106,19 @@ class ImageLoss:
 
     def value(self) -> float:
         """The loss at the last ``evaluate``; waits for the device."""
-        ssim, l1, pixels, _ = self.rt.download(self._line_sums).astype(np.float64).sum(axis=0)
-        return float(l1 / max(pixels, 1.0) + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
+        ssim, l1, pixels, squares = self.rt.download(self._line_sums).astype(np.float64).sum(axis=0)
+        data = (self.l1_weight * l1 + 0.5 * self.poisson_weight * squares) / max(pixels, 1.0)
+        return float(data + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
 
 
 def image_loss(
-    rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float
+    rendered: np.ndarray,
+    measured: np.ndarray,
+    mask: np.ndarray,
+    ssim_weight: float,
+    l1_weight: float = 1.0,
+    poisson_weight: float = 0.0,
+    transmission: np.ndarray | None = None,
 ) -> tuple[float, np.ndarray]:
     """Float64 twin: the loss and dL/drendered, images (lines, width)."""
     x, y = rendered * mask, measured * mask
@@ -98,8 +130,11 @@ def image_loss(
     by_mean = 2 * my * n2 / (d1 * d2) - 2 * mx * ssim / d1 - 2 * mx * by_xx - my * by_xy
     by_ssim = _blur(by_mean) + 2 * x * _blur(by_xx) + y * _blur(by_xy)
     pixels = max(mask.sum(), 1.0)
-    loss = np.abs(x - y).sum() / pixels + ssim_weight * (1 - ssim.mean())
-    return float(loss), mask * (np.sign(x - y) / pixels - ssim_weight * by_ssim / x.size)
+    weights = poisson_weight * (0.0 if transmission is None else transmission)
+    data = (l1_weight * np.abs(x - y) + 0.5 * weights * (x - y) ** 2).sum() / pixels
+    by_data = (l1_weight * np.sign(x - y) + weights * (x - y)) / pixels
+    loss = data + ssim_weight * (1 - ssim.mean())
+    return float(loss), mask * (by_data - ssim_weight * by_ssim / x.size)
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ Each knows its domain, its range and its transpose, and no algorithm.
 """
 
 from phyradgs_cl.operators.backproject import backproject, backproject_lines
+from phyradgs_cl.operators.intensity import IntensityOperator
 from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
 from phyradgs_cl.operators.rays import RayProjector
@@ -14,6 +15,7 @@ __all__ = [
     "DEFAULT_CUTOFF_SIGMA",
     "DeviceCells",
     "DeviceGaussians",
+    "IntensityOperator",
     "LinearOperator",
     "RayOperator",
     "RayProjector",

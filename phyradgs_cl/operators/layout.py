@@ -85,26 +85,42 @@ class DeviceCells:
     """The time cells of one frame on the device; lines are always the slow axis of the image.
 
     A frame read out along columns is handled as its transpose: only the poses' pixel steps change places.
+    With motion, ``matrices`` has three poses a cell, middle and both ends, and ``line_times`` (C, 3, time_pitch) when
+    every line integrates (TimeCells.line_times); without, it is a dummy.
     """
 
     cells: DeviceArray
     matrices: DeviceArray
     cell_lines: DeviceArray
     line_cells: DeviceArray
+    line_times: DeviceArray
     count: int
     lines: int
+    moving: bool = False
+
+    @property
+    def time_pitch(self) -> int:
+        return pitch_of(self.lines)
 
     @classmethod
     def upload(cls, rt: Runtime, table: TimeCells) -> DeviceCells:
         pose = transpose_pose(table.pose) if table.axis == "columns" else table.pose
+        poses, times = pose, np.zeros(1, np.float32)
+        if table.end_poses is not None and table.line_times is not None:
+            ends = transpose_pose(table.end_poses) if table.axis == "columns" else table.end_poses
+            poses = np.concatenate([pose[:, None], ends], 1).reshape(-1, pose.shape[1])
+            times = np.zeros((table.count, 3, pitch_of(table.lines)), np.float32)
+            times[:, :, : table.lines] = table.line_times
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
         return cls(
             cells=rt.upload(cell_constants(pose, table.weight)),
-            matrices=split_coefficients(rt, projection_matrices(pose)),
+            matrices=split_coefficients(rt, projection_matrices(poses)),
             cell_lines=rt.upload(ranges),
             line_cells=rt.upload(cells_of_lines(ranges, table.lines)),
+            line_times=rt.upload(times),
             count=table.count,
             lines=table.lines,
+            moving=table.end_poses is not None,
         )
 
 

@@ -64,13 +64,26 @@ class RayOperator:
 
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
+        return self._project(volume, "log")
+
+    def intensity_gap(self, volume: np.ndarray) -> np.ndarray:
+        """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
+
+        Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
+        to what an intensity detector measured of about x, it is what a log detector would have measured.
+        """
+        return self._project(volume, "gap")
+
+    def _project(self, volume: np.ndarray, average: str) -> np.ndarray:
         _check_shape("volume", volume, self.volume_shape)
         shared = self._shared
         shared.write_volume(volume)
         result = np.empty(self.frames_shape, np.float32)
         for part, listed in self._batches:
             frames = shared.frames(listed.size)
-            launch_forward(self.rt, shared.layout, shared.cells, listed, shared.volume, frames)
+            launch_forward(
+                self.rt, shared.layout, shared.cells, listed, shared.volume, frames, average=average
+            )
             by_line = unpad_rows(self.rt.download(frames), shared.layout.frames_shape(listed.size))
             result[part] = self._lines_first(by_line)
         return result

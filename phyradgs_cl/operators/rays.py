@@ -25,6 +25,7 @@ _BRICK = (32, 32, 8)
 _SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL promises
 _BLOCK = 4  # voxels a side of what a work-group takes where work-items are voxels; as in cl/rays.cl
 _LONG_FROM = 2**31  # floats: where 32-bit indices end
+AVERAGES = ("log", "intensity", "gap")  # gap: log less intensity; in the order of cl/rays.cl
 
 
 @dataclass(frozen=True)
@@ -121,9 +122,9 @@ def launch_forward(
     volume: DeviceArray,
     frames: DeviceArray,
     *,
-    intensity: bool = False,
+    average: str = "log",
 ) -> None:
-    """The listed frames of a padded volume, into ``frames``."""
+    """The listed frames of a padded volume, into ``frames``; ``average``, one of AVERAGES, is over a line's cells."""
     blocks = -(-layout.width // rt.lanes)
     rt.launch(
         rt.kernel("rays", "rays_forward", **_defines(rt, layout)),
@@ -134,7 +135,7 @@ def launch_forward(
         cells.line_cells,
         frame_list,
         *layout.constants(),
-        np.int32(intensity),
+        np.int32(AVERAGES.index(average)),
         frames,
         group=rt.group(on_cpu=min(blocks, 8)),
     )
@@ -251,8 +252,7 @@ class RayProjector:
         ``log`` averages line integrals over the cells; ``intensity`` takes −ln of the mean transmission.
         """
         cells = RayCells.upload(self.rt, self.grid, [table])
-        intensity = detector_model == "intensity"
-        launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, intensity=intensity)
+        launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
         image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]
         return image if self.axis == "rows" else np.ascontiguousarray(image.T)
 

@@ -20,20 +20,36 @@ from phyradgs_cl.operators.layout import (
     pitch_of,
     unpad_rows,
 )
+from phyradgs_cl.operators.splat_count import Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-RECORD_FLOATS = 16
+RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
+SUM_FLOATS = 16
+DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
 DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
 _BAND_LINES = 8
 _TILE = 16
 _BACKWARD_GROUP = 32
 
 
+def path_limits(time_error: float) -> tuple[float, float, float]:
+    """Longest paths within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
+
+    The rules' remainders for exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3 and 15, are path²/24,
+    path⁴/1440 and path⁶/134400 of the peak. Twice ``time_error`` in the worst pixel leaves some half of it RMS.
+    Longer paths take the closed form, whose moments lose digits below 0.7.
+    """
+    worst = 2 * time_error
+    one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
+    return one, two, max(three, 0.7)
+
+
 class SplatProjector:
     """Renders frames of ``lines`` lines by ``width`` pixels (the readout axis is the lines').
 
     ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the
-    Mahalanobis radius beyond which a Gaussian is not drawn; 0 draws all of it.
+    Mahalanobis radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` bounds what the rules
+    leave by which cells with motion average a splat over time (relative, RMS).
     """
 
     def __init__(
@@ -44,15 +60,17 @@ class SplatProjector:
         *,
         affine: bool = False,
         cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+        time_error: float = DEFAULT_TIME_ERROR,
     ) -> None:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
         self.cutoff2 = np.float32(cutoff_sigma**2)
+        self.path_limits = np.array([*path_limits(time_error), 0], np.float32)
         self.by_pixel = rt.pixel_items
         self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
-        self._defines = {"AFFINE": int(affine), "IMAGE_GUARD": GUARD}
+        self._affine = int(affine)
         self.image = padded_zeros(rt, lines, width)
         self._records = rt.empty(1)
         self._sums = rt.empty(1)
@@ -65,7 +83,9 @@ class SplatProjector:
         self._prepare(gaussians, cells)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         rt = self.rt
-        kernel = rt.kernel("splat_forward", "splat_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines)
+        kernel = rt.kernel(
+            "splat_forward", "splat_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines(cells)
+        )
         items = (self.pitch, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
             kernel,
@@ -73,6 +93,9 @@ class SplatProjector:
             self._records,
             cells.cells,
             cells.line_cells,
+            cells.line_times,
+            np.int32(cells.time_pitch),
+            self.path_limits,
             self.lists.starts,
             self.lists.entries,
             np.int32(cells.count),
@@ -97,12 +120,15 @@ class SplatProjector:
         """
         rt = self.rt
         group = _BACKWARD_GROUP if self.by_pixel else 1
-        kernel = rt.kernel("splat_backward", "splat_backward", GROUP=group, **self._defines)
+        kernel = rt.kernel("splat_backward", "splat_backward", GROUP=group, **self._defines(cells))
         rt.launch(
             kernel,
             gaussians.count * group,
             self._records,
             cells.cells,
+            cells.line_times,
+            np.int32(cells.time_pitch),
+            self.path_limits,
             by_image,
             np.int32(gaussians.count),
             np.int32(cells.count),
@@ -112,7 +138,7 @@ class SplatProjector:
             group=group if group > 1 else 16,
         )
         rt.launch(
-            rt.kernel("splat_chain", "splat_chain", **self._defines),
+            rt.kernel("splat_chain", "splat_chain", **self._defines(cells)),
             gaussians.stride // rt.lanes,
             gaussians.rows,
             cells.cells,
@@ -129,33 +155,45 @@ class SplatProjector:
         )
 
     def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
-        """Of the last ``forward``: Gaussian–pixel pairs in bounding boxes, pairs that were evaluated (whole vectors),
-        and Gaussian–cell footprints.
+        """Of the last ``forward``: Gaussian–pixel pairs in the spans that are walked, pairs that were evaluated (whole
+        vectors), and Gaussian–cell footprints.
         """
-        shape = (gaussians.stride, cells.count, RECORD_FLOATS)
-        whole = self.rt.download(DeviceArray(self._records.buffer, shape, np.dtype(np.int32)))[
-            : gaussians.count
-        ]
-        rows = np.maximum(whole[..., 14].astype(np.int64) - whole[..., 13] + 1, 0)
-        columns = np.where(rows > 0, whole[..., 12].astype(np.int64) - whole[..., 11] + 1, 0)
-        vectors = -(-columns // self.rt.lanes) * self.rt.lanes
-        return int((rows * columns).sum()), int((rows * vectors).sum()), int((rows > 0).sum())
+        work = self.work(gaussians, cells)
+        return work.pairs, work.evaluated, work.footprints
+
+    def work(self, gaussians: DeviceGaussians, cells: DeviceCells) -> Work:
+        """What the last ``forward`` of these Gaussians and cells had to do."""
+        shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
+        size = int(np.prod(shape))
+        records = self.rt.download(DeviceArray(self._records.buffer, (size,), np.dtype(np.float32)))
+        records = records.reshape(shape)[: gaussians.count]
+        if not cells.moving:
+            return still_work(records, self.rt.lanes)
+        times = self.rt.download(cells.line_times)
+        return moving_work(records, times, self.path_limits, self.rt.lanes, bool(self.cutoff2 > 0))
+
+    def _defines(self, cells: DeviceCells) -> dict[str, int]:
+        """What the kernels are built with; cells without motion get code without it."""
+        return {"AFFINE": self._affine, "IMAGE_GUARD": GUARD, "MOVING": int(cells.moving)}
 
     def _prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
         rt = self.rt
-        floats = gaussians.stride * cells.count * RECORD_FLOATS
-        if self._records.size < floats:
-            self._records = rt.empty(floats)
-            self._sums = rt.empty(floats)
+        footprints = gaussians.stride * cells.count
+        if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
+            self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
+        if self._sums.size < footprints * SUM_FLOATS:
+            self._sums = rt.empty(footprints * SUM_FLOATS)
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
         rt.launch(
-            rt.kernel("splat_prepare", "splat_prepare", **self._defines),
+            rt.kernel("splat_prepare", "splat_prepare", **self._defines(cells)),
             gaussians.stride // rt.lanes,
             gaussians.rows,
             cells.cells,
             cells.matrices,
             cells.cell_lines,
+            cells.line_times,
+            np.int32(cells.time_pitch),
             np.int32(cells.count),
             np.int32(gaussians.count),
             np.int32(gaussians.stride),

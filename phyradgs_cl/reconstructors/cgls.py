@@ -63,7 +63,8 @@ def cgls(
 class Cgls:
     """min ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0, until the residual's norm is ``enough`` or less.
 
-    The residual that is reported is the new one.
+    The residual that is reported is the new one. In the intensity model it is p − I(x), J takes A's place, and
+    directions combine as in nonlinear conjugate gradients (Polak and Ribière 1969), which is the same where I is linear.
     """
 
     def __init__(self, system: System, enough: float = 0.0) -> None:
@@ -71,22 +72,27 @@ class Cgls:
         self.volume = np.zeros(system.operator.volume_shape, np.float32)
         self.finished: str | None = None
         self.residual = system.measured.astype(np.float32)
-        self.direction = system.operator.adjoint(self.residual)
-        self.gamma = inner(self.direction, self.direction)
+        self.gradient = system.operator.adjoint(self.residual)
+        self.direction = self.gradient
+        self.gamma = inner(self.gradient, self.gradient)
 
     def step(self) -> float:
-        projected = self.system.forward(self.direction)
+        projected = self.system.derivative(self.direction)
         energy = inner(projected, projected)
         if self.gamma == 0 or energy == 0:
             self.finished = "exact solution"
             return norm(self.residual)
-        alpha = np.float32(self.gamma / energy)
+        linear = self.system.intensity is None
+        slope = self.gamma if linear else inner(self.gradient, self.direction)
+        alpha = np.float32(slope / energy)
         self.volume = self.volume + alpha * self.direction
-        self.residual = self.residual - alpha * projected
-        gradient = self.system.operator.adjoint(self.residual)
+        self.residual = self.residual - alpha * projected if linear else self.system.residual(self.volume)
+        gradient = self.system.back(self.residual)
         gamma = inner(gradient, gradient)
-        self.direction = gradient + np.float32(gamma / self.gamma) * self.direction
-        self.gamma = gamma
+        turned = 0.0 if linear else inner(gradient, self.gradient)
+        beta = np.float32(max(gamma - turned, 0.0) / self.gamma)
+        self.direction = gradient + beta * self.direction
+        self.gradient, self.gamma = gradient, gamma
         length = norm(self.residual)
         if length <= self.enough:
             self.finished = "residual as small as the noise"
@@ -97,10 +103,12 @@ class Cgls:
             "volume": self.volume,
             "residual": self.residual,
             "direction": self.direction,
+            "gradient": self.gradient,
             "gamma": np.array(self.gamma),
         }
 
     def restore(self, state: State) -> None:
-        names = ["volume", "residual", "direction", "gamma"]
-        self.volume, self.residual, self.direction, gamma = state_arrays(state, names)
+        arrays = state_arrays(state, list(self.state()))
+        self.volume, self.residual, self.direction, self.gradient, gamma = arrays
         self.gamma = float(gamma)
+        self.system.stand_at(self.volume)

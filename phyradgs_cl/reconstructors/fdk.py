@@ -45,7 +45,7 @@ class FdkOptions:
 
     def __post_init__(self) -> None:
         checks.one_of("FDK window", self.window, WINDOWS)
-        if self.motion.name == "micro-views":
+        if self.motion.name in ("micro-views", "exact"):
             raise InputError(
                 "--motion",
                 repr(self.motion.name),

@@ -30,12 +30,14 @@ from phyradgs_cl.runtime import Runtime
 class FistaTvOptions(IterativeOptions):
     """tv_weight: λ as a share of the largest value of Aᵀp, so that units and doses do not matter.
 
-    tv_iterations: dual iterations a proximal map; it goes on from the last one's dual.
+    tv_iterations: dual iterations a proximal map; it goes on from the last one's dual. transmission_weights: pixels
+    count by their light, ½ Σ t (p − A x)², and λ is a share of the largest value of Aᵀ t p.
     """
 
     iterations: int = 100
     tv_weight: float = 0.001
     tv_iterations: int = 10
+    transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,7 +70,11 @@ def axis_weights(grid: Grid) -> tuple[float, float, float]:
 
 
 class FistaTv:
-    """The residual that is reported is that of the new volume; A is linear, so momentum needs no projection of its own."""
+    """The residual that is reported is that of the new volume; A is linear, so momentum needs no projection of its own.
+
+    In the intensity model I(x) and Jᵀ at x stand in for A x and Aᵀ; what momentum's straight line misses of them vanishes
+    with the steps.
+    """
 
     def __init__(self, system: System, options: FistaTvOptions, prox: TvProx) -> None:
         self.system, self.options, self.prox = system, options, prox
@@ -80,9 +86,9 @@ class FistaTv:
         self.momentum = 1.0
         self.finished: str | None = None
         # AᵀA has no negative entry: its largest row sum bounds its norm
-        normal = system.operator.adjoint(system.row_sums())
+        normal = system.operator.adjoint(system.weighed(system.row_sums()))
         self.curvature = float(normal.max()) or 1.0
-        largest = float(np.abs(system.operator.adjoint(system.measured)).max())
+        largest = float(np.abs(system.operator.adjoint(system.weighed(system.measured))).max())
         self.tv_weight = options.tv_weight * largest
 
     def step(self) -> float:
@@ -90,13 +96,13 @@ class FistaTv:
         beta = np.float32((self.momentum - 1) / following)
         point = self.volume + beta * (self.volume - self.previous)
         projected = self.projected + beta * (self.projected - self.projected_previous)
-        gradient = self.system.operator.adjoint(self.system.measured - projected)
+        gradient = self.system.back(self.system.weighed(self.system.measured - projected))
         moved = point + np.float32(1 / self.curvature) * gradient
         weight = self.tv_weight / self.curvature
         volume = self.prox(moved, weight, self.options.tv_iterations, nonnegative=self.options.nonnegative)
         uphill = inner(point - volume, volume - self.volume) > 0
         self.previous, self.volume = self.volume, volume
-        self.projected_previous, self.projected = self.projected, self.system.forward(volume)
+        self.projected_previous, self.projected = self.projected, self.system.expected(volume)
         self.momentum = 1.0 if uphill else following
         return norm(self.system.measured - self.projected)
 
@@ -114,3 +120,4 @@ class FistaTv:
         arrays = state_arrays(state, list(self.state()))
         self.volume, self.previous, self.projected, self.projected_previous, momentum, dual = arrays
         self.momentum, self.prox.dual = float(momentum), dual
+        self.system.stand_at(self.volume)

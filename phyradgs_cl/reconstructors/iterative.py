@@ -8,13 +8,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import ClassVar
 from typing import Protocol as Interface
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.errors import NumericalError
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
 from phyradgs_cl.reconstructors.system import System, norm
@@ -29,17 +31,26 @@ class IterativeOptions:
 
     motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
     nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by
-    less than this share of its norm; 0 runs all iterations.
+    less than this share of its norm; 0 runs all iterations. detector_model: what is averaged over a line's times, line
+    integrals (log) or intensity, or what the scan says.
     """
+
+    transmission_weights: ClassVar[bool] = False
+    """Weigh pixels by their transmission; methods that can have an option of this name."""
 
     motion: Motion = Motion("static")
     iterations: int = 20
     nonnegative: bool = True
     tolerance: float = 0.0
+    detector_model: str = "scan"
 
     def __post_init__(self) -> None:
         checks.within("iterations", self.iterations, 0, MOST_ITERATIONS)
         checks.within("tolerance", self.tolerance, 0, 1)
+        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
+        if self.motion.name == "exact":
+            expected = "static, static-start, micro-views or per-row: exact moves splats, and rays have none"
+            raise InputError("--motion", "'exact'", expected, "take --motion per-row")
 
 
 class Algorithm(Interface):
@@ -75,7 +86,9 @@ def run_iterations(
     The record has a line an iteration: residual ‖p − A x‖/‖p‖, change ‖x − x'‖/‖x‖, seconds since the start.
     """
     started = time.perf_counter()
-    system = System.of_scan(rt, scan, options.motion)
+    system = System.of_scan(rt, scan, options.motion, options.detector_model)
+    if options.transmission_weights:
+        system = system.trusting_light()
     algorithm = make(system)
     iteration = 0
     if resume is not None:
@@ -86,6 +99,7 @@ def run_iterations(
     facts: dict[str, object] = {
         "method": method,
         "options": asdict(options),
+        "detector_model": "log" if system.intensity is None else "intensity",
         "iterations": loop.iteration,
         "stopped_by": loop.stopped_by,
         "seconds": time.perf_counter() - started,

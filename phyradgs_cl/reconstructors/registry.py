@@ -16,6 +16,7 @@ from phyradgs_cl.reconstructors.cgls import CglsOptions, cgls
 from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, fdk
 from phyradgs_cl.reconstructors.fista_tv import FistaTvOptions, fista_tv
 from phyradgs_cl.reconstructors.phyradgs import phyradgs
+from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
 from phyradgs_cl.reconstructors.r2 import r2
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.reconstructors.sart import OS_SART, SartOptions, os_sart, sart
@@ -23,8 +24,13 @@ from phyradgs_cl.reconstructors.sirt import SirtOptions, sirt
 from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
 from phyradgs_cl.runtime import Runtime
 
-_MOTION_KEYS = ("motion", "strips", "sub_intervals")
-_MODELS_WITH = {"strips": ("micro-views",), "sub_intervals": ("micro-views", "per-row")}
+_MOTION_KEYS = ("motion", "strips", "sub_intervals", "segments", "time_error")
+_MODELS_WITH = {
+    "strips": ("micro-views",),
+    "sub_intervals": ("micro-views", "per-row"),
+    "segments": ("exact",),
+    "time_error": ("exact",),
+}
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,8 @@ METHODS = {
 def method_options(method: str, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
 
-    ``motion``, ``strips`` and ``sub_intervals`` change the motion model together. Raises InputError for a name
-    that the method does not have, so that no option is accepted and ignored.
+    ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together.
+    Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
     """
     if not isinstance(method, str) or method not in METHODS:
         raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
@@ -75,11 +81,21 @@ def reconstruct(
     *,
     seed: int = 0,
     report: ProgressReport = ignore_progress,
+    before: InputOptions | None = None,
     **extra: Any,
 ) -> Reconstruction:
-    """Runs a method by name; ``options`` as from ``method_options``, the method's default when None."""
+    """Runs a method by name; ``options`` as from ``method_options``, the method's default when None.
+
+    ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing.
+    """
     chosen = method_options(method) if options is None else options
-    return METHODS[method].run(scan, chosen, rt, seed=seed, report=report, **extra)
+    ready = prepared(scan, InputOptions() if before is None else before)
+    return METHODS[method].run(ready, chosen, rt, seed=seed, report=report, **extra)
+
+
+def input_options(changes: Mapping[str, Any]) -> InputOptions:
+    """Input options by name, checked as the methods' own are."""
+    return _changed(InputOptions(), changes, "reconstruct")
 
 
 def motions_of(method: str) -> tuple[str, ...]:

@@ -32,12 +32,14 @@ class SartOptions(IterativeOptions):
 
     frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
     (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
+    transmission_weights: rays count by the light that came through, W = t/(A 1) and V = 1/(Aᵀ t).
     """
 
     relaxation: float = 1.0
     relaxation_reduction: float = 0.999
     frames_per_subset: int = 1
     order: str = "spread"
+    transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,7 +79,7 @@ def os_sart(
 
 
 class Sart:
-    """x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i, W = 1/(Aᵢ 1), V = 1/(Aᵢᵀ 1).
+    """x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i, W = 1/(Aᵢ 1), V = 1/(Aᵢᵀ 1); Jᵢᵀ and Iᵢ(x) in the intensity model.
 
     The residual that is reported is the pass's own: of every subset just before its correction.
     """
@@ -102,7 +104,7 @@ class Sart:
             subset = self.subsets[index]
             residual = subset.residual(volume)
             squares += norm(residual) ** 2
-            update = subset.operator.adjoint(self._row_weights[index] * residual)
+            update = subset.back(self._row_weights[index] * residual)
             volume += np.float32(self.relaxation) * self._columns(index) * update
             if self.options.nonnegative:
                 np.maximum(volume, 0, out=volume)

@@ -22,10 +22,11 @@ from phyradgs_cl.runtime import Runtime
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """relaxation: λ between 0 and 2."""
+    """relaxation: λ between 0 and 2. transmission_weights: rays count by their light, R = t/(A 1), C = 1/(Aᵀ t)."""
 
     iterations: int = 100
     relaxation: float = 1.0
+    transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -46,7 +47,7 @@ def sirt(
 
 
 class Sirt:
-    """x ← x + λ C Aᵀ R (p − A x), R = 1/(A 1), C = 1/(Aᵀ 1).
+    """x ← x + λ C Aᵀ R (p − A x), R = 1/(A 1), C = 1/(Aᵀ 1); Jᵀ and I(x) in the intensity model.
 
     The residual that is reported is the one before the correction: √R ‖·‖ of it falls without exception.
     """
@@ -60,7 +61,7 @@ class Sirt:
 
     def step(self) -> float:
         residual = self.system.residual(self.volume)
-        volume = self.volume + self._columns * self.system.operator.adjoint(self._rows * residual)
+        volume = self.volume + self._columns * self.system.back(self._rows * residual)
         self.volume = np.maximum(volume, 0) if self.options.nonnegative else volume
         return norm(residual)
 

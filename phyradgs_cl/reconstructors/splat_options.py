@@ -14,6 +14,8 @@ from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 _WEIGHT = (0, 1e6)
 _RANGES = {
     "ssim_weight": _WEIGHT,
+    "l1_weight": _WEIGHT,
+    "poisson_weight": _WEIGHT,
     "tv_weight": _WEIGHT,
     "tv_edge": (1, 4096),
     "density_weight": _WEIGHT,
@@ -45,6 +47,8 @@ class SplatOptions:
     iterations: int = 3000
     gaussians: int = 0
     ssim_weight: float = 0.2
+    l1_weight: float = 1.0
+    poisson_weight: float = 0.0
     tv_weight: float = 0.01
     tv_edge: int = 32
     density_weight: float = 0.001
@@ -69,7 +73,7 @@ class SplatOptions:
         if self.scale_max <= self.scale_min:
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
         if self.motion.name == "per-row":
-            raise InputError("--motion", "'per-row'", "static, static-start or micro-views")
+            raise InputError("--motion", "'per-row'", "static, static-start, micro-views or exact")
 
     def activation(self, grid: Grid) -> Activation:
         """Bounds of the scales on ``grid`` (in internal units)."""

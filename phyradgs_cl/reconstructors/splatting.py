@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
@@ -86,6 +87,8 @@ def reconstruct_splats(
         "seconds": time.perf_counter() - started,
         "interrupted_at": run.interrupted_at,
     }
+    if options.motion.name == "exact":
+        facts |= run.time_facts()
     state = run.state() if run.interrupted_at is not None else None
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, record, facts, state)
@@ -116,10 +119,21 @@ class SplatRun:
         self.activation = options.activation(self.grid)
         self.frames = DeviceFrames(rt, scan, options, scale)
         self.projector = SplatProjector(
-            rt, self.frames.lines, self.frames.width, affine=options.affine, cutoff_sigma=options.cutoff_sigma
+            rt,
+            self.frames.lines,
+            self.frames.width,
+            affine=options.affine,
+            cutoff_sigma=options.cutoff_sigma,
+            time_error=options.motion.time_error,
         )
         self.loss = ImageLoss(
-            rt, self.frames.lines, self.frames.width, self.projector.pitch, options.ssim_weight
+            rt,
+            self.frames.lines,
+            self.frames.width,
+            self.projector.pitch,
+            options.ssim_weight,
+            options.l1_weight,
+            options.poisson_weight,
         )
         edge = [min(options.tv_edge, n) for n in self.grid.shape]
         self.crop = Voxeliser(rt, (edge[0], edge[1], edge[2]), cutoff_sigma=options.cutoff_sigma)
@@ -160,7 +174,8 @@ class SplatRun:
         cells, measured, mask, pixels = self.frames.get(frame)
         self.adam.activate(self.raw, gaussians.rows, gaussians.count, gaussians.stride)
         rendered = self.projector.forward(gaussians, cells)
-        by_image = self.loss.evaluate(rendered, measured, mask, pixels)
+        trust = self.frames.transmission(frame)
+        by_image = self.loss.evaluate(rendered, measured, mask, pixels, trust)
         self.projector.backward(gaussians, cells, by_image, self.gradients)
         if options.tv_weight > 0:
             self._add_total_variation()
@@ -208,6 +223,14 @@ class SplatRun:
                 "check the scan for extreme values",
             )
         return loss
+
+    def time_facts(self) -> dict[str, object]:
+        """How the motion ``exact`` averaged over time: the largest K of a frame, and the share of pairs by rule."""
+        self.adam.activate(self.raw, self.gaussians.rows, self.gaussians.count, self.gaussians.stride)
+        cells = self.frames.get(0)[0]
+        self.projector.forward(self.gaussians, cells)
+        shares = self.projector.work(self.gaussians, cells).rule_shares()
+        return {"segments": self.frames.most_cells, "time_rules": shares}
 
     # --- stop and go on ---------------------------------------------------------------------------------
 
@@ -281,6 +304,20 @@ class DeviceFrames:
         frames = scan.projections / np.float32(scale.line_integral)
         self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
         self._mask, self._pixels = _upload_masks(rt, scan, by_column)
+        self._transmission: list[DeviceArray] = []
+        if options.poisson_weight > 0:
+            valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
+            trust = transmission_weights(scan.projections, valid)
+            self._transmission = [rt.upload(pad_rows(t.T if by_column else t)) for t in trust]
+
+    def transmission(self, frame: int) -> DeviceArray | None:
+        """Weights of the Poisson term, where it counts."""
+        return self._transmission[frame] if self._transmission else None
+
+    @property
+    def most_cells(self) -> int:
+        """The largest number of time cells of a frame."""
+        return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
         shared = frame if len(self._mask) > 1 else 0
@@ -300,15 +337,8 @@ def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[Device
 
 def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
     """The same cells with all lengths multiplied by ``factor``."""
-    return TimeCells(
-        table.pose * factor,
-        table.time_s,
-        table.line_start,
-        table.line_stop,
-        table.weight,
-        table.lines,
-        table.axis,
-    )
+    ends = None if table.end_poses is None else table.end_poses * factor
+    return replace(table, pose=table.pose * factor, end_poses=ends)
 
 
 def static_poses(scan: Scan) -> np.ndarray:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.detector import transmission_weights
+from phyradgs_cl.operators.intensity import IntensityOperator
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
 from phyradgs_cl.runtime import Runtime
 
@@ -19,22 +22,33 @@ class System:
     """Operator A and measurement p (F, rows, columns) float32; ``valid`` (F, rows, columns) bool, None: all pixels.
 
     Pixels that are not valid are 0 in ``measured`` and in every residual, as if their rows were not in A.
+    ``intensity`` is there where the detector adds photons: the measurement is then compared with I(x) instead of A x,
+    and what comes back goes through Jᵀ, the derivative of I at the volume of the last comparison, instead of Aᵀ.
+    ``light`` (F, rows, columns) weighs pixels by their transmission, mean 1; None: all alike.
     """
 
     operator: LinearOperator
     measured: np.ndarray
     valid: np.ndarray | None = None
+    intensity: IntensityOperator | None = None
+    light: np.ndarray | None = None
 
     @classmethod
-    def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion) -> System:
-        """The scan's frames with the cells of ``motion``."""
+    def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> System:
+        """The scan's frames with the cells of ``motion``; ``detector_model``: log, intensity, or the scan's own."""
         tables = [motion.cells(scan, f) for f in range(scan.frames)]
         operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         measured = np.asarray(scan.projections, np.float32)
+        model = scan.detector_model if detector_model == "scan" else detector_model
+        intensity = None
+        if model == "intensity" and any(
+            averages(table) for table in tables
+        ):  # of one value both are the mean
+            intensity = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         if scan.pixel_mask is None:
-            return cls(operator, measured)
+            return cls(operator, measured, None, intensity)
         valid = np.broadcast_to(scan.pixel_mask == 0, measured.shape)
-        return cls(operator, np.where(valid, measured, np.float32(0)), valid)
+        return cls(operator, np.where(valid, measured, np.float32(0)), valid, intensity)
 
     @property
     def frames(self) -> int:
@@ -48,23 +62,59 @@ class System:
         """A x at the pixels that count."""
         return self.masked(self.operator.forward(volume))
 
+    def expected(self, volume: np.ndarray) -> np.ndarray:
+        """What the detector would measure of x, at the pixels that count: A x, or I(x) in the intensity model."""
+        if self.intensity is None:
+            return self.forward(volume)
+        return self.masked(self.intensity.expected(volume))
+
+    def derivative(self, change: np.ndarray) -> np.ndarray:
+        """What a change of the volume of the last ``expected`` or ``residual`` would change in it: A d, or J d."""
+        if self.intensity is None:
+            return self.forward(change)
+        return self.masked(self.intensity.forward(change))
+
+    def back(self, frames: np.ndarray) -> np.ndarray:
+        """The transpose of ``derivative``: frames (0 where pixels do not count) to a volume by Aᵀ, or Jᵀ."""
+        return (self.operator if self.intensity is None else self.intensity).adjoint(frames)
+
     def residual(self, volume: np.ndarray) -> np.ndarray:
-        """p − A x, dimensionless."""
-        return self.measured - self.forward(volume)
+        """Measured less expected, dimensionless: p − A x, or p − I(x)."""
+        return self.measured - self.expected(volume)
+
+    def stand_at(self, volume: np.ndarray) -> None:
+        """Puts J where an interrupted run had it; A is the same everywhere."""
+        if self.intensity is not None:
+            self.intensity.expected(volume)
 
     def row_sums(self) -> np.ndarray:
         """A 1 in mm: the length of every ray in the volume."""
         return self.forward(np.ones(self.operator.volume_shape, np.float32))
 
     def column_sums(self) -> np.ndarray:
-        """Aᵀ 1 in mm, over the pixels that count."""
-        return self.operator.adjoint(self.masked(np.ones(self.measured.shape, np.float32)))
+        """Aᵀ 1 in mm over the pixels that count, or Aᵀ t with their light."""
+        return self.operator.adjoint(self.masked(self.weighed(np.ones(self.measured.shape, np.float32))))
+
+    def weighed(self, frames: np.ndarray) -> np.ndarray:
+        """Frames times the light of their pixels."""
+        return frames if self.light is None else frames * self.light
+
+    def trusting_light(self) -> System:
+        """The same system with pixels that count by their transmission."""
+        return replace(self, light=transmission_weights(self.measured, self.valid))
 
     def subset(self, frames: Sequence[int]) -> System:
         """The system of some frames."""
         chosen = list(frames)
         valid = None if self.valid is None else self.valid[chosen]
-        return System(self.operator.subset(chosen), self.measured[chosen], valid)
+        intensity = None if self.intensity is None else self.intensity.subset(chosen)
+        light = None if self.light is None else self.light[chosen]
+        return System(self.operator.subset(chosen), self.measured[chosen], valid, intensity, light)
+
+
+def averages(table: TimeCells) -> bool:
+    """Whether a line of the frame has more than one cell."""
+    return table.count > len(np.unique(table.line_start))
 
 
 def norm(values: np.ndarray) -> float:
@@ -85,9 +135,9 @@ def reciprocal(sums: np.ndarray, share: float = 1e-6) -> np.ndarray:
 
 
 def row_weights(system: System) -> np.ndarray:
-    """1/(A 1) of every ray, 1/mm, no more than that of a ray through a tenth of the longest path.
+    """1/(A 1) of every ray, 1/mm, no more than that of a ray through a tenth of the longest path; times its light.
 
     A ray that only grazes an edge of the volume would else put its whole noise on a voxel or two, and bright corners
     are what one sees of it. TIGRE measures the paths in a box that is a tenth larger, to the same end.
     """
-    return reciprocal(system.row_sums(), _SHORTEST_PATH)
+    return system.weighed(reciprocal(system.row_sums(), _SHORTEST_PATH))

@@ -108,6 +108,50 @@ def test_columns_and_intensity_and_jitter_are_simulated(cli, tmp_path):
     assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "v.h5"), "--iterations", "5"]) == 0
 
 
+@pytest.mark.parametrize(
+    ("options", "warns"),
+    [
+        (["--method", "fdk"], True),
+        (["--method", "sart", "--motion", "micro-views", "--iterations", "1"], False),
+        (["--method", "sart", "--iterations", "1", "--detector-model", "log"], False),
+    ],
+)
+def test_methods_without_the_intensity_model_say_so(cli, tmp_path, caplog, options, warns):
+    path = tmp_path / "scan.h5"
+    assert cli.run([*SIMULATE, "--detector-model", "intensity", "-o", str(path)]) == 0
+    assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "v.h5"), *options]) == 0
+    assert ("averages intensity" in caplog.text) == warns
+
+
+def test_a_detector_model_belongs_to_the_methods_that_have_one(cli, scan, tmp_path, capsys):
+    options = ["--method", "fdk", "--detector-model", "intensity"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), *options]) == 2
+    assert "detector_model" in capsys.readouterr().err
+
+
+def test_pulse_and_lag_are_simulated_and_the_lag_may_be_ignored(cli, tmp_path):
+    path, volumes = tmp_path / "scan.h5", []
+    assert cli.run([*SIMULATE, "--pulse", "0.86,0.14", "--lag", "0.1", "-o", str(path)]) == 0
+    with h5py.File(path) as file:
+        own = file["entry/phyradgs"]
+        assert (own["pulse_start"][()], own["pulse_length"][()], own["lag"][()]) == (0.86, 0.14, 0.1)
+    for options in ([], ["--ignore-lag"], ["--median-filter", "3"], ["--set", "median_filter=3"]):
+        output = tmp_path / "volume.h5"
+        assert cli.run(["reconstruct", str(path), "-o", str(output), "--method", "fdk", *options]) == 0
+        with h5py.File(output) as file:
+            volumes.append(file["entry/reconstruction/volume"][()])
+            facts = json.loads(file["entry/provenance/json"][()])
+        assert facts["input"]["ignore_lag"] == ("--ignore-lag" in options)
+    assert np.abs(volumes[0] - volumes[1]).max() > 0 and np.abs(volumes[0] - volumes[2]).max() > 0
+    np.testing.assert_array_equal(volumes[2], volumes[3])
+
+
+@pytest.mark.parametrize("pulse", ["0.5", "a,b", "0,0", "5,1"])
+def test_impossible_pulses_are_named(cli, tmp_path, capsys, pulse):
+    assert cli.run([*SIMULATE, "--pulse", pulse, "-o", str(tmp_path / "scan.h5")]) == 2
+    assert "pulse" in capsys.readouterr().err
+
+
 def test_simulating_twice_with_one_seed_gives_the_same_frames(cli, tmp_path):
     frames = []
     for run, seed in enumerate((3, 3, 4)):
@@ -149,7 +193,8 @@ def test_numbers_of_a_config_may_be_written_as_whole_floats(cli, scan, tmp_path)
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config)]) == 0
     with h5py.File(output) as file:
         facts = json.loads(file["entry/provenance/json"][()])
-    assert facts["options"]["motion"] == {"name": "micro-views", "strips": 2, "sub_intervals": 3}
+    motion = facts["options"]["motion"]
+    assert (motion["name"], motion["strips"], motion["sub_intervals"]) == ("micro-views", 2, 3)
     assert (facts["seed"], facts["options"]["iterations"]) == (3, 2)
 
 

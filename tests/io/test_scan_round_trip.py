@@ -123,6 +123,62 @@ def test_shutters_come_back(tmp_path, make_scan, axis, direction, readout_s) -> 
     assert read_scan(tmp_path / "scan.h5", counts_to_attenuation).shutter == shutter
 
 
+@pytest.mark.parametrize("is_fly", [True, False])
+def test_pulse_and_lag_come_back(tmp_path, make_scan, is_fly) -> None:
+    path = tmp_path / "scan.h5"
+    write_scan(path, make_scan())
+    with h5py.File(path) as file:
+        assert not {"pulse_start", "pulse_length", "lag"} & set(file["entry/phyradgs"])
+    assert read_scan(path, counts_to_attenuation).lag == 0
+    pulsed = Shutter(0.8, 1.2, "columns", -1, (0.25, 0.5))
+    scan = make_scan(shutter=pulsed, lag=0.04, is_fly=is_fly)
+    assert scan.pixel_mask[:, 0].all() and not scan.pixel_mask[:, 2:].any()  # column 0 opens last, at 1.2 s
+    write_scan(path, scan)
+    again = read_scan(path, counts_to_attenuation)
+    assert (again.shutter, again.lag) == (pulsed, 0.04)
+    np.testing.assert_array_equal(again.pixel_mask, scan.pixel_mask)
+    for frame in range(scan.frames):
+        ours, theirs = (Motion("static").cells(s, frame).pose for s in (scan, again))
+        np.testing.assert_allclose(theirs, ours, rtol=0, atol=LENGTH_TOLERANCE_MM)
+    facts = scan_summary(path)
+    assert (facts["pulse_start_s"], facts["pulse_length_s"], facts["lag"]) == (0.25, 0.5, 0.04)
+    assert facts["dark_lines"] == 2
+
+
+def test_a_standing_gantry_on_a_pose_table_keeps_its_pulsed_pose(tmp_path, make_scan) -> None:
+    pulsed = Shutter(0.8, 0.3, "columns", -1, (0.2, 0.2))
+    scan = make_scan(is_fly=False, shutter=pulsed)
+    scan = dataclasses.replace(scan, trajectory=wobbling_table(scan))
+    write_scan(tmp_path / "scan.h5", scan)
+    again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
+    assert again.shutter.pulse_s is None
+    for frame in range(scan.frames):
+        ours, theirs = (Motion("static").cells(s, frame).pose for s in (scan, again))
+        np.testing.assert_allclose(theirs, ours, rtol=0, atol=LENGTH_TOLERANCE_MM)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "culprit"),
+    [
+        ("lag", 1.0, "lag"),
+        ("lag", -0.1, "lag"),
+        ("pulse_length", 0.0, "pulse_length"),
+        ("pulse_start", 7.0, "pulse_start"),
+        ("pulse_start", None, "pulse_start"),
+    ],
+)
+def test_impossible_pulses_and_lags_are_named(tmp_path, make_scan, name, value, culprit) -> None:
+    path = tmp_path / "scan.h5"
+    write_scan(path, make_scan(shutter=Shutter(0.8, 0.3, "columns", -1, (0.25, 0.5)), lag=0.1))
+    with h5py.File(path, "r+") as file:
+        if value is None:
+            del file[f"entry/phyradgs/{name}"]
+        else:
+            file[f"entry/phyradgs/{name}"][...] = value
+    with pytest.raises(InputError, match=f"/entry/phyradgs/{culprit}"):
+        read_scan(path, counts_to_attenuation)
+
+
 def test_fly_rule_follows_motion_and_exposure(tmp_path, make_scan) -> None:
     path = tmp_path / "scan.h5"
     write_scan(path, make_scan())

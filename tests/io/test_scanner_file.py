@@ -65,6 +65,19 @@ def test_all_fields(write) -> None:
     assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("columns", -1, 0.5)
 
 
+def test_pulse_and_lag_of_a_scanner(write) -> None:
+    plain = load_scanner(write(GOOD), DATA)
+    assert plain.pulse is None and plain.lag == 0
+    panel = GOOD.replace("columns = 60", "columns = 60\nlag = 0.03")
+    scanner = load_scanner(write(panel + "[beam]\npulse_start = 0.5\npulse_length = 0.25\n"), DATA)
+    assert scanner.pulse == (0.5, 0.25) and scanner.lag == 0.03
+    for line, key in (("pulse_start = 0.5", "pulse_length"), ("pulse_start = 0\npulse_length = 0", "length")):
+        with pytest.raises(InputError, match=rf"\[beam\] .*{key}"):
+            load_scanner(write(f"{GOOD}[beam]\n{line}\n"), DATA)
+    with pytest.raises(InputError, match=r"\[detector\] lag"):
+        load_scanner(write(GOOD.replace("columns = 60", "columns = 60\nlag = 1.0")), DATA)
+
+
 def test_volume_and_readout_may_be_left_out(write) -> None:
     scanner = load_scanner(write(GOOD.split("[volume]")[0]), DATA)
     assert scanner.grid == default_grid(scanner.geometry)

@@ -32,11 +32,14 @@ def mask_of(shape: tuple[int, int], kind: str) -> np.ndarray:
     return mask
 
 
-def on_device(rt, rendered, measured, mask, weight: float) -> tuple[float, np.ndarray]:
+def on_device(
+    rt, rendered, measured, mask, weight: float, transmission=None, **data: float
+) -> tuple[float, np.ndarray]:
     lines, width = rendered.shape
-    loss = ImageLoss(rt, lines, width, pitch_of(width), weight)
+    loss = ImageLoss(rt, lines, width, pitch_of(width), weight, **data)
     arrays = [rt.upload(pad_rows(a)) for a in (rendered, measured, mask)]
-    flat = rt.download(loss.evaluate(*arrays, float(mask.sum())))
+    trust = None if transmission is None else rt.upload(pad_rows(transmission))
+    flat = rt.download(loss.evaluate(*arrays, float(mask.sum()), trust))
     gradient = unpad_rows(flat, rendered.shape)
     assert np.count_nonzero(flat) == np.count_nonzero(gradient)  # the padding stays zero
     return loss.value(), gradient
@@ -62,6 +65,37 @@ def test_twin_is_differentiated_right(finite_differences, weight, kind) -> None:
     expected = finite_differences(lambda x: image_loss(x, measured, mask, weight)[0], rendered)
     _, gradient = image_loss(rendered, measured, mask, weight)
     np.testing.assert_allclose(gradient, expected, rtol=0, atol=TWIN_GRADIENT * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("data", [{"poisson_weight": 3.0}, {"l1_weight": 0.0, "poisson_weight": 10.0}])
+@pytest.mark.parametrize("kind", ["all", "some"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_poisson_term_is_its_twin(any_rt, shape, data, kind) -> None:
+    rendered, measured = images(shape)
+    mask, trust = mask_of(shape, kind), np.exp(-3 * measured)
+    value, gradient = on_device(any_rt, rendered, measured, mask, 0.2, trust, **data)
+    expected, by_image = image_loss(rendered, measured, mask, 0.2, transmission=trust, **data)
+    assert abs(value - expected) <= IMAGE_VALUE * max(expected, 1)
+    np.testing.assert_allclose(gradient, by_image, rtol=0, atol=IMAGE_GRADIENT * np.abs(by_image).max())
+
+
+@pytest.mark.parametrize("data", [{"poisson_weight": 3.0}, {"l1_weight": 0.0, "poisson_weight": 10.0}])
+def test_poisson_twin_is_differentiated_right(finite_differences, data) -> None:
+    rendered, measured = images((13, 9), 1)
+    mask, trust = mask_of((13, 9), "some"), np.exp(-3 * measured)
+    more = {"transmission": trust, **data}
+    expected = finite_differences(lambda x: image_loss(x, measured, mask, 0.2, **more)[0], rendered)
+    _, gradient = image_loss(rendered, measured, mask, 0.2, **more)
+    np.testing.assert_allclose(gradient, expected, rtol=0, atol=TWIN_GRADIENT * np.abs(expected).max())
+
+
+def test_without_a_weight_transmissions_change_no_bit(rt) -> None:
+    rendered, measured = images((24, 31), 2)
+    mask = mask_of((24, 31), "some")
+    plain = on_device(rt, rendered, measured, mask, 0.2)
+    beside = on_device(rt, rendered, measured, mask, 0.2, np.full((24, 31), 7.0))
+    assert plain[0] == beside[0]
+    np.testing.assert_array_equal(plain[1], beside[1])
 
 
 def test_masked_pixels_pull_at_nothing(any_rt) -> None:

@@ -125,9 +125,11 @@ def test_unknown_options_of_a_table_name_the_table_and_what_it_has() -> None:
     assert "strips" not in refusal.value.expected
 
 
-def test_splats_have_no_exact_line_times_and_fdk_no_micro_views() -> None:
+def test_only_splats_are_exact_in_time_and_fdk_has_no_micro_views() -> None:
     for method in ("phyradgs", "r2"):
-        assert motions_of(method) == ("static", "static-start", "micro-views")
+        assert motions_of(method) == ("static", "static-start", "micro-views", "exact")
+    for method in ("sirt", "fdk"):
+        assert "exact" not in motions_of(method)
     assert "micro-views" not in motions_of("fdk")
 
 
@@ -142,9 +144,10 @@ def test_errors_about_motion_offer_what_the_method_has(method) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("key", ["strips", "sub_intervals"])
+@pytest.mark.parametrize("key", ["strips", "sub_intervals", "segments"])
 def test_counts_belong_to_the_motions_that_have_them(method, key) -> None:
-    having = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}}[key]
+    models = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}, "segments": {"exact"}}
+    having = models[key]
     if method == "fdk":  # one pose a line
         having = set()
     for name in motions_of(method):

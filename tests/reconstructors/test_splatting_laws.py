@@ -88,6 +88,17 @@ def test_more_counts_make_the_same_volume(rt, scan, gain) -> None:
     assert difference(from_counts(1e4 * gain), from_counts(1e4)) <= GAIN_LAW
 
 
+def test_exact_motion_says_how_it_averaged(rt, scan) -> None:
+    """Which rules served how many pairs, and K; with the same bits every time and a loss like that of micro-views."""
+    options = replace(OPTIONS, motion=Motion("exact", segments=3))
+    result = phyradgs(scan, options, rt)
+    assert result.facts["segments"] == 3
+    assert sum(result.facts["time_rules"].values()) == pytest.approx(1.0)
+    np.testing.assert_array_equal(result.volume, phyradgs(scan, options, rt).volume)
+    assert result.record[-1]["loss"] < 1.1 * phyradgs(scan, OPTIONS, rt).record[-1]["loss"]
+    assert "segments" not in phyradgs(scan, replace(OPTIONS, iterations=0), rt).facts
+
+
 def test_it_gets_better(rt, scan) -> None:
     """200 iterations halve the loss of the first ones, and the volume comes nearer to the phantom."""
     truth = shepp_logan(1.0).voxelise(scan.grid, 3)

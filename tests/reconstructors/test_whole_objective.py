@@ -1,6 +1,7 @@
 """One iteration of the real loop against finite differences of the whole objective in float64.
 
-Raw numbers → activation → splats through time cells → L1 + SSIM, + total variation of a crop, + parameter terms.
+Raw numbers → activation → splats through time cells → L1 + weighed squares + SSIM, + total variation of a crop, + parameter
+terms.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from tolerances import FINITE_DIFFERENCE_STEP, WHOLE_GRADIENT, WHOLE_VALUE
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Scan, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import ParameterTerms, image_loss, parameter_loss, total_variation
@@ -28,6 +30,8 @@ OPTIONS = SplatOptions(
     motion=Motion("micro-views", 3, 2),
     iterations=1,
     ssim_weight=0.25,
+    l1_weight=0.7,
+    poisson_weight=1.5,
     tv_weight=0.3,
     tv_edge=6,
     density_weight=0.02,
@@ -77,10 +81,12 @@ def test_gradient_of_everything(rt, make_cloud, finite_differences, axis) -> Non
     table = internal(OPTIONS.motion.cells(scan, frame))
     measured = scan.projections[frame].astype(float) / UNIT.line_integral
     mask = (scan.pixel_mask == 0).astype(float)
+    light = transmission_weights(scan.projections, scan.pixel_mask == 0)[frame].astype(float)
+    data = {"l1_weight": OPTIONS.l1_weight, "poisson_weight": OPTIONS.poisson_weight, "transmission": light}
 
     def image_term(at: np.ndarray) -> float:
         rendered = splat_frame(activation.apply(at), table, SHAPE)
-        return image_loss(rendered, measured, mask, OPTIONS.ssim_weight)[0]
+        return image_loss(rendered, measured, mask, OPTIONS.ssim_weight, **data)[0]
 
     def objective(at: np.ndarray) -> float:
         rows = activation.apply(at)

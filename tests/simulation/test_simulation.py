@@ -119,6 +119,41 @@ def test_peak_of_nothing_is_refused() -> None:
         run(SimulationOptions(FLY, peak=4.0), EllipsoidPhantom((), "nothing"))
 
 
+def test_a_pulse_freezes_what_it_lights() -> None:
+    """A short flash in every line's window is one pose; lines that it misses hold nothing and are masked."""
+    flash = replace(FLY, readout_ratio=1.5, pulse=(0.8, 1e-6))
+    scan = run(SimulationOptions(flash))
+    assert scan.shutter.pulse_s == (0.8, 1e-6)
+    lit = np.flatnonzero(np.arange(SHAPE[0]) / (SHAPE[0] - 1) * 1.5 < 0.8)
+    expected = integrals(np.deg2rad(120.0 + 0.8 * 12.0))
+    np.testing.assert_allclose(scan.projections[1][lit], expected[lit], rtol=0, atol=1e-4)
+    dark = np.setdiff1d(np.arange(SHAPE[0]), lit)
+    assert not scan.projections[:, dark].any()
+    assert scan.pixel_mask[dark].all() and not scan.pixel_mask[lit].any()
+
+
+@pytest.mark.parametrize("noise", ["tigre", "beer"])
+def test_lines_that_see_less_of_a_pulse_are_noisier(noise) -> None:
+    pulsed = replace(FLY, pulse=(-0.5, 0.6))  # light ends 0.1 after the start: line r sees 0.1 − r/13·0.5
+    clean, noisy = (run(SimulationOptions(pulsed, noise=n, electronic_noise=0.0)) for n in ("none", noise))
+    share = clean.shutter.lit_share(SHAPE[0])
+    dark = share == 0
+    assert dark.sum() == 11 and not noisy.projections[:, dark].any()
+    first, last = (np.std((noisy.projections - clean.projections)[:, line]) for line in (0, 2))
+    assert last > 1.3 * first
+
+
+@pytest.mark.parametrize("noise", ["none", "tigre", "beer"])
+def test_lag_leaves_a_ghost_of_the_frame_before(noise) -> None:
+    options = SimulationOptions(FLY, peak=3.0, lag=0.2, noise=noise, dose=1e9, electronic_noise=0.0)
+    slow, clean = run(options), run(replace(options, lag=0.0, noise="none"))
+    signal = np.exp(-clean.projections.astype(np.float64))
+    expected = [0.8 * signal[0], 0.8 * signal[1] + 0.16 * signal[0]]
+    tolerance = 1e-3 if noise != "none" else 1e-6
+    np.testing.assert_allclose(slow.projections[:2], -np.log(expected), atol=tolerance)
+    assert slow.lag == 0.2
+
+
 @pytest.mark.parametrize("noise", ["tigre", "beer"])
 def test_noise_has_a_seed_and_a_dose(noise) -> None:
     clean = run(SimulationOptions(FLY)).projections
@@ -170,6 +205,8 @@ def test_progress_is_reported_frame_by_frame() -> None:
         ({"dose": 0.0}, "--dose"),
         ({"electronic_noise": -1.0}, "--electronic-noise"),
         ({"jitter_deg": np.inf}, "--jitter-deg"),
+        ({"lag": 0.95}, "--lag"),
+        ({"lag": np.nan}, "--lag"),
         ({"time_samples": -1}, "--time-samples"),
     ],
 )

@@ -61,6 +61,37 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
     return volume
 
 
+def intensity_change(
+    change: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, int]
+) -> np.ndarray:
+    """Derivative (rows, columns) of ``ray_frame`` with the intensity model at ``volume`` along ``change`` (z, y, x)."""
+    frame = np.zeros(detector_shape)
+    for cell, share in _shares(volume, grid, table, detector_shape):
+        frame += share * joseph_image(change, grid, table.pose[cell], detector_shape)
+    return frame
+
+
+def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
+    """The transpose of ``intensity_change``: a frame (rows, columns) onto a volume (z, y, x)."""
+    result = np.zeros(grid.shape)
+    for cell, share in _shares(volume, grid, table, frame.shape):
+        result += joseph_adjoint(share * frame, grid, table.pose[cell])
+    return result
+
+
+def _shares(
+    volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, ...]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """(cell, share (rows, columns) of a pixel's light that comes in it, 0 at the lines that it does not serve)."""
+    shape = (detector_shape[0], detector_shape[1])
+    total = np.exp(-ray_frame(volume, grid, table, shape, "intensity"))
+    for cell in range(table.count):
+        share, where = np.zeros(shape), _lines(table, cell)
+        light = np.exp(-joseph_image(volume, grid, table.pose[cell], shape)[where])
+        share[where] = table.weight[cell] * light / total[where]
+        yield cell, share
+
+
 def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
     lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
     return (lines, slice(None)) if table.axis == "rows" else (slice(None), lines)

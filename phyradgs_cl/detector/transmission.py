@@ -1,0 +1,27 @@
+"""How far each measured line integral can be trusted: the variance of −ln(counts) is one over the counts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def transmission_weights(
+    line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
+    """Weights exp(−p) of a scan's pixels (F, v, u), scaled to the mean 1, so that other weights keep their meaning.
+
+    These are the weights of least squares for photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534).
+    What lies below 0 counts as air: noise should not be trusted more for being bright.
+
+    Args:
+        line_integrals: (F, v, u).
+        valid: broadcast to (F, v, u), False where a value must not be used; None: all may be. Only these are in the mean.
+    """
+    weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
+    if valid is None:
+        mean = float(weights.mean(dtype=np.float64))
+    else:
+        chosen = np.broadcast_to(valid, weights.shape)
+        mean = float(weights.mean(dtype=np.float64, where=chosen)) if chosen.any() else 1.0
+    return weights / np.float32(mean) if mean > 0 else np.ones_like(weights)

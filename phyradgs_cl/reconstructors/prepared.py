@@ -1,0 +1,44 @@
+"""What happens to a scan's frames before any method sees them: lag undone, and a median filter where it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector import without_lag
+from phyradgs_cl.reconstructors.fdk import unmasked_frames
+
+MEDIAN_EDGES = (0, 3, 5)
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """ignore_lag: leave the panel's lag in the frames. median_filter: edge of its window in pixels, 0 for none."""
+
+    ignore_lag: bool = False
+    median_filter: int = 0
+
+    def __post_init__(self) -> None:
+        checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
+
+
+def prepared(scan: Scan, options: InputOptions) -> Scan:
+    """The scan as a method gets it; the scan itself where nothing is to be done."""
+    if not options.ignore_lag:
+        scan = without_lag(scan)
+    if options.median_filter > 0:
+        scan = replace(scan, projections=median_frames(scan, options.median_filter))
+    return scan
+
+
+def median_frames(scan: Scan, edge: int) -> np.ndarray:
+    """Line integrals (F, rows, columns) float32, each the median of ``edge`` × ``edge`` pixels of its frame.
+
+    Masked pixels are filled in from their row first, so that what they hold does not reach their neighbours.
+    """
+    frames = unmasked_frames(scan)
+    return np.stack([median_filter(frame, size=edge, mode="nearest") for frame in frames]).astype(np.float32)

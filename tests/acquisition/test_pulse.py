@@ -1,0 +1,146 @@
+"""Pulsed exposure: a line sees the part of its window that lies in the pulse, and some lines see nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    Motion,
+    Protocol,
+    Scan,
+    Shutter,
+)
+from phyradgs_cl.acquisition.cells import (
+    micro_view_cells,
+    per_line_cells,
+    static_cells,
+    static_start_cells,
+)
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+
+SHAPE = (7, 10)
+GEOMETRY = ConeGeometry(50.0, 70.0, SHAPE, (0.6, 0.5))
+ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.25))
+START_S = 3.0
+TIME_TOLERANCE_S = 1e-12
+DARK_FROM = Shutter(0.8, 1.2, pulse_s=(0.1, 0.9))  # the last lines open after 1.0 s
+
+
+def test_a_window_is_cut_by_the_pulse() -> None:
+    shutter = Shutter(0.8, 0.6, pulse_s=(0.3, 0.7))
+    expected = [[max(0.1 * r, 0.3), min(0.1 * r + 0.8, 1.0)] for r in range(7)]
+    np.testing.assert_allclose(shutter.line_windows_s(7), expected, atol=TIME_TOLERANCE_S)
+    assert shutter.lit_span_s == pytest.approx((0.3, 1.0))
+    assert shutter.middle_s == pytest.approx(0.65)
+    seen = np.diff(expected)[:, 0]
+    np.testing.assert_allclose(shutter.lit_share(7), seen / seen.max(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_pulse_over_the_whole_span_changes_nothing(direction) -> None:
+    plain = Shutter(0.8, 0.3, "columns", direction)
+    pulsed = replace(plain, pulse_s=(-1.0, 5.0))
+    np.testing.assert_array_equal(plain.line_windows_s(10), pulsed.line_windows_s(10))
+    assert pulsed.lit_span_s == (0.0, plain.span_s) and pulsed.middle_s == plain.span_s / 2
+    np.testing.assert_array_equal(pulsed.lit_share(10), 1)
+    where = (0, START_S, 10)
+    for build, more in ((micro_view_cells, (4, 3)), (per_line_cells, (3,)), (static_cells, ())):
+        ours, theirs = (build(ORBIT, s, *where, *more) for s in (plain, pulsed))
+        np.testing.assert_array_equal(ours.time_s, theirs.time_s)
+
+
+def test_lines_that_the_pulse_misses_have_no_share_and_one_moment() -> None:
+    windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
+    np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
+    np.testing.assert_array_equal(windows_s[5:], 1.0)
+
+
+@pytest.mark.parametrize("motion", ["micro-views", "per-row", "static", "static-start"])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_every_time_lies_in_the_pulse_and_weights_stay_whole(motion, direction) -> None:
+    shutter = replace(DARK_FROM, direction=direction)
+    cells = {
+        "micro-views": lambda: micro_view_cells(ORBIT, shutter, 0, START_S, 7, 4, 3),
+        "per-row": lambda: per_line_cells(ORBIT, shutter, 0, START_S, 7, 3),
+        "static": lambda: static_cells(ORBIT, shutter, 0, START_S, 7),
+        "static-start": lambda: static_start_cells(ORBIT, shutter, 0, START_S, 7),
+    }[motion]()
+    np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+    assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S
+    assert cells.time_s.max() <= START_S + 1.0 + TIME_TOLERANCE_S
+
+
+def test_static_stands_in_the_middle_of_the_light() -> None:
+    assert static_cells(ORBIT, DARK_FROM, 0, START_S, 7).time_s[0] == pytest.approx(START_S + 0.55)
+    assert static_start_cells(ORBIT, DARK_FROM, 0, START_S, 7).time_s[0] == pytest.approx(START_S + 0.1)
+
+
+def test_sub_intervals_share_the_lit_part_of_a_strips_window() -> None:
+    cells = micro_view_cells(ORBIT, Shutter(0.8, 0.6, pulse_s=(0.3, 0.7)), 0, 0.0, 7, 2, 4)
+    for first_line, opens_s in ((0, 0.15), (4, 0.45)):
+        first_s, last_s = max(opens_s, 0.3), min(opens_s + 0.8, 1.0)
+        expected = first_s + (np.arange(4) + 0.5) / 4 * (last_s - first_s)
+        found = cells.time_s[(cells.line_start <= first_line) & (first_line < cells.line_stop)]
+        np.testing.assert_allclose(found, expected, atol=TIME_TOLERANCE_S)
+
+
+def scan(shutter: Shutter, **changes: object) -> Scan:
+    fields = {
+        "projections": np.zeros((2, *SHAPE), np.float32),
+        "geometry": GEOMETRY,
+        "trajectory": ORBIT,
+        "shutter": shutter,
+        "frame_start_s": np.array([0.0, START_S]),
+        "grid": Grid.cube(4, 2.0),
+    }
+    return Scan(**(fields | changes))
+
+
+def test_dark_lines_join_the_mask_of_a_scan() -> None:
+    assert scan(Shutter(0.8, 1.2)).pixel_mask is None
+    expected = np.zeros(SHAPE, bool)
+    expected[5:] = True
+    np.testing.assert_array_equal(scan(DARK_FROM).pixel_mask, expected)
+    own = np.zeros((2, *SHAPE), np.int32)
+    own[1, 2, 3] = 64
+    found = scan(DARK_FROM, pixel_mask=own).pixel_mask
+    np.testing.assert_array_equal(found, (own != 0) | expected)
+    by_column = scan(Shutter(0.8, 1.8, "columns", -1, (0.0, 0.5))).pixel_mask
+    assert by_column[:, :7].all() and not by_column[:, 7:].any()  # column 6 opens at 0.6 s
+
+
+@pytest.mark.parametrize("is_fly", [True, False])
+def test_a_pulsed_scan_knows_when_it_needs_a_pose(is_fly) -> None:
+    pulsed = scan(DARK_FROM, is_fly=is_fly)
+    pulsed.check_timing()
+    assert Motion("static").cells(pulsed, 1).time_s[0] == pytest.approx(START_S + 0.55)
+
+
+@pytest.mark.parametrize("is_fly", [True, False])
+def test_a_protocol_pulses_in_shares_of_the_exposure(is_fly) -> None:
+    protocol = Protocol(views=4, exposure_deg=10.0, readout_ratio=0.5, pulse=(0.5, 0.4), is_fly=is_fly)
+    assert protocol.shutter().pulse_s == (0.5, 0.4)
+    angle = protocol.orbit(GEOMETRY).angle_rad(1, protocol.frame_start_s()[1] + np.array([0.7]))
+    assert np.rad2deg(angle[0]) == pytest.approx(97.0)  # moving there, or standing there
+
+
+@pytest.mark.parametrize(
+    "pulse", [(0.0, 0.0), (0.0, -1.0), (2.0, 1.0), (-3.0, 1.0), (np.nan, 1.0), (0.0, np.inf)]
+)
+def test_pulses_that_no_frame_sees_are_refused(pulse) -> None:
+    with pytest.raises(InputError, match="pulse"):
+        Protocol(readout_ratio=0.5, pulse=pulse)
+    with pytest.raises(InputError, match="pulse_s"):
+        Shutter(1.0, 0.5, pulse_s=pulse)
+
+
+def test_a_pulse_between_the_windows_of_two_lines_is_refused() -> None:
+    with pytest.raises(InputError, match="no line is open"):
+        Shutter(0.1, 10.0, pulse_s=(0.5, 0.2)).lit_share(3)

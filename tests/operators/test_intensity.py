@@ -1,0 +1,167 @@
+"""The intensity model, its derivative and the transpose: twins, finite differences, ⟨Jd, y⟩ = ⟨d, Jᵀy⟩."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import IntensityOperator, RayOperator, RayProjector
+from phyradgs_cl.operators.intensity import layers
+from phyradgs_cl.operators.twins.rays import intensity_change, intensity_volume, ray_frame
+
+GRID = Grid((5, 7, 6), (0.35, 0.26, 0.3), (0.1, -0.05, 0.1))
+SHAPE = (6, 7)
+DIFFERENCE = 1e-4  # step of finite differences in float64: their error is of its square
+GRADIENT = 1e-5
+MOTIONS = ("static", "micro-views", "per line")
+BUSY = pytest.mark.parametrize("motion", ["micro-views", "per line"])
+AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
+
+
+def noise(shape: tuple[int, ...], seed: int, peak: float = 6.0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, peak, shape).astype(np.float32)
+
+
+def tables(motion: str, axis: str = "rows", frames: int = 2) -> list[TimeCells]:
+    geometry = ConeGeometry(5.0, 7.5, SHAPE, (0.6, 0.55), (0.1, 0.2))
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.4, 1.5))
+    shutter = Shutter(0.5, 0.4, axis, -1)
+    wheres = [(orbit, shutter, f, 0.1 + 1.1 * f, shutter.lines(SHAPE)) for f in range(frames)]
+    if motion == "static":
+        return [static_cells(*where) for where in wheres]
+    if motion == "micro-views":
+        return [micro_view_cells(*where, 3, 4) for where in wheres]
+    return [per_line_cells(*where, 3) for where in wheres]
+
+
+@AXES
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_what_is_expected_is_the_twin_and_the_projector(any_rt, motion, axis) -> None:
+    cells, x = tables(motion, axis), noise(GRID.shape, 1)
+    found = IntensityOperator(any_rt, GRID, SHAPE, cells).expected(x)
+    expected = np.stack([ray_frame(x, GRID, table, SHAPE, "intensity") for table in cells])
+    assert expected.max() > 4
+    np.testing.assert_allclose(found, expected, rtol=0, atol=RAYS * expected.max())
+    projector = RayProjector(any_rt, GRID, SHAPE, axis)
+    on_device = projector.upload_volume(x)
+    frames = np.stack([projector.forward(on_device, table, "intensity") for table in cells])
+    np.testing.assert_allclose(frames, expected, rtol=0, atol=RAYS * expected.max())
+
+
+@AXES
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_derivative_and_transpose_are_the_twins(any_rt, motion, axis) -> None:
+    cells = tables(motion, axis)
+    x, d, y = noise(GRID.shape, 2), noise(GRID.shape, 3), noise((2, *SHAPE), 4)
+    operator = IntensityOperator(any_rt, GRID, SHAPE, cells)
+    operator.expected(x)
+    expected = np.stack([intensity_change(d, x, GRID, table, SHAPE) for table in cells])
+    np.testing.assert_allclose(operator.forward(d), expected, rtol=0, atol=3 * RAYS * expected.max())
+    back = sum(intensity_volume(frame, x, GRID, table) for frame, table in zip(y, cells, strict=True))
+    np.testing.assert_allclose(operator.adjoint(y), back, rtol=0, atol=3 * RAYS_BACK * back.max())
+
+
+@BUSY
+def test_the_twins_derivative_is_that_of_finite_differences(motion) -> None:
+    table = tables(motion)[0]
+    x, d = noise(GRID.shape, 5).astype(float), noise(GRID.shape, 6).astype(float)
+    ahead, behind = (ray_frame(x + s * DIFFERENCE * d, GRID, table, SHAPE, "intensity") for s in (1.0, -1.0))
+    expected = (ahead - behind) / (2 * DIFFERENCE)
+    found = intensity_change(d, x, GRID, table, SHAPE)
+    assert np.linalg.norm(found - expected) <= GRADIENT * np.linalg.norm(expected)
+    by_log = ray_frame(d, GRID, table, SHAPE)
+    assert np.linalg.norm(found - by_log) > 1e-2 * np.linalg.norm(by_log)
+
+
+@AXES
+@BUSY
+def test_adjoint(any_rt, motion, axis) -> None:
+    operator = IntensityOperator(any_rt, GRID, SHAPE, tables(motion, axis))
+    operator.expected(noise(GRID.shape, 7))
+    d, y = noise(GRID.shape, 8), noise((2, *SHAPE), 9)
+    forward = float(np.vdot(operator.forward(d).astype(np.float64), y))
+    backward = float(np.vdot(operator.adjoint(y).astype(np.float64), d))
+    assert (
+        abs(forward - backward) <= 10 * ADJOINT * forward
+    )  # the weights are rounded to float32 on both ways
+
+
+def test_before_any_volume_it_is_the_linear_operator(rt) -> None:
+    cells, x = tables("micro-views"), noise(GRID.shape, 10)
+    linear = RayOperator(rt, GRID, SHAPE, cells).forward(x)
+    operator = IntensityOperator(rt, GRID, SHAPE, cells)
+    np.testing.assert_allclose(operator.forward(x), linear, rtol=FLOAT32, atol=1e-6)
+    operator.expected(np.zeros(GRID.shape, np.float32))
+    np.testing.assert_allclose(operator.forward(x), linear, rtol=FLOAT32, atol=1e-6)
+
+
+@AXES
+@BUSY
+def test_the_gap_is_what_the_models_differ_by(any_rt, motion, axis) -> None:
+    cells = tables(motion, axis)
+    operator = RayOperator(any_rt, GRID, SHAPE, cells)
+    for peak in (6.0, 0.006):  # small gaps too: they are second order in the contrast
+        x = noise(GRID.shape, 11, peak)
+        models = [
+            np.stack([ray_frame(x, GRID, table, SHAPE, model) for table in cells])
+            for model in ("log", "intensity")
+        ]
+        expected, found = models[0] - models[1], operator.intensity_gap(x)
+        assert found.min() >= -1e-6 * peak
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * expected.max() + 2e-7)
+
+
+def test_very_opaque_volumes_stay_finite(rt) -> None:
+    cells, x = tables("per line"), noise(GRID.shape, 12, 300.0)
+    operator = IntensityOperator(rt, GRID, SHAPE, cells)
+    expected = np.stack([ray_frame(x / 100, GRID, t, SHAPE) for t in cells]) * 100
+    assert expected.max() > 300
+    assert np.isfinite(operator.expected(x)).all() and np.isfinite(operator.adjoint(expected)).all()
+    assert np.isfinite(RayOperator(rt, GRID, SHAPE, cells).intensity_gap(x)).all()
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_layers_have_every_cell_once_and_a_line_no_more_than_once(motion) -> None:
+    table = tables(motion)[0]
+    parts = layers(table)
+    assert sum(part.count for part in parts) == table.count
+    total = np.sum([part.line_weights() for part in parts], axis=0)
+    np.testing.assert_allclose(total, table.line_weights())
+    for part in parts:
+        assert np.all(part.line_start[1:] >= part.line_stop[:-1])
+    assert len(parts) == {"static": 1, "micro-views": 4, "per line": 3}[motion]
+
+
+def test_frames_with_fewer_cells_and_lines_without_any(rt) -> None:
+    first, second = tables("per line")
+    keep = (second.line_start > 2) & (np.arange(second.count) % 3 < 2)
+    names = ("pose", "time_s", "line_start", "line_stop", "weight")
+    fewer = replace(second, **{n: getattr(second, n)[keep] for n in names})
+    fewer = replace(fewer, weight=np.full(fewer.count, 0.5))
+    operator, x = IntensityOperator(rt, GRID, SHAPE, [first, fewer]), noise(GRID.shape, 13)
+    found = operator.expected(x)
+    expected = ray_frame(x, GRID, first, SHAPE, "intensity")
+    np.testing.assert_allclose(found[0], expected, rtol=0, atol=RAYS * expected.max())
+    assert not found[1, :3].any() and found[1, 3:].any()
+    assert not operator.forward(x)[1, :3].any()
+    assert not RayOperator(rt, GRID, SHAPE, [first, fewer]).intensity_gap(x)[1, :3].any()
+
+
+@AXES
+def test_subsets_and_repeated_bits(rt, axis) -> None:
+    operator = IntensityOperator(rt, GRID, SHAPE, tables("micro-views", axis, frames=3))
+    x, y = noise(GRID.shape, 14), noise((3, *SHAPE), 15)
+    whole = operator.expected(x)
+    np.testing.assert_array_equal(operator.expected(x), whole)
+    np.testing.assert_array_equal(operator.adjoint(y), operator.adjoint(y))
+    part = operator.subset([2, 0])
+    np.testing.assert_array_equal(part.expected(x), whole[[2, 0]])
+    np.testing.assert_array_equal(part.forward(x), operator.forward(x)[[2, 0]])
+    only = np.where(np.isin(np.arange(3), [0, 2])[:, None, None], y, 0)
+    np.testing.assert_allclose(part.adjoint(y[[2, 0]]), operator.adjoint(only), rtol=FLOAT32, atol=1e-5)

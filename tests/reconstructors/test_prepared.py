@@ -1,0 +1,77 @@
+"""What is done to frames before a method sees them: lag undone or ignored, and the median filter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import FLOAT32
+
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
+from phyradgs_cl.detector import lagged
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors import InputOptions, input_options, method_options, reconstruct
+from phyradgs_cl.reconstructors.prepared import prepared
+from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+
+GEOMETRY = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
+
+
+@pytest.fixture(scope="module")
+def scan() -> Scan:
+    options = SimulationOptions(protocol=Protocol(views=6, exposure_deg=10.0), peak=3.0)
+    grid = Grid.cube(12, 2.0)
+    return simulate(AnalyticSource(shepp_logan(1.0), GEOMETRY), GEOMETRY, grid, options)
+
+
+def test_nothing_to_do_is_the_scan_itself(scan) -> None:
+    assert prepared(scan, InputOptions()) is scan
+
+
+def test_lag_is_undone_unless_it_is_to_be_ignored(rt, scan) -> None:
+    slow = replace(scan, projections=lagged(scan.projections, 0.2).astype(np.float32), lag=0.2)
+    assert prepared(slow, InputOptions(ignore_lag=True)) is slow
+    np.testing.assert_allclose(
+        prepared(slow, InputOptions()).projections, scan.projections, atol=FLOAT32 * np.exp(3.0)
+    )
+    volumes = [
+        reconstruct(s, "fdk", rt, before=before).volume
+        for s, before in ((scan, None), (slow, None), (slow, InputOptions(ignore_lag=True)))
+    ]
+    undone, ignored = (np.abs(volume - volumes[0]).max() for volume in volumes[1:])
+    assert undone < 1e-3 * np.abs(volumes[0]).max() < ignored
+
+
+def test_the_median_takes_a_spark_out(scan) -> None:
+    sparked = scan.projections.copy()
+    sparked[2, 7, 8] = 50.0
+    for edge in (3, 5):
+        frames = prepared(replace(scan, projections=sparked), InputOptions(median_filter=edge)).projections
+        window = sparked[2, 7 - edge // 2 : 8 + edge // 2, 8 - edge // 2 : 9 + edge // 2]
+        assert frames[2, 7, 8] == np.median(window) < 5
+        assert frames.dtype == np.float32
+
+
+def test_what_masked_pixels_hold_does_not_reach_the_median(scan) -> None:
+    mask = np.zeros(GEOMETRY.detector_shape, bool)
+    mask[4:7, 9] = True
+    found = []
+    for garbage in (0.0, 99.0):
+        frames = scan.projections.copy()
+        frames[:, mask] = garbage
+        masked = replace(scan, projections=frames, pixel_mask=mask)
+        found.append(prepared(masked, InputOptions(median_filter=3)).projections)
+    np.testing.assert_array_equal(*found)
+
+
+def test_options_by_name() -> None:
+    assert input_options({"median_filter": 3.0, "ignore_lag": True}) == InputOptions(True, 3)
+    with pytest.raises(InputError, match="median_filter"):
+        input_options({"median_filter": 4})
+    with pytest.raises(InputError, match="ignore_lag"):
+        input_options({"ignore_lag": "no"})
+    with pytest.raises(InputError, match="median_filter"):
+        method_options("fdk", None, {"median_filter": 3})  # not the method's
