@@ -68,6 +68,8 @@ def read_config(path: Path | None) -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
     if path is None:
         return {}
+    if path.exists() and not path.is_file():  # a device or a pipe may never end
+        raise InputError(f"--config {path}", "not a regular file", "a TOML file")
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)

@@ -323,8 +323,8 @@ def summary(path: Path) -> dict[str, object]:
         facts = volume_summary(path)
         provenance = dict(facts.pop("provenance", {}) or {})
         provenance.pop("record", None)
-        provenance.pop("options", None)
-        return {"kind": "volume", **facts, **provenance}
+        options = provenance.pop("options", None)
+        return {"kind": "volume", **facts, **_asked_for(options), **provenance}
     volume = _bare_volume(path)
     return {
         "kind": "bare volume",
@@ -332,6 +332,21 @@ def summary(path: Path) -> dict[str, object]:
         "minimum": float(volume.min()),
         "maximum": float(volume.max()),
     }
+
+
+def _asked_for(options: object) -> dict[str, object]:
+    """What a run was asked for, in words; the file has every option."""
+    if not isinstance(options, Mapping):
+        return {}
+    told: dict[str, object] = {}
+    motion = options.get("motion")
+    if isinstance(motion, Mapping):
+        strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
+        counts = {"micro-views": f" {strips} × {sub_intervals}", "per-row": f", {sub_intervals} times a line"}
+        told["motion"] = f"{motion.get('name')}{counts.get(str(motion.get('name')), '')}"
+    if "iterations" in options:
+        told["iterations_asked"] = options["iterations"]
+    return told
 
 
 def _bare_volume(path: Path) -> np.ndarray:

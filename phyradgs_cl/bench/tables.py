@@ -32,7 +32,7 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
         InputError: no line of the results file belongs to the table.
     """
     chosen = lines_of(job, lines)
-    if not chosen:
+    if not chosen or _misses_splats(job, chosen, lines):
         size = job.bench_size
         sizes = sorted(
             {f"{x.get('voxels')}³ ({x.get('study')}, iterations {x.get('iterations')})" for x in lines}
@@ -49,6 +49,13 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
         with written_beside(path) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="")
     return list(written)
+
+
+def _misses_splats(job: BenchJob, chosen: Sequence[Line], lines: Sequence[Line]) -> bool:
+    """Whether the file has splatting runs, but none with the job's iterations: a table would lose all of them."""
+    iterations = job.bench_size.iterations
+    others = any(x.get("study") == job.study and x.get("iterations") not in (None, iterations) for x in lines)
+    return others and not any(line.get("iterations") == iterations for line in chosen)
 
 
 def markdown(job: BenchJob, lines: Sequence[Line]) -> str:

@@ -123,6 +123,10 @@ def test_tables_alone_need_no_device_but_results(job: BenchJob, rt: Runtime) -> 
     assert "| PhyRadGS w/o ST | – |" in (remake_tables(job)[0]).read_text()
     with pytest.raises(InputError, match="found results of 12³"):
         remake_tables(replace(job, size="S", rows=["PhyRadGS"]))
+    before = remake_tables(job)[0].read_text()
+    with pytest.raises(InputError, match="iterations 8"):  # a table without its splats is not what is meant
+        remake_tables(replace(job, iterations=9))
+    assert remake_tables(job)[0].read_text() == before
 
 
 def test_files_that_are_no_volumes_are_named_before_any_work(job: BenchJob) -> None:

@@ -111,6 +111,7 @@ OPTIONS = {
     "no such preset": (["reconstruct", "{scan}", "--preset", "best"], "--preset"),
     "negative seed": (["reconstruct", "{scan}", "--seed", "-1"], "seed"),
     "missing config": (["reconstruct", "{scan}", "--config", "{tmp}/none.toml"], "none.toml"),
+    "config that never ends": (["reconstruct", "{scan}", "--config", "/dev/zero"], "/dev/zero"),
     "config that is not TOML": (["reconstruct", "{scan}", "--config", "{text}"], "text.h5"),
     "resume without checkpoint": (["reconstruct", "{scan}", "--resume"], "--resume"),
     "unknown option": (["reconstruct", "{scan}", "--iteration-count", "5"], "--iteration-count"),

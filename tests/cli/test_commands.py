@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -43,7 +44,7 @@ def scan(cli, tmp_path_factory):
 
 
 def test_help_shows_every_command_with_an_example(cli, capsys):
-    for command in ("simulate", "reconstruct", "evaluate", "info", "devices"):
+    for command in ("simulate", "reconstruct", "evaluate", "bench", "info", "devices"):
         assert cli.run([command, "--help"]) == 0
         assert f"Example: phyradgs {command}" in capsys.readouterr().out
 
@@ -67,7 +68,11 @@ def test_each_method_writes_a_volume_that_evaluates(cli, scan, tmp_path, capsys,
     assert 0 < facts["ssim"] <= 1
     assert Path(facts["picture"]).stat().st_size > 1000
     assert cli.run(["info", str(output)]) == 0
-    assert "voxel size mm" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "voxel size mm" in told
+    wanted = options[options.index("--motion") + 1] if "--motion" in options else ""
+    assert re.search(rf"^motion +{wanted}", told, re.M)
+    assert ("iterations asked" in told) == ("--iterations" in options)
 
 
 def test_columns_and_intensity_and_jitter_are_simulated(cli, tmp_path):
