@@ -196,8 +196,15 @@ def phantom_scene(
     if isinstance(phantom, EllipsoidPhantom):
         grid = _resized(box, size)
         return Scene(AnalyticSource(phantom, geometry), grid, phantom.voxelise(grid, 4), f"phantom {name}")
-    volume = phantom.voxelise(Grid.cube(2 * size, 2 * half_size_mm))
     fine = Grid.cube(2 * size, 2 * half_size_mm)
+    if not (np.allclose(box.size_mm, fine.size_mm) and np.allclose(box.offset_mm, 0)):
+        log.warning(
+            "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
+            "are not used",
+            name,
+            2 * half_size_mm,
+        )
+    volume = phantom.voxelise(fine)
     source = VolumeSource(rt, volume, fine, geometry, axis)
     return Scene(
         source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}"

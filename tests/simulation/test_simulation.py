@@ -18,6 +18,7 @@ from phyradgs_cl.simulation import (
     VolumeSource,
     default_time_samples,
     line_groups,
+    phantom_scene,
     simulate,
 )
 
@@ -213,3 +214,14 @@ def test_progress_is_reported_frame_by_frame() -> None:
 def test_impossible_options_are_named(change, option) -> None:
     with pytest.raises(InputError, match=option):
         SimulationOptions(**change)
+
+
+def test_a_box_that_a_procedural_phantom_does_not_fill_is_said(rt, caplog) -> None:
+    geometry = ConeGeometry(5.0, 7.0, (8, 8), (0.5, 0.5))
+    cube = phantom_scene(rt, "jaw", geometry, Grid.cube(8, 2.0), 8, "rows", 0)
+    assert not caplog.records
+    flat = Grid((4, 8, 8), (0.25, 0.25, 0.25), (0.1, 0.0, 0.0))
+    scene = phantom_scene(rt, "jaw", geometry, flat, 8, "rows", 0)
+    assert "not used" in caplog.text
+    assert scene.grid == Grid.cube(8, 1.0)
+    assert cube.grid == Grid.cube(8, 2.0)
