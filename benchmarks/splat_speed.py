@@ -21,9 +21,9 @@ from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.layout import pad_rows
-from phyradgs_cl.reconstructors.fdk import fdk_volume
+from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
-from phyradgs_cl.reconstructors.splatting import SplatRun, first_population, internal_scale, static_poses
+from phyradgs_cl.reconstructors.splatting import SplatRun, first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
@@ -87,7 +87,7 @@ def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[s
 
 def iteration_shares(rt: Runtime, scan: Scan, count: int, iterations: int) -> dict[str, dict[str, float]]:
     """Wall and kernel time of whole iterations (density control left out), by motion model."""
-    fdk = fdk_volume(rt, scan.projections, static_poses(scan), scan.grid)
+    fdk = static_fdk(rt, scan)
     scale = internal_scale(fdk, scan.grid)
     grid = scan.grid.scaled(1 / scale.length_mm)
     result: dict[str, dict[str, float]] = {}

@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.objective import TvDescent
-from phyradgs_cl.reconstructors.fdk import fdk_volume, unmasked_frames
+from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.iterative import run_iterations
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
@@ -22,7 +22,6 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.sart import Sart, SartOptions
-from phyradgs_cl.reconstructors.splatting import static_poses
 from phyradgs_cl.reconstructors.system import System, inner, norm
 from phyradgs_cl.runtime import Runtime
 
@@ -64,7 +63,7 @@ def asd_pocs(
     """The ASD-POCS volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
 
     def make(system: System) -> AsdPocs:
-        start = fdk_volume(rt, unmasked_frames(scan), static_poses(scan), scan.grid)
+        start = static_fdk(rt, scan)
         epsilon = options.residual_share * norm(system.residual(start))
         return AsdPocs(system, options, seed, TvDescent(rt, scan.grid.shape), epsilon)
 

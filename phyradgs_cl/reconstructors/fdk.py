@@ -128,6 +128,12 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
     return filtered
 
 
+def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
+    """FDK (z, y, x) in 1/mm at the mid-window poses: what other methods start from, or measure themselves by."""
+    pose = np.concatenate([Motion("static").cells(scan, f).pose for f in range(scan.frames)])
+    return fdk_volume(rt, unmasked_frames(scan), pose, scan.grid)
+
+
 def unmasked_frames(scan: Scan) -> np.ndarray:
     """The scan's line integrals with masked pixels filled in, for methods that cannot leave pixels out."""
     if scan.pixel_mask is None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.errors import NumericalError
@@ -23,7 +23,7 @@ from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser, voxelise
 from phyradgs_cl.operators.layout import pad_columns, pad_rows, stride_of
 from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
-from phyradgs_cl.reconstructors.fdk import fdk_volume, unmasked_frames
+from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
@@ -61,7 +61,7 @@ def reconstruct_splats(
     ``resume`` continues an interrupted run of the same scan and options from its state.
     """
     started = time.perf_counter()
-    fdk = _static_fdk(rt, scan)
+    fdk = static_fdk(rt, scan)
     scale = internal_scale(fdk, scan.grid)
     grid = scan.grid.scaled(1 / scale.length_mm)
     rng = np.random.default_rng(seed)
@@ -339,16 +339,6 @@ def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
     """The same cells with all lengths multiplied by ``factor``."""
     ends = None if table.end_poses is None else table.end_poses * factor
     return replace(table, pose=table.pose * factor, end_poses=ends)
-
-
-def static_poses(scan: Scan) -> np.ndarray:
-    """Mid-window poses (F, 12)."""
-    return np.concatenate([Motion("static").cells(scan, f).pose for f in range(scan.frames)])
-
-
-def _static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
-    """FDK at the mid-window poses, the start of every splatting method."""
-    return fdk_volume(rt, unmasked_frames(scan), static_poses(scan), scan.grid)
 
 
 def first_population(

@@ -53,3 +53,4 @@ def test_no_stderr_is_no_trouble(monkeypatch):
     monkeypatch.setattr("sys.stderr", None)
     with Ticker("frame") as ticker:
         ticker.show(1, 1)
+    assert not ticker.is_open  # nothing to close where nothing could be written

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import h5py
 import numpy as np
+import pint
 import pytest
+from nxtomo.application import nxtomo
 
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.io import read_scan, write_scan
-
-nxtomo = pytest.importorskip("nxtomo.application.nxtomo")
-pint = pytest.importorskip("pint")
 
 
 @pytest.fixture
