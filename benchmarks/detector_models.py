@@ -1,18 +1,27 @@
-"""What it is worth to model the detector: intensity averaging, a pulsed beam and lag, each modelled and ignored.
+"""What it is worth to model the detector: every effect modelled and ignored, several methods, mean over seeds.
 
-    python benchmarks/detector_models.py [--names shepp-logan,VOLUME.h5] [--json docs/results/detector_models.json]
+    python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects intensity,lag] [--seeds 0,1]
+    python benchmarks/detector_models.py RESULTS.jsonl --table
 
-Rapid fly-scans (25 frames of 14.4 degrees, rows read out) with counts of 1e5 photons and electronic noise of 10, at
-peak line integrals of 4 and 6, reconstructed by the iterative methods with a pose for every line and time.
+Rapid fly-scans (25 frames of 14.4 degrees, rows read out) of 48 cubed voxels on 72 squared pixels, counts of 1e5 photons
+and electronic noise of 10 unless an effect says otherwise. Iterative methods take every line at 5 times of its own;
+phyradgs is exact in time, and with micro-views (8x5) where that is said. Results are a line a run: the command goes on
+where it was interrupted.
+
+Effects: intensity (peak line integral 4 and 6; ignored: line integrals are averaged), pulse (all lines share one flash;
+ignored: the beam is always on), lag (0.1 and 0.3; ignored: not undone), low-dose (300 photons; modelled: pixels are
+weighted by their transmission), pixel-area (a pixel is 4 by 4 rays; modelled: splats have a pixel's footprint).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -22,91 +31,146 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
 
 VOXELS, PIXELS, SUB_INTERVALS = 48, 72, 5
-DOSE, ELECTRONIC_NOISE = 1e5, 10.0
-LAGS, PULSE = (0.1, 0.3), (0.86, 0.14)  # the pulse that all lines of the rapid protocol share
-ITERATIONS = {"sart": 10, "os-sart": 15, "sirt": 60, "cgls": 12, "asd-pocs": 10, "fista-tv": 50}
+PULSE = (0.86, 0.14)  # the pulse that all lines of the rapid protocol share
+ITERATIONS = {
+    "sart": 10, "os-sart": 15, "sirt": 60, "cgls": 12, "asd-pocs": 10, "fista-tv": 50,
+    "phyradgs": 2000, "phyradgs micro-views": 2000,
+}  # fmt: skip
+ALL = tuple(ITERATIONS)
+WEIGHTED = {"l1_weight": 0.0, "poisson_weight": 30.0}  # of splats, in place of L1
 GEOMETRY = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (4.0 / PIXELS, 4.0 / PIXELS))
 
 Row = dict[str, object]
 
 
-def scene_of(rt: Runtime, name: str) -> Scene:
+@dataclass(frozen=True)
+class Effect:
+    """One effect: the scan that has it, and what the runs that model and ignore it are told."""
+
+    name: str
+    methods: tuple[str, ...]
+    simulation: dict[str, object] = field(default_factory=dict)
+    modelled: dict[str, object] = field(default_factory=dict)
+    ignored: dict[str, object] = field(default_factory=dict)
+    pulse: tuple[float, float] | None = None
+    pixel_samples: int = 1
+    forget: Callable[[Scan], Scan] = lambda scan: scan  # what the scan file would say if nobody knew
+
+
+def always_on(scan: Scan) -> Scan:
+    return replace(scan, shutter=replace(scan.shutter, pulse_s=None))
+
+
+def effects() -> list[Effect]:
+    found = [
+        Effect(f"intensity, peak {peak:g}", ALL, {"peak": peak}, {}, {"detector_model": "log"})
+        for peak in (4.0, 6.0)
+    ]
+    few = ("sart", "fista-tv", "phyradgs")
+    found.append(Effect("pulse, one flash", few, pulse=PULSE, forget=always_on))
+    found += [
+        Effect(f"lag {lag:g}", (*few, "sirt"), {"lag": lag}, {}, {"ignore_lag": True}) for lag in (0.1, 0.3)
+    ]
+    low = {"dose": 300.0, "electronic_noise": 1.0}
+    weights = {"transmission_weights": True}
+    found.append(Effect("low-dose weights", ("sart", "sirt", "fista-tv"), low, weights))
+    found.append(Effect("low-dose weights", ("phyradgs",), low, WEIGHTED))
+    on = {"pixel_footprint": True}
+    found.append(Effect("pixel-area", ("phyradgs", "phyradgs micro-views"), {}, on, pixel_samples=4))
+    return found
+
+
+def scene_of(rt: Runtime, name: str, pixel_samples: int) -> Scene:
     box = Grid.cube(VOXELS, 2.0)
     if name.endswith(".h5"):
-        return volume_scene(rt, name, GEOMETRY, box, VOXELS, "rows")
-    return phantom_scene(rt, name, GEOMETRY, box, VOXELS, "rows", 0)
+        return volume_scene(rt, name, GEOMETRY, box, VOXELS, "rows", pixel_samples)
+    return phantom_scene(rt, name, GEOMETRY, box, VOXELS, "rows", 0, pixel_samples)
 
 
-def scan_of(scene: Scene, peak: float, pulse: tuple[float, float] | None = None, lag: float = 0.0) -> Scan:
+def scan_of(scene: Scene, effect: Effect, seed: int) -> Scan:
+    usual = {"peak": 4.0, "dose": 1e5, "electronic_noise": 10.0}
     options = SimulationOptions(
-        protocol=make_protocol("rapid", pulse=pulse),
+        protocol=make_protocol("rapid", pulse=effect.pulse),
         detector_model="intensity",
-        peak=peak,
         noise="beer",
-        dose=DOSE,
-        electronic_noise=ELECTRONIC_NOISE,
-        lag=lag,
+        seed=seed,
+        **{**usual, **effect.simulation},
     )
     return simulate(scene.source, GEOMETRY, scene.grid, options, reference=scene.reference)
 
 
-def psnr_db(
-    rt: Runtime, scan: Scan, method: str, model: str = "intensity", ignore_lag: bool = False
-) -> float:
-    changes = {"motion": "per-row", "sub_intervals": SUB_INTERVALS, "iterations": ITERATIONS[method]}
-    options = method_options(method, None, {**changes, "detector_model": model})
-    before = InputOptions(ignore_lag=ignore_lag)
-    return compare(reconstruct(scan, method, rt, options, before=before).volume, scan.reference)["psnr_db"]
+def psnr_db(rt: Runtime, scan: Scan, method: str, told: dict[str, object], seed: int) -> float:
+    name, _, motion = method.partition(" ")
+    changes = {"iterations": ITERATIONS[method], **told}
+    before = InputOptions(ignore_lag=bool(changes.pop("ignore_lag", False)))
+    if name == "phyradgs":
+        changes["motion"] = motion or "exact"
+    else:
+        changes |= {"motion": "per-row", "sub_intervals": SUB_INTERVALS}
+    result = reconstruct(scan, name, rt, method_options(name, None, changes), seed=seed, before=before)
+    return compare(result.volume, scan.reference)["psnr_db"]
 
 
-def rows(rt: Runtime, name: str) -> Iterator[Row]:
-    scene = scene_of(rt, name)
-    for peak in (4.0, 6.0):
-        scan = scan_of(scene, peak)
-        for method in ITERATIONS:
-            pair = {model: psnr_db(rt, scan, method, model) for model in ("intensity", "log")}
-            yield row(name, peak, method, "intensity", pair["intensity"], pair["log"])
-    pulsed = scan_of(scene, 4.0, pulse=PULSE)
-    always_on = replace(pulsed, shutter=replace(pulsed.shutter, pulse_s=None))
-    for method in ("sart", "fista-tv"):
-        modelled, ignored = (psnr_db(rt, scan, method) for scan in (pulsed, always_on))
-        yield row(name, 4.0, method, f"pulse {PULSE[0]},{PULSE[1]}", modelled, ignored)
-    yield from lag_rows(rt, scene, name)
+def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[tuple]) -> Iterator[Row]:
+    for effect in effects():
+        missing = [m for m in effect.methods if (Path(name).stem, effect.name, m, seed) not in done]
+        if not missing or not effect.name.startswith(wanted):
+            continue
+        scan = scan_of(scene_of(rt, name, effect.pixel_samples), effect, seed)
+        unaware = effect.forget(scan)
+        for method in missing:
+            modelled = psnr_db(rt, scan, method, effect.modelled, seed)
+            ignored = psnr_db(rt, unaware, method, effect.ignored, seed)
+            yield {
+                "object": Path(name).stem,
+                "effect": effect.name,
+                "method": method,
+                "seed": seed,
+                "modelled_db": round(modelled, 3),
+                "ignored_db": round(ignored, 3),
+            }
 
 
-def lag_rows(rt: Runtime, scene: Scene, name: str) -> Iterator[Row]:
-    for lag in LAGS:
-        scan = scan_of(scene, 4.0, lag=lag)
-        for method in ("sart", "sirt", "fista-tv"):
-            modelled, ignored = (psnr_db(rt, scan, method, ignore_lag=ignore) for ignore in (False, True))
-            yield row(name, 4.0, method, f"lag {lag}", modelled, ignored)
+def table(lines: list[Row]) -> str:
+    """Markdown: modelled, ignored and gain in dB, mean ± standard deviation over seeds where there are several."""
+    text = ["| object | effect | method | modelled | ignored | gain |", "|---" * 6 + "|"]
+    groups: dict[tuple, list[Row]] = {}
+    for line in lines:
+        groups.setdefault((line["object"], line["effect"], line["method"]), []).append(line)
+    for key, runs in groups.items():
+        pairs = np.array([(run["modelled_db"], run["ignored_db"]) for run in runs], float)
+        gain = pairs[:, 0] - pairs[:, 1]
+        spread = f" ± {gain.std(ddof=1):.2f}" if len(gain) > 1 else ""
+        means = " | ".join(f"{v:.2f}" for v in pairs.mean(axis=0))
+        text.append(f"| {' | '.join(map(str, key))} | {means} | {gain.mean():+.2f}{spread} |")
+    return "\n".join(text)
 
 
-def row(name: str, peak: float, method: str, effect: str, modelled_db: float, ignored_db: float) -> Row:
-    return {
-        "object": Path(name).stem,
-        "peak": peak,
-        "method": method,
-        "effect": effect,
-        "modelled_db": round(modelled_db, 2),
-        "ignored_db": round(ignored_db, 2),
-        "gain_db": round(modelled_db - ignored_db, 2),
-    }
+def read_lines(path: Path) -> list[Row]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("results", type=Path)
     parser.add_argument("--names", default="shepp-logan", help="phantoms and volume files, with commas")
-    parser.add_argument("--json", type=Path, help="file for the rows")
+    parser.add_argument("--effects", default="", help="beginnings of the effects' names, with commas")
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     parser.add_argument("--device")
     arguments = parser.parse_args()
-    rt, found = Runtime(arguments.device), []
-    for name in arguments.names.split(","):
-        for line in rows(rt, name):
-            found.append(line)
-            print(json.dumps(line), flush=True)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    lines = read_lines(arguments.results)
+    if arguments.table:
+        print(table(lines))
+        return
+    rt, wanted = Runtime(arguments.device), tuple(arguments.effects.split(","))
+    done = {(line["object"], line["effect"], line["method"], line["seed"]) for line in lines}
+    for seed in (int(s) for s in arguments.seeds.split(",")):
+        for name in arguments.names.split(","):
+            for line in rows(rt, name, seed, wanted, done):
+                print(json.dumps(line), flush=True)
+                with open(arguments.results, "a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
 
 
 if __name__ == "__main__":

@@ -76,8 +76,8 @@ __kernel void splat_backward(
     __global const float *cells,    /* (C, CELL) */
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */
     const int time_pitch, const float4 path_limits,
-    __global const float *image,    /* dL/dp: guard, then (lines, pitch), padding zero */
-    const int count, const int cell_count, const int pitch, const float cutoff2,
+    __global const float *images,   /* dL/dp: guard, then (lines, pitch), padding zero; LAYERED: one a layer */
+    const int count, const int cell_count, const int lines, const int pitch, const float cutoff2,
     __global float *sums)           /* (stride, C, SUMS) */
 {
 #if GROUP > 1
@@ -97,6 +97,7 @@ __kernel void splat_backward(
         if (v_hi < v_lo)
             continue;
         const int u_lo = whole[REC_U_LO], u_hi = whole[REC_U_HI];
+        __global const float *image = images + LAYER_AT(cells + c * CELL, lines, pitch);
 #if MOVING
         __global const float *times = line_times + (size_t)c * TIME_ROWS * time_pitch;
         const float speed = rec[REC_SPEED];

@@ -80,14 +80,14 @@ __kernel void splat_chain(
         const vf across_u = V_LOAD(fields + 14 * LANES), across_v = V_LOAD(fields + 15 * LANES);
         const vf per = 1.0f / (along_u * across_v - along_v * across_u);
         const vf uz = across_v * per, uc = -along_v * per, vz = -across_u * per, vc = along_u * per;
-        const vf s_uu = uz * (uz * zz + 2.0f * uc * zc) + uc * uc * cc;
-        const vf s_uv = 2.0f * (uz * (vz * zz + vc * zc) + uc * (vz * zc + vc * cc));
-        const vf s_vv = vz * (vz * zz + 2.0f * vc * zc) + vc * vc * cc;
+        vf s_uu = uz * (uz * zz + 2.0f * uc * zc) + uc * uc * cc;
+        vf s_uv = 2.0f * (uz * (vz * zz + vc * zc) + uc * (vz * zc + vc * cc));
+        vf s_vv = vz * (vz * zz + 2.0f * vc * zc) + vc * vc * cc;
         const vf s_z = V_LOAD(fields + 5 * LANES), s_c = V_LOAD(fields + 6 * LANES);
         const vf s_tz = V_LOAD(fields + 10 * LANES), s_tc = V_LOAD(fields + 11 * LANES);
 #else
-        const vf s_uu = V_LOAD(fields + 2 * LANES), s_uv = 2.0f * V_LOAD(fields + 3 * LANES);
-        const vf s_vv = V_LOAD(fields + 4 * LANES);
+        vf s_uu = V_LOAD(fields + 2 * LANES), s_uv = 2.0f * V_LOAD(fields + 3 * LANES);
+        vf s_vv = V_LOAD(fields + 4 * LANES);
         const vf s_u = V_LOAD(fields + 5 * LANES), s_v = V_LOAD(fields + 6 * LANES);
 #endif
         const vf s_b = V_LOAD(fields + 7 * LANES), by_b1 = V_LOAD(fields + 8 * LANES), by_b2 = V_LOAD(fields + 9 * LANES);
@@ -111,6 +111,21 @@ __kernel void splat_chain(
         const v3 au = v3_mul(scale, mu), av = v3_mul(scale, mv);
         const vf factor = (z / det) * (z / det) * inv_kappa;
         const vf s11 = factor * v3_dot(au, au), s12 = factor * v3_dot(au, av), s22 = factor * v3_dot(av, av);
+        vf seen11 = s11, seen12 = s12, seen22 = s22, t_det = zero; /* S as drawn; derivative by log det S */
+#if FOOTPRINT
+        /* S is drawn as (S + E det S) / delta and the amplitude over sqrt(delta): see widened_by_pixel */
+        const vf root_det = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * rsqrt(kappa) / det;
+        const vf det_s = root_det * root_det;
+        const vf inv_delta = 1.0f / (1.0f + PIXEL_VARIANCE * ((s11 + s22) + PIXEL_VARIANCE * det_s));
+        seen11 = (s11 + PIXEL_VARIANCE * det_s) * inv_delta;
+        seen12 = s12 * inv_delta;
+        seen22 = (s22 + PIXEL_VARIANCE * det_s) * inv_delta;
+        const vf by_delta = -inv_delta * (s_uu * seen11 + s_uv * seen12 + s_vv * seen22 + 0.5f * w);
+        t_det = PIXEL_VARIANCE * det_s * ((s_uu + s_vv) * inv_delta + PIXEL_VARIANCE * by_delta);
+        s_uu = s_uu * inv_delta + PIXEL_VARIANCE * by_delta;
+        s_uv *= inv_delta;
+        s_vv = s_vv * inv_delta + PIXEL_VARIANCE * by_delta;
+#endif
         const vf t_s = s_uu * s11 + s_uv * s12 + s_vv * s22;
         const v3 by_au = v3_scale(v3_add(v3_scale(au, 2.0f * s_uu), v3_scale(av, s_uv)), factor);
         const v3 by_av = v3_scale(v3_add(v3_scale(av, 2.0f * s_vv), v3_scale(au, s_uv)), factor);
@@ -118,10 +133,10 @@ __kernel void splat_chain(
         v3 by_ray = v3_add(v3_cross(eu, by_mu), v3_cross(ev, by_mv));
         v3 by_eu = v3_cross(by_mu, ray), by_ev = v3_cross(by_mv, ray);
         v3 by_s = v3_add(v3_mul(mu, by_au), v3_mul(mv, by_av));
-        by_s = v3_add(by_s, v3_scale(inv_scale, -2.0f * t_s));
+        by_s = v3_add(by_s, v3_scale(inv_scale, -2.0f * (t_s + t_det)));
 
-        vf by_kappa = -inv_kappa * (t_s + 0.5f * w);
-        vf by_z = inv_z * 2.0f * t_s;
+        vf by_kappa = -inv_kappa * (t_s + t_det + 0.5f * w);
+        vf by_z = inv_z * (2.0f * t_s + 6.0f * t_det);
         v3 by_white = v3_make(zero, zero, zero);
 #if AFFINE
         const vf b1 = zero, b2 = zero;
@@ -149,8 +164,8 @@ __kernel void splat_chain(
         const vf g_u0 = -(2.0f * (along_u * s_z + across_u * s_c) + b1 * s_b);
         const vf g_v0 = -(2.0f * (along_v * s_z + across_v * s_c) + b2 * s_b);
 #else
-        const vf g_u0 = -(2.0f * (s11 * s_u + s12 * s_v) + b1 * s_b);
-        const vf g_v0 = -(2.0f * (s12 * s_u + s22 * s_v) + b2 * s_b);
+        const vf g_u0 = -(2.0f * (seen11 * s_u + seen12 * s_v) + b1 * s_b);
+        const vf g_v0 = -(2.0f * (seen12 * s_u + seen22 * s_v) + b2 * s_b);
 #endif
         torque = v3_add(torque, v3_add(v3_cross(by_ray, ray), v3_add(v3_cross(by_eu, eu), v3_cross(by_ev, ev))));
         by_scale = v3_add(by_scale, by_s);

@@ -64,6 +64,7 @@ __kernel void splat_forward(
     const int lines, const int width, const int pitch,
     const int tile_w, const int tile_h, const int tiles_u,
     const float cutoff2,
+    const int layer_count,           /* LAYERED: images, each of guard and (lines, pitch); else one of all cells */
     __global float *image)           /* guard, then (lines, pitch) */
 {
 #if BLOCK_PIXEL
@@ -71,10 +72,11 @@ __kernel void splat_forward(
     if (u >= pitch || v >= lines)
         return;
     const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
-    if (u >= width) {
-        image[at] = 0.0f;
+    const size_t layer_size = IMAGE_GUARD + (size_t)lines * pitch;
+    for (int layer = 0; layer < LAYERS(layer_count); ++layer)
+        image[layer * layer_size + at] = 0.0f;
+    if (u >= width)
         return;
-    }
     const int tile = (v / tile_h) * tiles_u + u / tile_w;
     const int c_first = line_cells[2 * v], c_stop = line_cells[2 * v + 1];
     float sum = 0.0f;
@@ -92,28 +94,36 @@ __kernel void splat_forward(
             const moving_line s = moving_on_line(rec, cells + c * CELL, (float)v, dv, t[0], t[TIME_HALF * time_pitch],
                                                  t[TIME_WEIGHT * time_pitch], path_limits);
             const moving_pixel p = moving_at(s, (float)u, du, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT);
-            if (p.drawn)
-                sum += moving_value(s.rule, s, p);
+            const float value = p.drawn ? moving_value(s.rule, s, p) : 0.0f;
 #else
             const splat_line s = splat_on_line(rec, cells + c * CELL, (float)v, dv);
             float num, b, rq;
-            const float value = splat_value(s, (float)u, du, &num, &b, &rq);
-            sum += (cutoff2 <= 0.0f || num * rq <= cutoff2) ? value : 0.0f;
+            const float all = splat_value(s, (float)u, du, &num, &b, &rq);
+            const float value = (cutoff2 <= 0.0f || num * rq <= cutoff2) ? all : 0.0f;
+#endif
+#if LAYERED
+            image[LAYER_AT(cells + c * CELL, lines, pitch) + at] += value; /* nobody else's pixel */
+#else
+            sum += value;
 #endif
         }
     }
+#if !LAYERED
     image[at] = sum;
+#endif
 #else
     const int tile = (int)get_global_id(0);
     const int top = tile * tile_h;
     if (top >= lines)
         return;
     const int bottom = min(top + tile_h, lines) - 1;
-    for (int v = top; v <= bottom; ++v) {
-        __global float *row = image + IMAGE_GUARD + (size_t)v * pitch;
-        for (int u = 0; u < pitch; u += LANES)
-            V_STORE((vf)(0.0f), row + u);
-    }
+    const size_t layer_size = IMAGE_GUARD + (size_t)lines * pitch;
+    for (int layer = 0; layer < LAYERS(layer_count); ++layer)
+        for (int v = top; v <= bottom; ++v) {
+            __global float *row = image + layer * layer_size + IMAGE_GUARD + (size_t)v * pitch;
+            for (int u = 0; u < pitch; u += LANES)
+                V_STORE((vf)(0.0f), row + u);
+        }
     const int c_first = line_cells[2 * top], c_stop = line_cells[2 * bottom + 1];
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int e = starts[tile]; e < starts[tile + 1]; ++e) {
@@ -122,15 +132,16 @@ __kernel void splat_forward(
             __global const float *rec = own + c * RECORD;
             __global const int *whole = (__global const int *)rec;
             const int v_lo = max(whole[REC_V_LO], top), v_hi = min(whole[REC_V_HI], bottom);
+            __global float *own_image = image + LAYER_AT(cells + c * CELL, lines, pitch);
 #if MOVING
             moving_rows(rec, cells + c * CELL, line_times + (size_t)c * TIME_ROWS * time_pitch, time_pitch,
-                        v_lo, v_hi, path_limits, cutoff2, image, pitch);
+                        v_lo, v_hi, path_limits, cutoff2, own_image, pitch);
 #else
             for (int v = v_lo; v <= v_hi; ++v) {
                 const int u_lo = whole[REC_U_LO], u_hi = whole[REC_U_HI];
                 const float dv = (float)(v - whole[REC_V_WHOLE]) - rec[REC_V_REST];
                 const splat_line s = splat_on_line(rec, cells + c * CELL, (float)v, dv);
-                __global float *row = image + IMAGE_GUARD + (size_t)v * pitch;
+                __global float *row = own_image + IMAGE_GUARD + (size_t)v * pitch;
                 for (int u = u_lo; u <= u_hi; u += LANES) {
                     vf num, b, rq;
                     const vf uu = (float)u + V_IOTA;
@@ -142,10 +153,11 @@ __kernel void splat_forward(
 #endif
         }
     }
-    for (int v = top; v <= bottom; ++v) {  /* vectors may have run past the last pixel: padding stays zero */
-        __global float *row = image + IMAGE_GUARD + (size_t)v * pitch;
-        for (int u = width; u < pitch; ++u)
-            row[u] = 0.0f;
-    }
+    for (int layer = 0; layer < LAYERS(layer_count); ++layer)
+        for (int v = top; v <= bottom; ++v) {  /* vectors may have run past the last pixel: padding stays zero */
+            __global float *row = image + layer * layer_size + IMAGE_GUARD + (size_t)v * pitch;
+            for (int u = width; u < pitch; ++u)
+                row[u] = 0.0f;
+        }
 #endif
 }

@@ -5,6 +5,22 @@
 #include "common/gaussian.h"
 #include "common/splat_moving.h"
 
+#if FOOTPRINT
+/* A pixel averages over its area: its variance is added to the splat's, (S^-1 + E)^-1 = (S + E det S) / delta with
+   delta = 1 + E tr S + E^2 det S. Returns what the amplitude is multiplied by so that the mass stays. */
+SPLAT_INLINE vf widened_by_pixel(vf *l11, vf *l12, vf *l22)
+{
+    const vf det_s = (*l11 * *l22) * (*l11 * *l22);
+    const vf trace = *l11 * *l11 + *l12 * *l12 + *l22 * *l22;
+    const vf inv = 1.0f / (1.0f + PIXEL_VARIANCE * (trace + PIXEL_VARIANCE * det_s));
+    const vf wide11 = sqrt((*l11 * *l11 + PIXEL_VARIANCE * det_s) * inv);
+    *l12 = *l11 * *l12 * inv / wide11;
+    *l22 = sqrt(det_s * inv) / wide11;
+    *l11 = wide11;
+    return sqrt(inv);
+}
+#endif
+
 #if MOVING
 #define POSES 3 /* the middle of the segment and its two ends */
 #define FIELDS 12
@@ -130,9 +146,9 @@ __kernel void splat_prepare(
         const v3 gv = v3_scale(v3_mul(scale, v3_cross(ray, ev)), inv_det);
         const vf gu_length = sqrt(v3_dot(gu, gu));
         const vf factor = z * root;
-        const vf l11 = gu_length * factor;
-        const vf l12 = v3_dot(gu, gv) / gu_length * factor;
-        const vf l22 = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * inv_det * root / l11;
+        vf l11 = gu_length * factor;
+        vf l12 = v3_dot(gu, gv) / gu_length * factor;
+        vf l22 = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * inv_det * root / l11;
 #if AFFINE
         const vf b1 = (vf)(0.0f), b2 = (vf)(0.0f), ik = (vf)(0.0f);
         const vf ray_length = sqrt(v3_dot(ray, ray)) / z;
@@ -142,7 +158,10 @@ __kernel void splat_prepare(
         const vf ik = inv_kappa;
         const vf ray_length = (vf)(1.0f);
 #endif
-        const vf amp = cell[CELL_WEIGHT] * 2.50662827463f * density * factor * ray_length;
+        vf amp = cell[CELL_WEIGHT] * 2.50662827463f * density * factor * ray_length;
+#if FOOTPRINT
+        amp *= widened_by_pixel(&l11, &l12, &l22);
+#endif
 
         /* the ellipse q <= cutoff2 is D'TD - 2 c b.D - c <= 0 with T = S (1 - c/kappa) - c b b' */
         vi drawn = exists & (z > 0.0f) & (kappa > 0.0f);

@@ -12,7 +12,7 @@ from skimage.transform import resize_local_mean
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, pixel_centres
-from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import TimeCells, finer_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
@@ -173,29 +173,78 @@ class AnalyticSource:
         return frame.astype(np.float32)
 
 
+class PixelAreaSource:
+    """Frames of pixels that see the mean over their area: of ``samples`` by ``samples`` rays of a finer panel."""
+
+    def __init__(self, finer: FrameSource, samples: int) -> None:
+        self._finer, self._samples = finer, samples
+
+    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
+        n = self._samples
+        fine = self._finer.frame(finer_cells(cells, n), model, factor)
+        rows, columns = fine.shape[0] // n, fine.shape[1] // n
+        rays = fine.reshape(rows, n, columns, n).transpose(1, 3, 0, 2).reshape(n * n, rows, columns)
+        return average(rays, np.full(n * n, 1 / n**2), model).astype(np.float32)
+
+
+def _on_panel(
+    geometry: ConeGeometry, pixel_samples: int, make: Callable[[ConeGeometry], FrameSource]
+) -> FrameSource:
+    """What ``make`` gives for the panel, or for a finer one behind the area of its pixels."""
+    checks.within("--pixel-samples", pixel_samples, 1, 32)
+    if pixel_samples == 1:
+        return make(geometry)
+    return PixelAreaSource(make(geometry.finer(pixel_samples)), pixel_samples)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx)."""
+    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx).
+
+    source_shape: voxels (z, y, x) that are projected, where the source is a volume from outside.
+    """
 
     source: FrameSource
     grid: Grid
     reference: np.ndarray
     title: str
+    source_shape: tuple[int, int, int] | None = None
+
+    def warn_of_inverse_crime(self) -> None:
+        """Says so where the projected voxels are no finer than the grid: reconstructions there look better than they are."""
+        shape = self.source_shape
+        if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
+            return
+        log.warning(
+            "%s: %s voxels are projected and a grid of %s is to be reconstructed: discretisation errors will not show "
+            "(inverse crime); take a smaller --size or a finer volume",
+            self.title,
+            "×".join(map(str, shape)),
+            "×".join(map(str, self.grid.shape)),
+        )
 
 
 def phantom_scene(
-    rt: Runtime, name: str, geometry: ConeGeometry, box: Grid, size: int, axis: str, seed: int
+    rt: Runtime,
+    name: str,
+    geometry: ConeGeometry,
+    box: Grid,
+    size: int,
+    axis: str,
+    seed: int,
+    pixel_samples: int = 1,
 ) -> Scene:
     """A phantom by name in the box of the scanner, to be reconstructed with ``size`` voxels a side.
 
     Closed forms are integrated exactly; procedural phantoms are drawn at twice ``size`` and projected at that
-    resolution, and the truth is their block mean.
+    resolution, and the truth is their block mean. Pixels see ``pixel_samples``² rays over their area.
     """
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(name, half_size_mm, 2 * size, seed)
     if isinstance(phantom, EllipsoidPhantom):
         grid = _resized(box, size)
-        return Scene(AnalyticSource(phantom, geometry), grid, phantom.voxelise(grid, 4), f"phantom {name}")
+        source = _on_panel(geometry, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
+        return Scene(source, grid, phantom.voxelise(grid, 4), f"phantom {name}")
     fine = Grid.cube(2 * size, 2 * half_size_mm)
     if not (np.allclose(box.size_mm, fine.size_mm) and np.allclose(box.offset_mm, 0)):
         log.warning(
@@ -205,19 +254,26 @@ def phantom_scene(
             2 * half_size_mm,
         )
     volume = phantom.voxelise(fine)
-    source = VolumeSource(rt, volume, fine, geometry, axis)
+    source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
     return Scene(
         source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}"
     )
 
 
 def volume_scene(
-    rt: Runtime, path: str, geometry: ConeGeometry, box: Grid, size: int | None, axis: str
+    rt: Runtime,
+    path: str,
+    geometry: ConeGeometry,
+    box: Grid,
+    size: int | None,
+    axis: str,
+    pixel_samples: int = 1,
 ) -> Scene:
     """A volume from a file, projected at its own resolution.
 
     A bare array is fitted into the scanner's box, its values being attenuation per half of the longest side (so
-    that line integrals do not depend on the scanner's size); one of our volumes keeps its own grid and 1/mm.
+    that line integrals do not depend on the scanner's size); one of our volumes keeps its own grid and 1/mm. Pixels see
+    ``pixel_samples``² rays over their area.
     """
     loaded = load_volume(path)
     volume, fine = loaded.volume, loaded.grid
@@ -226,8 +282,8 @@ def volume_scene(
         fine = Grid(volume.shape, (voxel_mm,) * 3, box.offset_mm)
         volume = volume / np.float32(fine.half_longest_mm)
     grid = _resized(fine, size or max(fine.shape))
-    source = VolumeSource(rt, volume, fine, geometry, axis)
-    return Scene(source, grid, block_mean(volume, grid.shape), f"volume {path}")
+    source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
+    return Scene(source, grid, block_mean(volume, grid.shape), f"volume {path}", fine.shape)
 
 
 def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:

@@ -38,6 +38,19 @@
 #define REC_REACH2 17     /* cutoff for |(along, across)|^2, enlarged by the largest Q */
 #endif
 
+/* floats from the first image to that of a cell; all of a frame's cells share one unless each line's own are wanted */
+#if LAYERED
+#define LAYER_AT(cell, lines, pitch) ((size_t)(cell)[CELL_LAYER] * (IMAGE_GUARD + (size_t)(lines) * (pitch)))
+#define LAYERS(count) (count)
+#else
+#define LAYER_AT(cell, lines, pitch) ((size_t)0)
+#define LAYERS(count) 1
+#endif
+
+#if FOOTPRINT
+#define PIXEL_VARIANCE 0.08333333333f /* of a uniform pixel, in pixels */
+#endif
+
 /* constants of a cell, floats */
 #define CELL 24
 #define CELL_SOURCE 0     /* 3 */
@@ -51,6 +64,7 @@
 #define CELL_DUU 14
 #define CELL_DUV 15
 #define CELL_DVV 16
+#define CELL_LAYER 17     /* LAYERED: image that the cell is drawn into; no line has two cells in one */
 
 #define MINUS_HALF_LOG2E (-0.72134752044f)
 

@@ -74,6 +74,14 @@ class ConeGeometry:
             detector_offset_mm=(off_v * factor, off_u * factor),
         )
 
+    def finer(self, factor: int) -> ConeGeometry:
+        """The same panel with every pixel cut into ``factor`` by ``factor``."""
+        rows, columns = self.detector_shape
+        dv, du = self.pixel_size_mm
+        return replace(
+            self, detector_shape=(rows * factor, columns * factor), pixel_size_mm=(dv / factor, du / factor)
+        )
+
     @property
     def magnification(self) -> float:
         """Detector size over object size at the axis."""

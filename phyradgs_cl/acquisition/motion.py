@@ -36,8 +36,11 @@ class Motion:
         checks.within("--segments (0 chooses from the time error)", self.segments, 0, 1000)
         checks.within("--time-error", self.time_error, 1e-6, 1)
 
-    def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The time cells of one frame; a scan that is not a fly-scan has one pose a frame in every model."""
+    def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
+        """The time cells of one frame; a scan that is not a fly-scan has one pose a frame in every model.
+
+        intensity_peak: as for ``segments_for``.
+        """
         where = (scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines)
         if self.name == "static-start":
             return cells.static_start_cells(*where)
@@ -46,6 +49,6 @@ class Motion:
         if self.name == "micro-views":
             return cells.micro_view_cells(*where, self.strips, self.sub_intervals)
         if self.name == "exact":
-            segments = self.segments or cells.segments_for(*where[:4], self.time_error)
+            segments = self.segments or cells.segments_for(*where[:4], self.time_error, intensity_peak)
             return cells.exact_cells(*where, segments)
         return cells.per_line_cells(*where, self.sub_intervals)

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.ray_operator import RayOperator
 from phyradgs_cl.runtime import Runtime
@@ -77,19 +77,11 @@ class IntensityOperator:
 
 def layers(table: TimeCells) -> list[TimeCells]:
     """The cells of a frame in tables in which no line has more than one; cells sorted by line stay so."""
-    chosen: list[list[int]] = []
-    free_from: list[int] = []
-    for cell, (start, stop) in enumerate(zip(table.line_start, table.line_stop, strict=True)):
-        layer = next((k for k, line in enumerate(free_from) if line <= start), len(free_from))
-        if layer == len(free_from):
-            chosen.append([])
-            free_from.append(0)
-        chosen[layer].append(cell)
-        free_from[layer] = int(stop)
-    return [_some(table, cells) for cells in chosen]
+    numbers = layer_numbers(table)
+    return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 
-def _some(table: TimeCells, cells: list[int]) -> TimeCells:
+def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
     names = ("pose", "time_s", "line_start", "line_stop", "weight")
     return replace(table, **{name: getattr(table, name)[cells] for name in names})
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers, layer_weights
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
@@ -86,7 +86,8 @@ class DeviceCells:
 
     A frame read out along columns is handled as its transpose: only the poses' pixel steps change places.
     With motion, ``matrices`` has three poses a cell, middle and both ends, and ``line_times`` (C, 3, time_pitch) when
-    every line integrates (TimeCells.line_times); without, it is a dummy.
+    every line integrates (TimeCells.line_times); without, it is a dummy. For the intensity model cells are spread over
+    ``layers`` images in which no line has two; ``layer_weights`` (layers, lines) are their shares of a line's window.
     """
 
     cells: DeviceArray
@@ -94,8 +95,10 @@ class DeviceCells:
     cell_lines: DeviceArray
     line_cells: DeviceArray
     line_times: DeviceArray
+    layer_weights: DeviceArray
     count: int
     lines: int
+    layers: int
     moving: bool = False
 
     @property
@@ -112,14 +115,18 @@ class DeviceCells:
             times = np.zeros((table.count, 3, pitch_of(table.lines)), np.float32)
             times[:, :, : table.lines] = table.line_times
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
+        numbers = layer_numbers(table)
+        weights = layer_weights(table, numbers)
         return cls(
-            cells=rt.upload(cell_constants(pose, table.weight)),
+            cells=rt.upload(cell_constants(pose, table.weight, numbers)),
             matrices=split_coefficients(rt, projection_matrices(poses)),
             cell_lines=rt.upload(ranges),
             line_cells=rt.upload(cells_of_lines(ranges, table.lines)),
             line_times=rt.upload(times),
+            layer_weights=rt.upload(weights, np.float32),
             count=table.count,
             lines=table.lines,
+            layers=len(weights),
             moving=table.end_poses is not None,
         )
 
@@ -136,7 +143,7 @@ def projection_matrices(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([inverse, shift[:, :, None]], -1).reshape(len(pose), 12)
 
 
-def cell_constants(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def cell_constants(pose: np.ndarray, weight: np.ndarray, layer: np.ndarray) -> np.ndarray:
     """The (C, 24) float32 table that cl/common/splat.h describes."""
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]
@@ -148,6 +155,7 @@ def cell_constants(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:
         [(d00, d00, 1), (d00, eu, 2), (d00, ev, 2), (eu, eu, 1), (eu, ev, 2), (ev, ev, 1)], start=11
     ):
         table[:, column] = factor * np.einsum("ci,ci->c", a, b)
+    table[:, 17] = layer
     return table.astype(np.float32)
 
 

@@ -3,7 +3,8 @@
 This is the paper's *multi-pose batch rendering* (section 2.3). All M×N micro-views of a frame go through one
 launch an operator: ``splat_prepare`` sees every Gaussian from every pose, ``splat_forward`` does micro-view
 accumulation and strip concatenation (Eq. 3) straight into the merged frame, ``splat_backward`` and
-``splat_chain`` are the adjoint. No micro-view is ever stored.
+``splat_chain`` are the adjoint. No micro-view is ever stored. A detector that adds photons instead of line integrals
+needs the cells of a line one by one: they are drawn into a few layers then, which ``Layers`` merges.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from phyradgs_cl.operators.binning import TileLists
+from phyradgs_cl.operators.layers import Layers
 from phyradgs_cl.operators.layout import (
     GUARD,
     DeviceCells,
@@ -49,7 +51,9 @@ class SplatProjector:
 
     ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the
     Mahalanobis radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` bounds what the rules
-    leave by which cells with motion average a splat over time (relative, RMS).
+    leave by which cells with motion average a splat over time (relative, RMS). ``pixel_footprint`` adds a pixel's
+    variance to that of every splat, mass kept: what pixels with an area see. ``intensity_unit``: the line integral
+    that is 1 in the image, where a detector averages intensities over a line's cells; None averages line integrals.
     """
 
     def __init__(
@@ -61,6 +65,8 @@ class SplatProjector:
         affine: bool = False,
         cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
         time_error: float = DEFAULT_TIME_ERROR,
+        pixel_footprint: bool = False,
+        intensity_unit: float | None = None,
     ) -> None:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
@@ -70,8 +76,9 @@ class SplatProjector:
         self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
-        self._affine = int(affine)
+        self._affine, self._footprint = int(affine), int(pixel_footprint)
         self.image = padded_zeros(rt, lines, width)
+        self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
         self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
@@ -86,6 +93,7 @@ class SplatProjector:
         kernel = rt.kernel(
             "splat_forward", "splat_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines(cells)
         )
+        drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.pitch, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
             kernel,
@@ -106,9 +114,12 @@ class SplatProjector:
             np.int32(self.tile_h),
             np.int32(-(-self.width // self.tile_w)),
             self.cutoff2,
-            self.image,
+            np.int32(cells.layers),
+            drawn,
             group=16 if self.by_pixel else 1,
         )
+        if self._layers is not None:
+            self._layers.merge(cells, self.image)
         return self.image
 
     def backward(
@@ -120,6 +131,7 @@ class SplatProjector:
         """
         rt = self.rt
         group = _BACKWARD_GROUP if self.by_pixel else 1
+        by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
         kernel = rt.kernel("splat_backward", "splat_backward", GROUP=group, **self._defines(cells))
         rt.launch(
             kernel,
@@ -129,9 +141,10 @@ class SplatProjector:
             cells.line_times,
             np.int32(cells.time_pitch),
             self.path_limits,
-            by_image,
+            by_images,
             np.int32(gaussians.count),
             np.int32(cells.count),
+            np.int32(self.lines),
             np.int32(self.pitch),
             self.cutoff2,
             self._sums,
@@ -174,7 +187,13 @@ class SplatProjector:
 
     def _defines(self, cells: DeviceCells) -> dict[str, int]:
         """What the kernels are built with; cells without motion get code without it."""
-        return {"AFFINE": self._affine, "IMAGE_GUARD": GUARD, "MOVING": int(cells.moving)}
+        return {
+            "AFFINE": self._affine,
+            "FOOTPRINT": self._footprint,
+            "IMAGE_GUARD": GUARD,
+            "LAYERED": int(self._layers is not None),
+            "MOVING": int(cells.moving),
+        }
 
     def _prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
         rt = self.rt

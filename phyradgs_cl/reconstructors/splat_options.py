@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
@@ -39,11 +40,14 @@ class SplatOptions:
 
     gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ; ``tv_edge`` is the
     edge of the random sub-volume in voxels. ``scale_min_voxels`` > 0 raises the smallest scale to that share
-    of a voxel.
+    of a voxel. ``detector_model``: what is averaged over a line's times, line integrals (log) or intensity, or
+    what the scan says. ``pixel_footprint`` lets pixels average over their area.
     """
 
     motion: Motion = Motion("micro-views", 8, 5)
     affine: bool = False
+    detector_model: str = "scan"
+    pixel_footprint: bool = False
     iterations: int = 3000
     gaussians: int = 0
     ssim_weight: float = 0.2
@@ -70,6 +74,7 @@ class SplatOptions:
         checks.within("--iterations", self.iterations, 0, 1_000_000_000)
         checks.within("--gaussians (0 chooses from the grid)", self.gaussians, 0, 100_000_000)
         checks.fields_within("", self, _RANGES)
+        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         if self.scale_max <= self.scale_min:
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
         if self.motion.name == "per-row":

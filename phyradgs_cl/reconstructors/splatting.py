@@ -33,6 +33,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 REPORT_EVERY = 50
 log = logging.getLogger(__name__)
 _REFERENCE_PERCENTILE = 99.9
+_PEAK_PERCENTILE = 99.9  # noise has peaks of its own
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ def reconstruct_splats(
         "gaussians": cloud.count,
         "seconds": time.perf_counter() - started,
         "interrupted_at": run.interrupted_at,
+        "detector_model": "log" if run.frames.intensity_unit is None else "intensity",
     }
     if options.motion.name == "exact":
         facts |= run.time_facts()
@@ -125,6 +127,8 @@ class SplatRun:
             affine=options.affine,
             cutoff_sigma=options.cutoff_sigma,
             time_error=options.motion.time_error,
+            pixel_footprint=options.pixel_footprint,
+            intensity_unit=self.frames.intensity_unit,
         )
         self.loss = ImageLoss(
             rt,
@@ -297,10 +301,15 @@ class DeviceFrames:
         by_column = scan.shutter.axis == "columns"
         rows, columns = scan.geometry.detector_shape
         self.lines, self.width = (columns, rows) if by_column else (rows, columns)
+        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
         tables = [
-            scaled_cells(options.motion.cells(scan, f), 1 / scale.length_mm) for f in range(scan.frames)
+            scaled_cells(options.motion.cells(scan, f, peak), 1 / scale.length_mm) for f in range(scan.frames)
         ]
         self._cells = [DeviceCells.upload(rt, table) for table in tables]
+        # of one value both models are the mean
+        averages = model == "intensity" and max(cells.layers for cells in self._cells) > 1
+        self.intensity_unit = scale.line_integral if averages else None
         frames = scan.projections / np.float32(scale.line_integral)
         self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
         self._mask, self._pixels = _upload_masks(rt, scan, by_column)

@@ -93,3 +93,9 @@ def test_impossible_numbers_are_named(change, option) -> None:
         Motion("exact", **change)
     with pytest.raises(InputError, match="segments"):
         exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 0)
+
+
+def test_averaged_intensities_take_more_segments_where_contrast_is_high() -> None:
+    where = (ORBIT, Shutter(0.8, 0.6), 0, START_S, 0.0005)
+    counts = [segments_for(*where, peak) for peak in (0.0, 4.0, 8.0, 16.0)]
+    assert counts[0] == counts[1] < counts[2] < counts[3] <= 2 * counts[0]

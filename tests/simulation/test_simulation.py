@@ -9,6 +9,8 @@ import pytest
 from tolerances import ANALYTIC_FRAME, FLOAT32, TIME_SAMPLING, VOXEL_SOURCE
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, make_protocol, pixel_centres
+from phyradgs_cl.acquisition.cells import per_line_cells
+from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import EllipsoidPhantom, shepp_logan
@@ -225,3 +227,37 @@ def test_a_box_that_a_procedural_phantom_does_not_fill_is_said(rt, caplog) -> No
     assert "not used" in caplog.text
     assert scene.grid == Grid.cube(8, 1.0)
     assert cube.grid == Grid.cube(8, 2.0)
+
+
+@pytest.mark.parametrize("model", ["log", "intensity"])
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_pixels_with_an_area_average_over_it(rt, axis, model) -> None:
+    """Every fine ray written out, its pixel's line integrated at that line's times."""
+    n, samples = 3, 4
+    scene = phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, axis, 0, pixel_samples=n)
+    options = SimulationOptions(FLY, axis, 1, model, time_samples=samples, peak=6.0)
+    scan = simulate(scene.source, GEOMETRY, GRID, options)
+    factor, shutter = scan.provenance["attenuation_factor"], scan.shutter
+    steps = (np.arange(n) - (n - 1) / 2) / n
+    lines = shutter.lines(SHAPE)
+    table = per_line_cells(scan.trajectory, shutter, 1, float(scan.frame_start_s[1]), lines, samples)
+    line = lines // 2
+    rays = []
+    for pose in table.pose[table.line_start == line]:
+        for dy in steps:
+            for dx in steps:
+                target = pixel_centres(pose, SHAPE) + dy * pose[9:12] + dx * pose[6:9]
+                p = factor * PHANTOM.line_integrals(pose[:3], target)
+                rays.append(p[line] if axis == "rows" else p[:, line])
+    expected = average(np.stack(rays), np.full(len(rays), 1 / len(rays)), model)
+    frame = scan.projections[1]
+    found = frame[line] if axis == "rows" else frame[:, line]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=ANALYTIC_FRAME * 6)
+    points = phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, axis, 0)
+    other = simulate(points.source, GEOMETRY, GRID, options).projections[1]
+    assert np.abs(other - frame).max() > 0.1
+
+
+def test_pixel_samples_are_counted_from_one(rt) -> None:
+    with pytest.raises(InputError, match="--pixel-samples"):
+        phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, "rows", 0, pixel_samples=0)

@@ -37,15 +37,21 @@ def moving_frame(
     detector_shape: tuple[int, int],
     cutoff_sigma: float = 0.0,
     affine: bool = False,
+    pixel_variance: float = 0.0,
 ) -> np.ndarray:
-    """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion."""
+    """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion.
+
+    ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept.
+    """
     by_column = table.axis == "columns"
     shape = detector_shape[::-1] if by_column else detector_shape
     turn = transpose_pose if by_column else np.asarray
     frame = np.zeros(shape)
     for pose, ends, times in zip(turn(table.pose), turn(table.end_poses), table.line_times, strict=True):
         for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
-            frame += _segment_image(row, precision, pose, ends, times, shape, cutoff_sigma, affine)
+            frame += _segment_image(
+                row, precision, pose, ends, times, shape, cutoff_sigma, affine, pixel_variance
+            )
     return frame.T if by_column else frame
 
 
@@ -55,19 +61,24 @@ def seen_at(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
     return np.array([p[0] / p[2], p[1] / p[2], p[2]])
 
 
-def _segment(row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray) -> _Segment:
+def _segment(
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, pixel_variance: float
+) -> _Segment:
     u, v, z = seen_at(pose, row[:3])
     first, last = (seen_at(end, row[:3])[:2] for end in ends)
     d0, steps = (row[:3] - pose[:3]) / z, np.stack([pose[6:9], pose[9:12]], -1)
     alpha = d0 @ precision @ d0
     b, c = steps.T @ precision @ d0 / alpha, steps.T @ precision @ steps / alpha
+    sharp = z * z * alpha * (c - np.outer(b, b))
+    conic = np.linalg.inv(np.linalg.inv(sharp) + pixel_variance * np.eye(2))
+    mass_kept = np.sqrt(np.linalg.det(conic) / np.linalg.det(sharp))
     return _Segment(
         centre=(first + 4 * np.array([u, v]) + last) / 6,
         path=last - first,
-        conic=z * z * alpha * (c - np.outer(b, b)),
+        conic=conic,
         b=b,
-        c=c,
-        amplitude=float(row[10] * np.sqrt(2 * np.pi / alpha)),
+        c=np.outer(b, b) + conic / (z * z * alpha),
+        amplitude=float(mass_kept * row[10] * np.sqrt(2 * np.pi / alpha)),
     )
 
 
@@ -80,10 +91,11 @@ def _segment_image(
     shape: tuple[int, int],
     cutoff_sigma: float,
     affine: bool,
+    pixel_variance: float,
 ) -> np.ndarray:
     if min(seen_at(p, row[:3])[2] for p in (pose, *ends)) <= 0:
         return np.zeros(shape)
-    s = _segment(row, precision, pose, ends)
+    s = _segment(row, precision, pose, ends, pixel_variance)
     v, u = np.mgrid[: shape[0], : shape[1]]
     delta = np.stack([u, v], -1) - s.centre
     big_q = np.ones(shape) if affine else 1 + 2 * delta @ s.b + np.einsum("...i,ij,...j", delta, s.c, delta)

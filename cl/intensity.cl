@@ -1,0 +1,63 @@
+/* The intensity model over the cells of a frame: a detector adds photons, not line integrals.
+
+   The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame is -ln(sum w_k exp(-p_k)) and
+   its derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Twin: detector/average.py. */
+#include "common/lanes.h"
+
+#define LOG2E 1.44269504089f
+
+/* p_k of a pixel from w_k p_k */
+#define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) / weights[(size_t)(k) * lines + v])
+
+__kernel void intensity_merge(
+    __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
+    __global const float *weights,  /* (layer_count, lines): share of a line's window, 0 where a layer is not its own */
+    const int layer_count, const int lines, const int width, const int pitch,
+    const float unit,               /* line integral that is 1 in the images */
+    __global float *shares,         /* layer_count images: derivative of the merged frame by the layers */
+    __global float *merged)         /* guard, then (lines, pitch), padding left as it is */
+{
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1);
+    if (u >= width || v >= lines)
+        return;
+    const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
+    const vi inside = V_INT((vf)(u) + V_IOTA) < width;
+    vf least = (vf)(MAXFLOAT); /* the brightest cell is taken out, so that nothing overflows */
+    for (int k = 0; k < layer_count; ++k)
+        if (weights[(size_t)k * lines + v] > 0.0f)
+            least = min(least, SEEN(k));
+    vf total = (vf)(0.0f);
+    for (int k = 0; k < layer_count; ++k) {
+        const float weight = weights[(size_t)k * lines + v];
+        vf light = (vf)(0.0f);
+        if (weight > 0.0f)
+            light = exp2((least - SEEN(k)) * (unit * LOG2E));
+        total += weight * light;
+        V_STORE(light, shares + (size_t)k * layer_size + at);
+    }
+    const vi lit = total > 0.0f;
+    const vf inv = V_PICK(0.0f, 1.0f / total, lit & inside);
+    for (int k = 0; k < layer_count; ++k) {
+        __global float *share = shares + (size_t)k * layer_size + at;
+        V_STORE(V_LOAD(share) * inv, share);
+    }
+    V_STORE(V_PICK(0.0f, least - log(total) / unit, lit & inside), merged + at);
+}
+
+/* dL/dlayers from dL/dmerged */
+__kernel void intensity_split(
+    __global const float *by_merged, /* guard, then (lines, pitch) */
+    __global const float *shares,
+    const int layer_count, const int lines, const int width, const int pitch,
+    __global float *by_layers)
+{
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1);
+    if (u >= width || v >= lines)
+        return;
+    const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
+    const vf by = V_LOAD(by_merged + at);
+    for (int k = 0; k < layer_count; ++k) {
+        const size_t there = (size_t)k * layer_size + at;
+        V_STORE(by * V_LOAD(shares + there), by_layers + there);
+    }
+}
