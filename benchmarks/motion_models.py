@@ -1,0 +1,255 @@
+"""Accuracy and cost of the splats' motion models: quality of whole reconstructions, time an iteration, and a figure.
+
+    python benchmarks/motion_models.py run VOLUMES RESULTS.jsonl [--size 64] [--names a,b] [--motions "8x5,exact 0.005"] [--seeds 0]
+    python benchmarks/motion_models.py cost COST.json [--size 64]
+    python benchmarks/motion_models.py table RESULTS.jsonl
+    python benchmarks/motion_models.py figure RESULTS.jsonl COST.json TIME_EXACT.json FIGURE.png
+
+Motions: static, MxN (micro-views), "exact BOUND". ``run`` scans the volumes as benchmarks/quality.py does (rapid, rows,
+TIGRE's noise at 1e4 photons and sigma 10) and goes on where it was interrupted. ``cost`` times whole iterations, density
+control left out, on one scan of the foot phantom: the median over rounds in which all motions take turns. TIME_EXACT.json
+is what benchmarks/time_exact.py writes: errors of one frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+from quality import append, file_for, make_scan, read_lines
+
+from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics import compare
+from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splatting import SplatRun, first_population, internal_scale
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+
+MOTIONS = "static,4x3,8x5,16x7,exact 0.02,exact 0.01,exact 0.005,exact 0.002"
+REFERENCE = "8x5"
+
+Line = dict[str, object]
+
+
+def motion_of(name: str) -> dict[str, object]:
+    """Options of a motion by its name here."""
+    if name.startswith("exact"):
+        return {"motion": "exact", "time_error": float(name.split()[1])}
+    if name == "static":
+        return {"motion": "static"}
+    strips, sub_intervals = (int(n) for n in name.split("x"))
+    return {"motion": "micro-views", "strips": strips, "sub_intervals": sub_intervals}
+
+
+# --- quality ----------------------------------------------------------------------------------------------------
+
+
+def run(arguments: Namespace) -> None:
+    rt = Runtime(arguments.device)
+    folder, results = Path(arguments.volumes), Path(arguments.results)
+    names = arguments.names.split(",") if arguments.names else names_in(folder)
+    done = {key_of(line) for line in read_lines(results)}
+    for motion in arguments.motions.split(","):
+        for seed in (int(s) for s in arguments.seeds.split(",")):
+            for name in names:
+                facts: Line = {
+                    "volume": name,
+                    "motion": motion,
+                    "size": arguments.size,
+                    "seed": seed,
+                    "iterations": arguments.iterations,
+                }
+                if key_of(facts) in done:
+                    continue
+                scan = make_scan(rt, file_for(folder, name, arguments.size), arguments, seed)
+                line = {**facts, **run_one(rt, scan, motion, arguments.iterations, seed)}
+                append(results, line)
+                print(json.dumps(line), flush=True)
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted({p.stem.rsplit("_", 1)[0] for p in folder.glob("*.h5")})
+
+
+def run_one(rt: Runtime, scan: Scan, motion: str, iterations: int, seed: int) -> Line:
+    options = method_options("phyradgs", None, {**motion_of(motion), "iterations": iterations})
+    result = reconstruct(scan, "phyradgs", rt, options, seed=seed)
+    facts = result.facts
+    return {
+        **compare(result.volume, scan.reference),
+        "seconds": round(float(facts["seconds"]), 1),
+        "gaussians": facts["gaussians"],
+        "segments": facts.get("segments", 0),
+        "device": rt.device.name,
+    }
+
+
+def key_of(line: Line) -> tuple[object, ...]:
+    return tuple(line[k] for k in ("volume", "motion", "size", "seed", "iterations"))
+
+
+def means(lines: list[Line], size: int) -> dict[str, dict[str, tuple[float, float]]]:
+    """(PSNR dB, SSIM) by motion and volume, the mean over seeds."""
+    groups: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for line in lines:
+        if line["size"] == size:
+            runs = groups.setdefault(str(line["motion"]), {}).setdefault(str(line["volume"]), [])
+            runs.append((float(line["psnr_db"]), float(line["ssim"])))  # type: ignore[arg-type]
+    return {
+        motion: {volume: tuple(np.mean(runs, axis=0)) for volume, runs in volumes.items()}
+        for motion, volumes in groups.items()
+    }  # type: ignore[return-value]
+
+
+def table(lines: list[Line]) -> str:
+    """Markdown: volumes by motions, PSNR dB / SSIM, for every size; the mean is of the volumes that all motions have."""
+    text = []
+    for size in sorted({int(line["size"]) for line in lines}):  # type: ignore[call-overload]
+        found = means(lines, size)
+        volumes = sorted({v for by_volume in found.values() for v in by_volume})
+        text += [
+            f"\n**{size}³**\n",
+            "| volume | " + " | ".join(found) + " |",
+            "|---" * (len(found) + 1) + "|",
+        ]
+        for volume in volumes:
+            cells = ("{:.2f} / {:.3f}".format(*f[volume]) if volume in f else "–" for f in found.values())
+            text.append(f"| {volume} | " + " | ".join(cells) + " |")
+        shared = [v for v in volumes if all(v in f for f in found.values())]
+        if shared:
+            mean = (np.mean([f[v] for v in shared], axis=0) for f in found.values())
+            cells = ("{:.2f} / {:.3f}".format(*m) for m in mean)
+            text.append(f"| **mean of {len(shared)}** | " + " | ".join(cells) + " |")
+    return "\n".join(text)
+
+
+# --- cost -------------------------------------------------------------------------------------------------------
+
+
+def cost(arguments: Namespace) -> dict[str, object]:
+    """Median milliseconds an iteration by motion, and the ratio to ``REFERENCE``."""
+    rt = Runtime(arguments.device)
+    scan = foot_scan(rt, arguments.size)
+    runs = {name: fresh_run(rt, scan, name) for name in arguments.motions.split(",")}
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(arguments.rounds):
+        for name, one in runs.items():
+            started = time.perf_counter()
+            for _ in range(arguments.steps):
+                one.step()
+            rt.finish()
+            times[name].append(1e3 * (time.perf_counter() - started) / arguments.steps)
+    median = {name: statistics.median(values) for name, values in times.items()}
+    rows = {name: {"ms": ms, "ratio": ms / median[REFERENCE]} for name, ms in median.items()}
+    return {"device": rt.device.name, "size": arguments.size, "motions": rows}
+
+
+def foot_scan(rt: Runtime, size: int) -> Scan:
+    geometry = ConeGeometry(5.0, 7.0, (2 * size, 2 * size), (2.0 / size,) * 2)
+    scene = phantom_scene(rt, "foot", geometry, Grid.cube(size, 2.0), size, "rows", 0)
+    options = SimulationOptions(protocol=make_protocol("rapid"), noise="tigre")
+    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
+
+
+def fresh_run(rt: Runtime, scan: Scan, name: str) -> SplatRun:
+    """A reconstruction after its first 200 iterations, from where its cost hardly changes."""
+    told = motion_of(name)
+    motion = Motion(str(told.pop("motion")), **told)  # type: ignore[arg-type]
+    options = SplatOptions(motion=motion)
+    fdk = static_fdk(rt, scan)
+    scale = internal_scale(fdk, scan.grid)
+    grid, rng = scan.grid.scaled(1 / scale.length_mm), np.random.default_rng(0)
+    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
+    started = SplatRun(rt, scan, options, scale, population, rng)
+    for _ in range(200):
+        started.step()
+    return started
+
+
+# --- figure -----------------------------------------------------------------------------------------------------
+
+
+def figure(lines: list[Line], costs: dict, errors: dict, path: Path) -> None:
+    """Error of a frame and PSNR of a reconstruction over the time of an iteration, by motion."""
+    from matplotlib.figure import Figure
+
+    size = int(costs["size"])
+    found = means(lines, size)
+    volumes = sorted(set.intersection(*(set(found[m]) for m in found)))
+    drawing = Figure(figsize=(10, 4), layout="constrained")
+    left, right = drawing.subplots(1, 2)
+    for family, colour, label in (("x", "#b3261e", "micro-views"), ("exact", "#2b5c8a", "exact in time")):
+        names = sorted((m for m in costs["motions"] if family in m.split()[0][1:] or m.startswith(family)), key=lambda m: costs["motions"][m]["ms"])  # fmt: skip
+        names = [m for m in names if (family == "exact") == m.startswith("exact")]
+        for axes, values in ((left, frame_errors(errors)), (right, psnrs(found, volumes))):
+            shown = [m for m in names if m in values]
+            axes.plot([costs["motions"][m]["ms"] for m in shown], [values[m] for m in shown], "o-", color=colour, label=label)  # fmt: skip
+            for m in shown:
+                at = (costs["motions"][m]["ms"], values[m])
+                axes.annotate(
+                    m.replace("exact ", ""), at, xytext=(4, 4), textcoords="offset points", fontsize=8
+                )
+    for axes, values in ((left, frame_errors(errors)), (right, psnrs(found, volumes))):
+        if "static" in values and "static" in costs["motions"]:
+            axes.plot(
+                costs["motions"]["static"]["ms"], values["static"], "s", color="#8a6d1a", label="static"
+            )
+        axes.set_xlabel("milliseconds an iteration")
+        axes.legend()
+    left.set_yscale("log")
+    left.set_ylabel("error of a frame, %")
+    right.set_ylabel(f"PSNR at {size}³, dB, mean of {len(volumes)}")
+    drawing.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def frame_errors(errors: dict) -> dict[str, float]:
+    """Percent, mean of single Gaussians, by the motion's name here."""
+    named = {
+        name.removeprefix("micro-views ").replace("exact, bound", "exact"): 100 * row["error_gaussians"]
+        for name, row in errors["models"].items()
+    }
+    return {name: value for name, value in named.items() if "K" not in name}
+
+
+def psnrs(found: dict, volumes: list[str]) -> dict[str, float]:
+    return {m: float(np.mean([found[m][v][0] for v in volumes])) for m in found}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("run", "cost", "table", "figure"))
+    parser.add_argument("paths", nargs="+")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--names")
+    parser.add_argument("--motions", default=MOTIONS)
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--steps", type=int, default=10)
+    parser.add_argument("--device")
+    arguments = parser.parse_args(namespace=Namespace(axis="rows", protocol="rapid"))
+    paths = [Path(p) for p in arguments.paths]
+    if arguments.what == "run":
+        arguments.volumes, arguments.results = paths
+        run(arguments)
+    elif arguments.what == "cost":
+        paths[0].write_text(json.dumps(cost(arguments), indent=1) + "\n", encoding="utf-8")
+    elif arguments.what == "table":
+        print(table(read_lines(paths[0])))
+    else:
+        lines, costs, errors = read_lines(paths[0]), *(json.loads(p.read_text()) for p in paths[1:3])
+        figure(lines, costs, errors, paths[3])
+
+
+if __name__ == "__main__":
+    main()
