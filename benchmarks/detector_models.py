@@ -1,6 +1,6 @@
 """What it is worth to model the detector: every effect modelled and ignored, several methods, mean over seeds.
 
-    python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects intensity,lag] [--seeds 0,1]
+    python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects lag,pulse] [--seeds 0]
     python benchmarks/detector_models.py RESULTS.jsonl --table
 
 Rapid fly-scans (25 frames of 14.4 degrees, rows read out) of 48 cubed voxels on 72 squared pixels, counts of 1e5 photons
@@ -37,7 +37,7 @@ ITERATIONS = {
     "phyradgs": 2000, "phyradgs micro-views": 2000,
 }  # fmt: skip
 ALL = tuple(ITERATIONS)
-WEIGHTED = {"l1_weight": 0.0, "poisson_weight": 30.0}  # of splats, in place of L1
+WEIGHTED = {"poisson_weight": 10.0}  # of splats, beside L1
 GEOMETRY = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (4.0 / PIXELS, 4.0 / PIXELS))
 
 Row = dict[str, object]

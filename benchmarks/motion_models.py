@@ -1,6 +1,6 @@
 """Accuracy and cost of the splats' motion models: quality of whole reconstructions, time an iteration, and a figure.
 
-    python benchmarks/motion_models.py run VOLUMES RESULTS.jsonl [--size 64] [--names a,b] [--motions "8x5,exact 0.005"] [--seeds 0]
+    python benchmarks/motion_models.py run VOLUMES RESULTS.jsonl [--size 64] [--names a,b] [--motions 8x5,static]
     python benchmarks/motion_models.py cost COST.json [--size 64]
     python benchmarks/motion_models.py table RESULTS.jsonl
     python benchmarks/motion_models.py figure RESULTS.jsonl COST.json TIME_EXACT.json FIGURE.png
@@ -186,17 +186,17 @@ def figure(lines: list[Line], costs: dict, errors: dict, path: Path) -> None:
     volumes = sorted(set.intersection(*(set(found[m]) for m in found)))
     drawing = Figure(figsize=(10, 4), layout="constrained")
     left, right = drawing.subplots(1, 2)
-    for family, colour, label in (("x", "#b3261e", "micro-views"), ("exact", "#2b5c8a", "exact in time")):
-        names = sorted((m for m in costs["motions"] if family in m.split()[0][1:] or m.startswith(family)), key=lambda m: costs["motions"][m]["ms"])  # fmt: skip
-        names = [m for m in names if (family == "exact") == m.startswith("exact")]
-        for axes, values in ((left, frame_errors(errors)), (right, psnrs(found, volumes))):
-            shown = [m for m in names if m in values]
-            axes.plot([costs["motions"][m]["ms"] for m in shown], [values[m] for m in shown], "o-", color=colour, label=label)  # fmt: skip
-            for m in shown:
-                at = (costs["motions"][m]["ms"], values[m])
-                axes.annotate(
-                    m.replace("exact ", ""), at, xytext=(4, 4), textcoords="offset points", fontsize=8
-                )
+    time_ms = {name: row["ms"] for name, row in costs["motions"].items()}
+    panels = ((left, frame_errors(errors)), (right, psnrs(found, volumes)))
+    for exact, colour, label in ((False, "#b3261e", "micro-views"), (True, "#2b5c8a", "exact in time")):
+        family = [m for m in time_ms if m != "static" and m.startswith("exact") == exact]
+        for axes, values in panels:
+            names = sorted((m for m in family if m in values), key=time_ms.__getitem__)
+            points = [(time_ms[m], values[m]) for m in names]
+            axes.plot(*zip(*points, strict=True), "o-", color=colour, label=label)
+            for name, at in zip(names, points, strict=True):
+                text = name.removeprefix("exact ")
+                axes.annotate(text, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
     for axes, values in ((left, frame_errors(errors)), (right, psnrs(found, volumes))):
         if "static" in values and "static" in costs["motions"]:
             axes.plot(

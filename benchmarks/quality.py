@@ -21,17 +21,18 @@ import numpy as np
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, simulate, volume_scene
-from phyradgs_cl.workflow import compare
 
 METHODS = {
     "fdk": ("fdk", {}),
     "r2": ("r2", {}),
     "r2 w/ ST": ("r2", {"motion": "micro-views"}),
     "phyradgs static": ("phyradgs", {"motion": "static"}),
-    "phyradgs": ("phyradgs", {}),
+    "phyradgs": ("phyradgs", {"motion": "micro-views"}),
+    "phyradgs exact": ("phyradgs", {"motion": "exact"}),
 }
 
 

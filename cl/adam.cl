@@ -3,8 +3,8 @@
    Twins: fields/gaussians.py and optim/adam.py. */
 #include "common/gaussian.h"
 
-inline vf logistic(vf x) { return 1.0f / (1.0f + exp(-x)); }
-inline vf softplus(vf x) { return max(max(x, 0.0f) + log1p(exp(-fabs(x))), 1e-12f); }
+static inline vf logistic(vf x) { return 1.0f / (1.0f + exp(-x)); }
+static inline vf softplus(vf x) { return max(max(x, 0.0f) + log1p(exp(-fabs(x))), 1e-12f); }
 
 __kernel void activate(
     __global const float *raw, const int count, const int stride, const float scale_min, const float scale_max,

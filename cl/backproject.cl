@@ -114,13 +114,13 @@ __kernel void backproject_upright(
 #define LINE_STEPS 6
 #define LEAST_SPEED 0.1f
 
-inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
+static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
 {
     *depth = m[8] * x + m[9] * y + m[10] * z + m[11];
     return (m[4] * x + m[5] * y + m[6] * z + m[7]) / *depth;
 }
 
-inline float line_sample(__global const float *line, const float u, const int width)
+static inline float line_sample(__global const float *line, const float u, const int width)
 {
     if (!(u >= 0.0f && u <= (float)(width - 1)))
         return 0.0f;

@@ -5,7 +5,7 @@
 
 #define RADIUS 5
 
-inline vf masked(__global const float *image, __global const float *mask, const size_t at)
+static inline vf masked(__global const float *image, __global const float *mask, const size_t at)
 {
     return V_LOAD(image + at) * V_LOAD(mask + at);
 }

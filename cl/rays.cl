@@ -178,7 +178,7 @@ __kernel void rays_adjoint(
 #define FEW_CELLS 8    /* a frame of so few is not worth the search */
 
 /* weight that the ray's sample puts on the voxel, as rays_forward does */
-inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)
+static inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)
 {
     const int a = r.axis, b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2;
     const float da = a == 0 ? r.x : (a == 1 ? r.y : r.z), db = a == 0 ? r.y : r.x, dc = a == 2 ? r.y : r.z;

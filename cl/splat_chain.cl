@@ -16,7 +16,7 @@
 #endif
 
 /* from the gradient by (u0, v0) and by the depth z to that by the mean: u0 = (row 0 . x) / z, v0 = (row 1 . x) / z */
-inline void add_by_centre(v3 *by_mean, __global const coefficient *m, const vf u0, const vf v0, const vf inv_z,
+static inline void add_by_centre(v3 *by_mean, __global const coefficient *m, const vf u0, const vf v0, const vf inv_z,
                           const vf by_u0, const vf by_v0, const vf by_z)
 {
     const vf cu = by_u0 * inv_z, cv = by_v0 * inv_z, cz = by_z - cu * u0 - cv * v0;

@@ -2,7 +2,7 @@
    between neighbours along each axis, and its gradient. A work-item takes one row of x. */
 #include "common/lanes.h"
 
-inline vf sign_of(vf d)
+static inline vf sign_of(vf d)
 {
     return V_PICK(V_PICK(0.0f, -1.0f, d < 0.0f), 1.0f, d > 0.0f);
 }

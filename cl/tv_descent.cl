@@ -4,7 +4,7 @@
 
 #define SMALLEST 1e-8f    /* keeps flat regions from dividing by zero */
 
-inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const int y, const int z,
+static inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const int y, const int z,
                                   const size_t row, const size_t slice)
 {
     const float here = volume[at];
@@ -12,7 +12,7 @@ inline float3 backward_difference(__global const float *volume, const size_t at,
                     z > 0 ? here - volume[at - slice] : 0.0f);
 }
 
-inline float inverse_length(const float3 d)
+static inline float inverse_length(const float3 d)
 {
     return 1.0f / (sqrt(d.x * d.x + d.y * d.y + d.z * d.z) + SMALLEST);
 }

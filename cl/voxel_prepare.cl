@@ -44,8 +44,8 @@ __kernel void voxel_prepare(
     const vf sigma[3] = {sqrt(v3_dot(sx, sx)) / pitch.x, sqrt(v3_dot(sy, sy)) / pitch.y, sqrt(v3_dot(sz, sz)) / pitch.z};
     const int sizes[3] = {shape.x, shape.y, shape.z};
 
-    float fields[VOXEL_RECORD * LANES];
-    int *bounds = (int *)fields;
+    float fields[VOX_WHOLE * LANES];
+    int bounds[(VOX_HI + 3 - VOX_WHOLE) * LANES];
     V_STORE(rest[0], fields);
     V_STORE(rest[1], fields + LANES);
     V_STORE(rest[2], fields + 2 * LANES);
@@ -71,15 +71,18 @@ __kernel void voxel_prepare(
     for (int k = 0; k < 3; ++k) {
         lo[k] = VI_PICK(1, lo[k], drawn);
         hi[k] = VI_PICK(0, hi[k], drawn);
-        VI_STORE(V_INT(whole[k]), bounds + (VOX_WHOLE + k) * LANES);
-        VI_STORE(lo[k], bounds + (VOX_LO + k) * LANES);
-        VI_STORE(hi[k], bounds + (VOX_HI + k) * LANES);
+        VI_STORE(V_INT(whole[k]), bounds + k * LANES);
+        VI_STORE(lo[k], bounds + (3 + k) * LANES);
+        VI_STORE(hi[k], bounds + (6 + k) * LANES);
         VI_STORE(lo[k], extents + (size_t)(2 * k) * stride + first);
         VI_STORE(hi[k], extents + (size_t)(2 * k + 1) * stride + first);
     }
     for (int lane = 0; lane < LANES; ++lane) {
-        __global int *rec = (__global int *)(records + (size_t)(first + lane) * VOXEL_RECORD);
-        for (int f = 0; f < VOX_HI + 3; ++f)
-            rec[f] = bounds[f * LANES + lane];
+        __global float *rec = records + (size_t)(first + lane) * VOXEL_RECORD;
+        __global int *whole_rec = (__global int *)rec;
+        for (int f = 0; f < VOX_WHOLE; ++f)
+            rec[f] = fields[f * LANES + lane];
+        for (int f = VOX_WHOLE; f < VOX_HI + 3; ++f)
+            whole_rec[f] = bounds[(f - VOX_WHOLE) * LANES + lane];
     }
 }

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from phyradgs_cl import checks
-from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.errors import InputError, PhyradgsError
+from phyradgs_cl.reconstructors import InputOptions, input_options, method_options
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -28,7 +29,8 @@ LARGEST_OFFSET_MM = 1e6
 class RunSettings:
     """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked.
 
-    ``before``: what is done to the scan's frames first, whatever the method.
+    ``before``: what is done to the scan's frames first, whatever the method. ``origins``: where the values that are not
+    named options come from, as errors are to name it.
     """
 
     method: str
@@ -37,31 +39,72 @@ class RunSettings:
     device: str | None
     changes: Mapping[str, Any]
     before: InputOptions = InputOptions()
+    origins: Mapping[str, str] = field(default_factory=dict)
+
+    @contextmanager
+    def naming_origins(self) -> Iterator[None]:
+        """Errors about an option, in the body, name the line of the file or the --set that it comes from."""
+        try:
+            yield
+        except PhyradgsError as error:
+            culprit = _origin_of(error.culprit, self.origins)
+            if culprit is None:
+                raise
+            found = error.found
+            if found == "no such option":
+                found += f" of --method {self.method}"
+            raise type(error)(culprit, found, error.expected, error.remedy) from error
 
 
 def run_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> RunSettings:
-    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None."""
+    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None.
+
+    All of them lie over the preset, which is where a method's options begin. They are checked here, so that an error
+    can say where a wrong value stands.
+    """
     settings = read_config(config)
-    culprits = {key: f"--config {config}: {key}" for key in settings}
+    origins = {key: f"config {config}: {key}" for key in settings}
     for text in assignments:
         merge(settings, assignment(text))
-        culprits[text.split("=")[0].split(".")[0].strip()] = f"--set {text}"
+        origins[text.split("=")[0].split(".")[0].strip()] = f"--set {text}"
     for key, value in given.items():
         if value is not None:
             settings[key] = value
-            culprits[key] = "--" + key.replace("_", "-")
-    method = _word(settings, "method", culprits)
-    preset = _word(settings, "preset", culprits)
+            origins.pop(key, None)
+    chosen = _run_settings(settings, origins)
+    with chosen.naming_origins():
+        method_options(chosen.method, chosen.preset, chosen.changes)
+    return chosen
+
+
+def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSettings:
+    method = _word(settings, "method", origins)
+    preset = _word(settings, "preset", origins)
     device = settings.pop("device", None)
     if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
         device = str(device)  # in TOML an index is a number
-    seed = _seed(settings.pop("seed", 0), culprits.get("seed", "--seed"))
-    wish = device_wish(device, culprits.get("device", "--device"))
-    names = [field.name for field in fields(InputOptions)]
-    before = input_options({name: settings.pop(name) for name in names if name in settings})
-    return RunSettings("phyradgs" if method is None else method, preset, seed, wish, settings, before)
+    seed = _seed(settings.pop("seed", 0), origins.get("seed", "--seed"))
+    wish = device_wish(device, origins.get("device", "--device"))
+    names = [f.name for f in fields(InputOptions)]
+    changes = {name: settings.pop(name) for name in names if name in settings}
+    chosen = RunSettings(
+        "phyradgs" if method is None else method, preset, seed, wish, settings, origins=origins
+    )
+    with chosen.naming_origins():
+        return replace(chosen, before=input_options(changes))
+
+
+def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
+    """Where the option that ``culprit`` names stands, with the way into its table; None for a named option."""
+    options = re.findall(r"option ([\w-]+)", culprit)
+    words = options or re.sub(r"\(.*\)", "", culprit).split()[-1:]
+    first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
+    origin = origins.get(first.replace("-", "_"))
+    if origin is None or origin.startswith("--set"):
+        return origin
+    return ".".join([origin, *rest])
 
 
 def read_config(path: Path | None) -> dict[str, Any]:
@@ -145,10 +188,10 @@ def pulse_pair(option: str, text: str | None) -> tuple[float, float] | None:
     return start, length
 
 
-def _word(settings: dict[str, Any], key: str, culprits: Mapping[str, str]) -> str | None:
+def _word(settings: dict[str, Any], key: str, origins: Mapping[str, str]) -> str | None:
     value = settings.pop(key, None)
     if value is not None and not isinstance(value, str):
-        raise InputError(culprits[key], checks.shown(value), "a word in quotation marks")
+        raise InputError(origins.get(key, f"--{key}"), checks.shown(value), "a word in quotation marks")
     return value
 
 

@@ -16,19 +16,26 @@ NAME = PACKAGE.name
 
 # A scan holds the grid that it asks for, so the fields lie under the acquisition.
 FLOORS: tuple[frozenset[str], ...] = (
-    frozenset({"__init__", "errors", "checks", "resources"}),
+    frozenset({"__init__", "errors", "checks", "resources", "signals"}),
     frozenset({"fields"}),
     frozenset({"acquisition"}),
     frozenset({"phantoms", "detector", "metrics", "io", "runtime"}),
     frozenset({"operators", "objective", "optim"}),
-    frozenset({"simulation", "reconstructors"}),
-    frozenset({"workflow", "bench", "settings", "progress"}),
+    frozenset({"simulation", "reconstructors", "importers", "exporters"}),
+    frozenset({"estimate", "workflow", "bench", "settings", "progress", "api", "report"}),
+    frozenset({"commands"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Within floor 0: errors know nothing, checks raise them.
-GROUND_FLOOR = {"__init__": set(), "errors": set(), "checks": {"errors"}, "resources": set()}
+GROUND_FLOOR = {
+    "__init__": set(),
+    "errors": set(),
+    "checks": {"errors"},
+    "resources": set(),
+    "signals": set(),
+}
 
 
 def module_files() -> list[Path]:

@@ -9,20 +9,20 @@
 
 typedef struct { vf x, y, z; } v3;
 
-inline v3 v3_make(vf x, vf y, vf z) { v3 r; r.x = x; r.y = y; r.z = z; return r; }
-inline v3 v3_cross(v3 a, v3 b)
+static inline v3 v3_make(vf x, vf y, vf z) { v3 r; r.x = x; r.y = y; r.z = z; return r; }
+static inline v3 v3_cross(v3 a, v3 b)
 {
     return v3_make(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
 }
-inline vf v3_dot(v3 a, v3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline v3 v3_mul(v3 a, v3 b) { return v3_make(a.x * b.x, a.y * b.y, a.z * b.z); }
-inline v3 v3_add(v3 a, v3 b) { return v3_make(a.x + b.x, a.y + b.y, a.z + b.z); }
-inline v3 v3_scale(v3 a, vf s) { return v3_make(a.x * s, a.y * s, a.z * s); }
+static inline vf v3_dot(v3 a, v3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+static inline v3 v3_mul(v3 a, v3 b) { return v3_make(a.x * b.x, a.y * b.y, a.z * b.z); }
+static inline v3 v3_add(v3 a, v3 b) { return v3_make(a.x + b.x, a.y + b.y, a.z + b.z); }
+static inline v3 v3_scale(v3 a, vf s) { return v3_make(a.x * s, a.y * s, a.z * s); }
 
 /* columns of R for a unit quaternion: the Gaussian's own axes in the world */
 typedef struct { v3 a, b, c; } frame3;
 
-inline frame3 quaternion_frame(vf w, vf x, vf y, vf z)
+static inline frame3 quaternion_frame(vf w, vf x, vf y, vf z)
 {
     frame3 f;
     f.a = v3_make(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y));
@@ -30,8 +30,8 @@ inline frame3 quaternion_frame(vf w, vf x, vf y, vf z)
     f.c = v3_make(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y));
     return f;
 }
-inline v3 to_local(frame3 f, v3 v) { return v3_make(v3_dot(f.a, v), v3_dot(f.b, v), v3_dot(f.c, v)); }
-inline v3 to_world(frame3 f, v3 v)
+static inline v3 to_local(frame3 f, v3 v) { return v3_make(v3_dot(f.a, v), v3_dot(f.b, v), v3_dot(f.c, v)); }
+static inline v3 to_world(frame3 f, v3 v)
 {
     return v3_add(v3_add(v3_scale(f.a, v.x), v3_scale(f.b, v.y)), v3_scale(f.c, v.z));
 }

@@ -5,7 +5,7 @@
 
 #define ROW_STATISTIC 11
 
-inline void gradient_store(__global float *out, const int stride, const int add, v3 mean, v3 scale,
+static inline void gradient_store(__global float *out, const int stride, const int add, v3 mean, v3 scale,
                            v3 torque, vf w, vf x, vf y, vf z, vf density)
 {
     const vf values[11] = {
@@ -23,7 +23,7 @@ inline void gradient_store(__global float *out, const int stride, const int add,
 }
 
 /* sums (.., 16) of LANES Gaussians that lie `step` floats apart, turned into one vector a field */
-inline void gather_sums(__global const float *sums, const size_t step, const int fields, __private float *buffer)
+static inline void gather_sums(__global const float *sums, const size_t step, const int fields, __private float *buffer)
 {
     for (int lane = 0; lane < LANES; ++lane)
         for (int f = 0; f < fields; ++f)

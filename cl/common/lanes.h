@@ -17,7 +17,7 @@ typedef int vi;
 #define V_ANY(condition) (condition)
 #define V_INT(v) convert_int(v)
 #define V_FLOAT(v) convert_float(v)
-inline float v_sum(vf v) { return v; }
+static inline float v_sum(vf v) { return v; }
 #else
 #define LANE_PASTE(a, b) a##b
 #define LANE_TYPE(a, b) LANE_PASTE(a, b)
@@ -34,13 +34,13 @@ typedef LANE_TYPE(int, LANES) vi;
 #define V_FLOAT(v) LANE_TYPE(convert_float, LANES)(v)
 #if LANES == 4
 #define V_IOTA ((vf)(0, 1, 2, 3))
-inline float v_sum(vf v) { float2 b = v.lo + v.hi; return b.x + b.y; }
+static inline float v_sum(vf v) { float2 b = v.lo + v.hi; return b.x + b.y; }
 #elif LANES == 8
 #define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7))
-inline float v_sum(vf v) { float4 a = v.lo + v.hi; float2 b = a.lo + a.hi; return b.x + b.y; }
+static inline float v_sum(vf v) { float4 a = v.lo + v.hi; float2 b = a.lo + a.hi; return b.x + b.y; }
 #else
 #define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-inline float v_sum(vf v)
+static inline float v_sum(vf v)
 {
     float8 c = v.lo + v.hi;
     float4 a = c.lo + c.hi;

@@ -16,14 +16,14 @@ typedef LANE_TYPE(double, LANES) vwide;
 #endif
 typedef double coefficient;
 
-inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
+static inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
 {
     return row[0] * V_WIDE(x) + row[1] * V_WIDE(y) + row[2] * V_WIDE(z) + row[3];
 }
-inline vf wide_value(vwide a) { return WIDE_FLOAT(a); }
+static inline vf wide_value(vwide a) { return WIDE_FLOAT(a); }
 
 /* a/b as whole + rest, |rest| <= 1/2 (whole kept within the range that a detector index can have) */
-inline vf wide_ratio(vwide a, vwide b, vf *rest)
+static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 {
     vwide ratio = a / b;
     vf whole = clamp(rint(WIDE_FLOAT(ratio)), -1e6f, 1e6f);
@@ -33,7 +33,7 @@ inline vf wide_ratio(vwide a, vwide b, vf *rest)
 #define COEFFICIENT(c) convert_float(c)
 
 /* a as whole + rest, |rest| <= 1/2 */
-inline vf wide_split(vwide a, vf *rest)
+static inline vf wide_split(vwide a, vf *rest)
 {
     vf whole = clamp(rint(WIDE_FLOAT(a)), -1e6f, 1e6f);
     *rest = WIDE_FLOAT(a - V_WIDE(whole));
@@ -43,7 +43,7 @@ inline vf wide_split(vwide a, vf *rest)
 typedef struct { vf high, low; } vwide;
 typedef float2 coefficient;
 
-inline vwide wide_sum(vwide a, vf b)
+static inline vwide wide_sum(vwide a, vf b)
 {
     vf s = a.high + b;
     vf t = s - a.high;
@@ -53,7 +53,7 @@ inline vwide wide_sum(vwide a, vf b)
     r.low = a.low + error;
     return r;
 }
-inline vwide wide_product_sum(vwide acc, coefficient c, vf x)
+static inline vwide wide_product_sum(vwide acc, coefficient c, vf x)
 {
     vf product = c.x * x;
     vf error = fma((vf)(c.x), x, -product);
@@ -61,7 +61,7 @@ inline vwide wide_product_sum(vwide acc, coefficient c, vf x)
     acc.low += error + c.y * x;
     return acc;
 }
-inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
+static inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
 {
     vwide acc;
     acc.high = (vf)(row[3].x);
@@ -70,9 +70,9 @@ inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
     acc = wide_product_sum(acc, row[1], y);
     return wide_product_sum(acc, row[2], z);
 }
-inline vf wide_value(vwide a) { return a.high + a.low; }
+static inline vf wide_value(vwide a) { return a.high + a.low; }
 
-inline vf wide_ratio(vwide a, vwide b, vf *rest)
+static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 {
     vf whole = clamp(rint(wide_value(a) / wide_value(b)), -1e6f, 1e6f);
     vf product = whole * b.high;
@@ -84,7 +84,7 @@ inline vf wide_ratio(vwide a, vwide b, vf *rest)
 }
 #define COEFFICIENT(c) ((c).x)
 
-inline vf wide_split(vwide a, vf *rest)
+static inline vf wide_split(vwide a, vf *rest)
 {
     vf whole = clamp(rint(wide_value(a)), -1e6f, 1e6f);
     vwide left = wide_sum(a, -whole);

@@ -33,26 +33,26 @@ typedef vi vindex;
 
 #if LANES == 1
 #define VI_IOTA (0)
-inline int v_least(vi v) { return v; }
-inline int v_largest(vi v) { return v; }
+static inline int v_least(vi v) { return v; }
+static inline int v_largest(vi v) { return v; }
 #elif LANES == 4
 #define VI_IOTA ((vi)(0, 1, 2, 3))
-inline int v_least(vi v) { const int2 b = min(v.lo, v.hi); return min(b.x, b.y); }
-inline int v_largest(vi v) { const int2 b = max(v.lo, v.hi); return max(b.x, b.y); }
+static inline int v_least(vi v) { const int2 b = min(v.lo, v.hi); return min(b.x, b.y); }
+static inline int v_largest(vi v) { const int2 b = max(v.lo, v.hi); return max(b.x, b.y); }
 #elif LANES == 8
 #define VI_IOTA ((vi)(0, 1, 2, 3, 4, 5, 6, 7))
-inline int v_least(vi v) { const int4 a = min(v.lo, v.hi); const int2 b = min(a.lo, a.hi); return min(b.x, b.y); }
-inline int v_largest(vi v) { const int4 a = max(v.lo, v.hi); const int2 b = max(a.lo, a.hi); return max(b.x, b.y); }
+static inline int v_least(vi v) { const int4 a = min(v.lo, v.hi); const int2 b = min(a.lo, a.hi); return min(b.x, b.y); }
+static inline int v_largest(vi v) { const int4 a = max(v.lo, v.hi); const int2 b = max(a.lo, a.hi); return max(b.x, b.y); }
 #else
 #define VI_IOTA ((vi)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-inline int v_least(vi v)
+static inline int v_least(vi v)
 {
     const int8 c = min(v.lo, v.hi);
     const int4 a = min(c.lo, c.hi);
     const int2 b = min(a.lo, a.hi);
     return min(b.x, b.y);
 }
-inline int v_largest(vi v)
+static inline int v_largest(vi v)
 {
     const int8 c = max(v.lo, v.hi);
     const int4 a = max(c.lo, c.hi);
@@ -63,9 +63,9 @@ inline int v_largest(vi v)
 
 /* a call would copy these structs of vectors through memory, which takes longer than what is done with them */
 #ifdef __clang__
-#define RAY_INLINE inline __attribute__((always_inline))
+#define RAY_INLINE static inline __attribute__((always_inline))
 #else
-#define RAY_INLINE inline
+#define RAY_INLINE static inline
 #endif
 
 #define LANE(type, v, lane) (((type *)&(v))[lane])

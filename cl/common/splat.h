@@ -69,9 +69,9 @@
 #define MINUS_HALF_LOG2E (-0.72134752044f)
 
 #ifdef __clang__
-#define SPLAT_INLINE inline __attribute__((always_inline))
+#define SPLAT_INLINE static inline __attribute__((always_inline))
 #else
-#define SPLAT_INLINE inline
+#define SPLAT_INLINE static inline
 #endif
 
 /* 2^x for x <= 0 to 2e-7. PoCL's exp2 has ranges and roundings that do not occur here, and takes half the time of a
@@ -95,7 +95,7 @@ typedef struct {
     float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
 } splat_line;
 
-inline splat_line splat_on_line(__global const float *rec, __global const float *cell, float v, float dv)
+static inline splat_line splat_on_line(__global const float *rec, __global const float *cell, float v, float dv)
 {
     splat_line s;
     s.l11 = rec[REC_L11];
@@ -112,7 +112,7 @@ inline splat_line splat_on_line(__global const float *rec, __global const float 
 }
 
 /* exponent (num/Q) and value at pixels u (absolute) with offset du from the centre */
-inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
+static inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
 {
     vf t = s.l11 * du + s.t0;
     vf num = t * t + s.k;

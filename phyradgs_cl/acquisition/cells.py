@@ -243,7 +243,9 @@ def segments_for(
     pose = trajectory.pose(frame, time_s)
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
     contrast = np.sqrt(max(1.0, intensity_peak / _HARMLESS_PEAK))
-    return int(np.clip(np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error)), 1, _MOST_SEGMENTS))
+    return int(
+        np.clip(np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error)), 1, _MOST_SEGMENTS)
+    )
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:

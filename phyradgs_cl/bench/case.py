@@ -35,6 +35,10 @@ class Case(Interface):
         """What results are compared with, where its own numbers are worth a line."""
         ...
 
+    def warn_of_inverse_crime(self) -> None:
+        """Says so where what is projected is no finer than what is reconstructed."""
+        ...
+
 
 def standing(protocol: Protocol) -> Protocol:
     """The stop-and-shoot protocol at the mid-window angles of a fly-scan."""
@@ -116,3 +120,7 @@ class SyntheticCase:
     def references(self) -> dict[str, Measure]:
         """None: the truth is exact."""
         return {}
+
+    def warn_of_inverse_crime(self) -> None:
+        """Where the volume's file has no more voxels than the benchmark's grid."""
+        self._scene.warn_of_inverse_crime()

@@ -52,7 +52,8 @@ def truth_of(facts: Mapping[str, Any]) -> Line:
 
 
 def write_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
-    """One PNG for each volume and protocol; the files written."""
+    """One PNG for each volume and protocol that the lines hold; the files written."""
+    job = job.with_all(lines)
     chosen = [line for line in lines_of(job, lines) if line["acquisition"] == FLY]
     cases = dict.fromkeys((line["protocol"], line["volume"]) for line in chosen)
     figures = [
@@ -76,7 +77,7 @@ def _figure(job: BenchJob, protocol: str, lines: Sequence[Line]) -> Path | None:
     if len(columns) < 2:
         return None
     volume, size = lines[0]["volume"], job.bench_size
-    path = job.output / "figures" / f"{job.kind}_{size.name}_{protocol}_{volume}.png"
+    path = job.output / "figures" / f"{job.stem}_{protocol}_{volume}.png"
     _make(path.parent)
     title = f"{volume}, {size.voxels}³ from {lines[0]['views']} views of {size.pixels}², seed {seed}"
     panels_png(path, columns, title)

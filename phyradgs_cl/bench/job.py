@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.bench.case import FLY, STILL
 from phyradgs_cl.bench.results import Line
-from phyradgs_cl.bench.rows import Row, choose_rows
+from phyradgs_cl.bench.rows import Row, candidate_rows, choose_rows, rows_of
 from phyradgs_cl.bench.sizes import BenchSize, bench_size
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError
@@ -85,6 +85,31 @@ class BenchJob:
         return tuple(self.protocols or (("rapid", "standard") if self.kind == "table1" else ("rapid",)))
 
     @property
+    def stem(self) -> str:
+        """How the names of tables and figures begin: one for each set of results that is summed up together."""
+        size = self.bench_size
+        own = self.iterations in (None, replace(self, iterations=None).bench_size.iterations)
+        parts = (
+            self.kind,
+            size.name,
+            "" if own else f"i{size.iterations}",
+            "" if self.axis == "rows" else self.axis,
+        )
+        return "_".join(part for part in parts if part)
+
+    def with_all(self, lines: Sequence[Line]) -> BenchJob:
+        """The job whose table has everything of its kind and size that the lines hold, whatever is to be run now.
+
+        Rows of the kind are always there, others where they have results or are asked for.
+        """
+        runs = {line.get("run") for line in lines if line.get("acquisition") == FLY}
+        always = {row.run for row in (*rows_of(self.kind), *self.chosen_rows)}
+        labels = {row.label for row in (*rows_of(self.kind), *self.chosen_rows)}
+        more = [r for r in candidate_rows(self.kind) if r.method and r.run in runs and r.run not in always]
+        rows = [*labels, *(row.label for row in more)]
+        return replace(self, rows=rows, names=None, protocols=_FLY_PROTOCOLS)
+
+    @property
     def study(self) -> str:
         """Volumes with TIGRE's noise, or the sphere phantom with raw counts."""
         return PHANTOM if self.kind == "phantom" else SYNTHETIC
@@ -131,8 +156,16 @@ class PlannedRun:
 
 
 def plan_runs(job: BenchJob) -> list[PlannedRun]:
-    """Every run of a job, a case after the other, stop-and-shoot runs once for all rows that share them."""
+    """Every run of a job, a case after the other, stop-and-shoot runs once for all rows that share them.
+
+    Raises:
+        InputError: rows, volumes or options that do not exist, or no row that can be run.
+    """
     shared = _with_options(job)
+    if not shared:
+        asked = ", ".join(row.label for row in job.chosen_rows)
+        others = "; ".join(row.label for row in candidate_rows(job.kind) if row.method is not None)
+        raise InputError("--rows", f"{asked}, which this program does not have yet", f"one of {others}")
     plan = []
     for seed in dict.fromkeys(job.seeds):
         for volume, source in job.sources().items():

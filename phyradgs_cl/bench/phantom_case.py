@@ -89,6 +89,9 @@ class PhantomCase:
         """The truth's own shape, which voxels limit, and the pseudo-truth's distance from it."""
         return {"truth": lambda: self.shape(self.truth), PSEUDO: self._measure_pseudo}
 
+    def warn_of_inverse_crime(self) -> None:
+        """Never: the phantom's line integrals are closed forms."""
+
     def _measure_pseudo(self) -> dict[str, float]:
         numbers = self.measure(self._pseudo_truth())
         return {name: value for name, value in numbers.items() if not name.endswith("_pseudo")}

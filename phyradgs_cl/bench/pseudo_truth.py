@@ -15,6 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, reconstruct
+from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.runtime import Runtime
 
 
@@ -55,11 +56,12 @@ class PseudoTruth:
         size, protocol = self._job.bench_size, PROTOCOLS["rapid"]
         case = PhantomCase(self._rt, size, protocol, self._job.axis, self._seed, self.volume_of)
         scan = case.scan(PSEUDO)
-        result = reconstruct(scan, "r2", self._rt, self._options, seed=self._seed, report=self._report)
-        refuse_interrupted(result)
-        provenance = {"method": "r2", "views": PSEUDO_VIEWS, "identity": self._identity}
-        metrics = compare(result.volume, case.truth)
-        write_volume(self.path, result.volume, result.grid, provenance, None, metrics)
+        with keep_finished_work():
+            result = reconstruct(scan, "r2", self._rt, self._options, seed=self._seed, report=self._report)
+            refuse_interrupted(result)
+            provenance = {"method": "r2", "views": PSEUDO_VIEWS, "identity": self._identity}
+            metrics = compare(result.volume, case.truth)
+            write_volume(self.path, result.volume, result.grid, provenance, None, metrics)
         return result.volume
 
 

@@ -44,6 +44,7 @@ def read_lines(path: Path) -> list[Line]:
     Raises:
         InputError: a file that cannot be read, or that has content but no result.
     """
+    refuse_irregular(path)
     try:
         text = path.read_bytes().decode(errors="replace") if path.exists() else ""
     except OSError as error:
@@ -63,6 +64,13 @@ def read_lines(path: Path) -> list[Line]:
     if damaged:
         log.warning("%s: line %s is damaged and left out", path, ", ".join(map(str, damaged)))
     return lines
+
+
+def refuse_irregular(path: Path) -> None:
+    """Raise InputError for what is there and no regular file: a device or a pipe may never end."""
+    if path.exists() and not path.is_file():
+        expected = "a results file (JSON lines)"
+        raise InputError(str(path), "something that is not a regular file", expected, "choose another -o")
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:

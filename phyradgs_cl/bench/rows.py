@@ -134,13 +134,18 @@ def rows_of(kind: str) -> tuple[Row, ...]:
     return _table2() if kind == "table2" else _table1()
 
 
+def candidate_rows(kind: str) -> tuple[Row, ...]:
+    """Every row that a kind may have: a quick run may take any of table 1; extras stand at the end."""
+    rows = _table1() if kind == "quick" else rows_of(kind)
+    return (*rows, *(() if kind == "table2" else _extras()))
+
+
 def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:
     """The rows of a kind, or those with the given labels in the table's order; InputError for one that is unknown."""
     rows = rows_of(kind)
     if not labels:
         return rows
-    # a quick run may take any row of table 1; extras stand at the end
-    candidates = (*(_table1() if kind == "quick" else rows), *(() if kind == "table2" else _extras()))
+    candidates = candidate_rows(kind)
     by_name = {row.label.casefold(): row for row in candidates}
     wanted = set()
     for label in labels:

@@ -23,14 +23,14 @@ from phyradgs_cl.bench.figures import truth_of, write_figures, write_slices
 from phyradgs_cl.bench.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
 from phyradgs_cl.bench.phantom_case import PhantomCase
 from phyradgs_cl.bench.pseudo_truth import PseudoTruth, refuse_interrupted
-from phyradgs_cl.bench.results import Line, Present, append_line, read_lines
+from phyradgs_cl.bench.results import Line, Present, append_line, read_lines, refuse_irregular
 from phyradgs_cl.bench.summary import REFERENCE
 from phyradgs_cl.bench.tables import write_tables
 from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind
 from phyradgs_cl.reconstructors import Progress, ProgressReport, reconstruct
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
 
@@ -59,23 +59,36 @@ def run_bench(
         OutputError: the folder cannot be written.
     """
     plan = plan_runs(job)
+    _name_rows_to_come(job)
     results = _results_file(job.output)
-    present = Present(read_lines(results))
+    lines = read_lines(results)
+    present = Present(lines)
     missing = [run for run in plan if not present.has(run.facts)]
     _check_volumes(missing)
     if missing:
-        batch = _Batch(job, make_runtime(), results, present, missing, len(plan), report)
+        batch = _Batch(job, make_runtime(), results, lines, missing, len(plan), report)
         for _, group in groupby(missing, key=lambda run: run.case):
             batch.run_case(list(group))
-    return remake_tables(job)
+    return _write_tables_and_figures(job, lines)
 
 
 def remake_tables(job: BenchJob) -> list[Path]:
     """Writes tables and figures from the results file as it is; the files written."""
-    lines = read_lines(job.output / RESULTS)
+    return _write_tables_and_figures(job, read_lines(job.output / RESULTS))
+
+
+def _write_tables_and_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     if not lines:
         raise InputError(str(job.output / RESULTS), "no results", "a results file", "run the benchmark first")
-    return [*write_tables(job, lines), *write_figures(job, lines)]
+    with finish_despite_interrupt():
+        return [*write_tables(job, lines), *write_figures(job, lines)]
+
+
+def _name_rows_to_come(job: BenchJob) -> None:
+    """Rows that are asked for by name and cannot be run yet are said to be left out."""
+    to_come = [row.label for row in job.chosen_rows if row.method is None]
+    if job.rows and to_come:
+        log.warning("--rows: %s: not in this program yet, left out", ", ".join(to_come))
 
 
 class _Batch:
@@ -86,28 +99,33 @@ class _Batch:
         job: BenchJob,
         rt: Runtime,
         results: Path,
-        present: Present,
+        lines: list[Line],
         missing: Sequence[PlannedRun],
         total: int,
         report: Report,
     ) -> None:
-        self.job, self.rt, self.results, self.present, self.report = job, rt, results, present, report
+        self.job, self.rt, self.results, self.report = job, rt, results, report
+        self.lines, self.present = lines, Present(lines)  # the file's; runs add to both
         self.left, self.total = list(missing), total
-        self.known = [line for line in read_lines(results) if "seconds" in line]
+        self.warned: set[str] = set()
 
     def run_case(self, runs: Sequence[PlannedRun]) -> None:
         """All missing runs of one case."""
         title = f"reference of seed {runs[0].seed}"
         first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
         case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
+        if runs[0].volume not in self.warned:
+            self.warned.add(runs[0].volume)
+            case.warn_of_inverse_crime()
         write_slices(self.job.output, truth_of(runs[0].facts), case.slices(case.truth))
         self._write_references(runs[0], case)
         for run in runs:
             number = self.total - len(self.left) + 1
             started = BenchProgress(number, self.total, run.title)
             self.report(started)
-            line = _one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
-            self._keep(line)
+            with keep_finished_work():  # a run that is done is measured and kept, then the benchmark stops
+                line = _one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
+                self._keep(line)
             self.left.remove(run)
             self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
 
@@ -115,8 +133,7 @@ class _Batch:
         with finish_despite_interrupt():
             append_line(self.results, line)
         self.present.add(line)
-        if "seconds" in line:
-            self.known.append(line)
+        self.lines.append(line)
 
     def _write_references(self, run: PlannedRun, case: Case) -> None:
         """Lines about what results are compared with, where the case has any that the file lacks."""
@@ -132,7 +149,7 @@ class _Batch:
         """Seconds that the missing runs will take, by what the same runs took on other objects; None if unknown."""
         total = 0.0
         for run in self.left:
-            like = [line["seconds"] for line in self.known if _is_like(line, run)]
+            like = [line["seconds"] for line in self.lines if "seconds" in line and _is_like(line, run)]
             if not like:
                 return None
             total += float(np.mean(like))
@@ -232,6 +249,7 @@ def _results_file(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / RESULTS
+        refuse_irregular(path)
         path.open("ab").close()
     except OSError as error:
         raise OutputError(

@@ -28,9 +28,12 @@ Cell = Callable[[Summary], str]
 def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     """Writes KIND_SIZE.md and KIND_SIZE.csv into the job's folder; the two paths.
 
+    They have all that the lines hold for the kind and size: a run of some rows, volumes or protocols adds to a table.
+
     Raises:
         InputError: no line of the results file belongs to the table.
     """
+    job = job.with_all(lines)
     chosen = lines_of(job, lines)
     if not chosen or _misses_splats(job, chosen, lines):
         size = job.bench_size
@@ -40,10 +43,9 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
         wanted = f"runs of {job.study} at {size.voxels}³ with {size.iterations} iterations"
         remedy = "give the --size and --iterations of the runs"
         raise InputError(str(job.output), f"results of {'; '.join(sizes)}", wanted, remedy)
-    stem = job.output / f"{job.kind}_{job.bench_size.name}"
     written = {
-        stem.with_suffix(".md"): markdown(job, chosen),
-        stem.with_suffix(".csv"): comma_separated(job, chosen),
+        job.output / f"{job.stem}.md": markdown(job, chosen),
+        job.output / f"{job.stem}.csv": comma_separated(job, chosen),
     }
     for path, text in written.items():
         with written_beside(path) as temporary:

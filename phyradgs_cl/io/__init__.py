@@ -4,6 +4,7 @@ from phyradgs_cl.io.atomic import check_writable, written_beside
 from phyradgs_cl.io.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
 from phyradgs_cl.io.grid_io import default_grid, with_grid_count
 from phyradgs_cl.io.hashing import sha256_of
+from phyradgs_cl.io.lock import only_run
 from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
 from phyradgs_cl.io.scan_writer import write_scan
 from phyradgs_cl.io.scanner_file import Scanner, load_scanner, with_detector_count
@@ -18,6 +19,7 @@ __all__ = [
     "default_grid",
     "file_kind",
     "load_scanner",
+    "only_run",
     "read_checkpoint",
     "read_scan",
     "read_volume",

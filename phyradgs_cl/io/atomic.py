@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
 
 _NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -23,7 +24,7 @@ def check_writable(path: str | Path) -> None:
     Meant for the start of long work: it makes, and removes, an empty file in the target's folder.
     """
     temporary = _create_beside(_target(path))
-    temporary.unlink()
+    _remove(temporary)
 
 
 @contextmanager
@@ -41,10 +42,11 @@ def written_beside(path: str | Path) -> Iterator[Path]:
         if target.exists():
             shutil.copymode(target, temporary)
         os.replace(temporary, target)
+        signals.unfinished.discard(str(temporary))
         _flush_folder(target.parent)
     except BaseException as error:
         with suppress(OSError):
-            temporary.unlink()
+            _remove(temporary)
         if isinstance(error, OSError) or (isinstance(error, RuntimeError) and "errno = " in str(error)):
             raise _output_error(target, error) from error
         raise
@@ -78,9 +80,11 @@ def _target(path: str | Path) -> Path:
 def _create_beside(target: Path) -> Path:
     """A new empty file in the target's folder, with the permissions that the user's umask gives."""
     temporary = target.with_name(f".{target.name[:60]}.{secrets.token_hex(4)}{_SUFFIX}")
+    signals.unfinished.add(str(temporary))  # Ctrl-C may end the process at any line
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
+        signals.unfinished.discard(str(temporary))
         raise OutputError(
             str(target),
             f"{error.strerror or error} in folder {target.parent}",
@@ -88,6 +92,11 @@ def _create_beside(target: Path) -> Path:
             "choose another folder or change its permissions",
         ) from error
     return temporary
+
+
+def _remove(temporary: Path) -> None:
+    signals.unfinished.discard(str(temporary))
+    temporary.unlink()
 
 
 def _flush_to_disk(path: Path) -> None:

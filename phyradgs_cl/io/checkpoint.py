@@ -34,8 +34,10 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        # what NumPy says is about pickles, whatever is wrong
+        reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
         raise InputError(
-            str(path), f"a damaged checkpoint ({error})", "a whole one", "start without --resume"
+            str(path), f"a damaged checkpoint{reason}", "a whole one", "start without --resume"
         ) from error
     if arrays.pop("format", None) != _FORMAT:
         raise InputError(str(path), "another checkpoint format", str(_FORMAT), "start without --resume")

@@ -67,7 +67,7 @@ def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
         raise InputError(str(path), error.strerror or str(error), "a scanner file (TOML)") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"text that is not TOML ({error})", "a scanner file (TOML)") from error
-    return _scanner(path, content)
+    return scanner_from(path, content)
 
 
 def with_detector_count(geometry: ConeGeometry, rows: int, columns: int) -> ConeGeometry:
@@ -101,7 +101,8 @@ def _describes_scanner(path: Path) -> bool:
         return False
 
 
-def _scanner(path: Path, content: dict[str, object]) -> Scanner:
+def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
+    """The scanner that a TOML file's content describes; ``path`` names it in messages."""
     _refuse_unknown(str(path), content, (*_TABLES, *_WORDS), "a table")
     tables = {name: _Table(path, name, content.get(name, {})) for name in _TABLES}
     geometry = _geometry(tables["source"], tables["detector"])

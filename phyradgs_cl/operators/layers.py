@@ -42,7 +42,9 @@ class Layers:
         self._launch("intensity_split", (by_merged, self._shares), cells, (self._by_layers,))
         return self._by_layers
 
-    def _launch(self, name: str, inputs: tuple[object, ...], cells: DeviceCells, rest: tuple[object, ...]) -> None:
+    def _launch(
+        self, name: str, inputs: tuple[object, ...], cells: DeviceCells, rest: tuple[object, ...]
+    ) -> None:
         rt = self.rt
         sizes = (np.int32(n) for n in (cells.layers, self.lines, self.width, pitch_of(self.width)))
         kernel = rt.kernel("intensity", name, IMAGE_GUARD=GUARD)

@@ -84,6 +84,9 @@ def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray
 
 
 def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid) -> None:
+    if np.unique(arc.progress_rad).size == 1:
+        log.warning("FDK: all views are from one angle: the volume is a single backprojection")
+        return
     if arc.is_full and not fan.sees_axis:
         log.warning(
             "FDK: the detector does not see the rotation axis; the middle of the volume is not measured"

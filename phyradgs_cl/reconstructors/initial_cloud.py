@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from phyradgs_cl.fields import Gaussians, Grid
+
+log = logging.getLogger(__name__)
 
 
 def initial_cloud(
@@ -27,6 +31,12 @@ def initial_cloud(
     """
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
+        log.warning(
+            "no voxel of the first volume is above initial_threshold %g (the largest is %.3g): starting with one "
+            "Gaussian in the middle",
+            threshold,
+            volume.max(),
+        )
         candidates = np.array([np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)])
     chosen = np.sort(rng.choice(candidates, size=min(count, candidates.size), replace=False))
     z, y, x = np.unravel_index(chosen, grid.shape)

@@ -107,7 +107,7 @@ def run_iterations(
     }
     state = None
     if loop.stopped_by == "interrupt":
-        state = {**algorithm.state(), "iteration": np.array(loop.iteration)}
+        state = loop.state()
     return Reconstruction(algorithm.volume, scan.grid, record=loop.record, facts=facts, state=state)
 
 
@@ -140,6 +140,10 @@ class _Loop:
                 if self.stopped_by != "iterations":
                     return
 
+    def state(self) -> dict[str, np.ndarray]:
+        """What ``restore`` and a loop need to go on from here."""
+        return {**self.algorithm.state(), "iteration": np.array(self.iteration)}
+
     def _iterate(self) -> None:
         before = self.algorithm.volume
         residual = self.algorithm.step() / self.measured_norm
@@ -160,6 +164,8 @@ class _Loop:
             self.stopped_by = "tolerance"
         total = self.options.iterations
         try:
-            self.report(Progress(self.iteration, total, residual, 0, seconds, quantity="residual"))
+            self.report(
+                Progress(self.iteration, total, residual, 0, seconds, quantity="residual", state=self.state)
+            )
         except KeyboardInterrupt:
             self.stopped_by = "interrupt" if self.iteration < total else self.stopped_by

@@ -100,7 +100,10 @@ def input_options(changes: Mapping[str, Any]) -> InputOptions:
 
 def motions_of(method: str) -> tuple[str, ...]:
     """The motion models that a method takes: those that its options accept."""
-    base = next(iter(METHODS[method].presets.values()))
+    return _motions(next(iter(METHODS[method].presets.values())))
+
+
+def _motions(base: Any) -> tuple[str, ...]:
     return tuple(name for name in MOTIONS if _accepts(base, replace(base.motion, name=name)))
 
 
@@ -116,7 +119,7 @@ def _motion(method: str, options: Any, given: dict[str, Any]) -> Motion:
     """The motion of ``options`` with the name and the counts that are given, of which the model must have each."""
     base: Motion = options.motion
     names = motions_of(method)
-    name = base.name if given["motion"] is None else given["motion"]
+    name = _implied_motion(base.name, given, names) if given["motion"] is None else given["motion"]
     if name not in names:
         raise InputError("--motion", checks.shown(name), f"one of {', '.join(names)} for --method {method}")
     counts = {key: value for key, value in given.items() if key != "motion" and value is not None}
@@ -136,13 +139,35 @@ def _motion(method: str, options: Any, given: dict[str, Any]) -> Motion:
     return replace(base, name=name, **counts)
 
 
+def _motion_keys(options: Any) -> list[str]:
+    """The names by which the motion of ``options`` can be changed: counts that one of its models has."""
+    if not hasattr(options, "motion"):
+        return []
+    counts = [key for key, models in _MODELS_WITH.items() if set(models) & set(_motions(options))]
+    if not getattr(options, "has_sub_intervals", True):
+        counts.remove("sub_intervals")
+    return ["motion", *counts]
+
+
+def _implied_motion(usual: str, given: Mapping[str, Any], names: tuple[str, ...]) -> str:
+    """The usual model; where that follows the motion in its own way, the one that has what is given.
+
+    A method that is static by itself stays so until it is told otherwise.
+    """
+    counts = [key for key in _MOTION_KEYS if key != "motion" and given[key] is not None]
+    if usual.startswith("static") or all(usual in _MODELS_WITH[key] for key in counts):
+        return usual
+    having = [name for name in names if all(name in _MODELS_WITH[key] for key in counts)]
+    return having[0] if len(having) == 1 else usual
+
+
 def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
     """``options`` with ``changes`` by name; ``culprit`` is the method, or the table that they belong to."""
     known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
-            names = [*known, *(_MOTION_KEYS if hasattr(options, "motion") else ())]
+            names = [*known, *_motion_keys(options)]
             close = get_close_matches(key, names, n=1)
             remedy = f"did you mean {close[0]!r}?" if close else "leave it out"
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)

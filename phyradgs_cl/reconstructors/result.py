@@ -33,7 +33,10 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of a running method: ``loss`` is what ``quantity`` names; 0 Gaussians where there are none."""
+    """One report of a running method: ``loss`` is what ``quantity`` names; 0 Gaussians where there are none.
+
+    ``state`` makes what a run needs to go on from here; it is for the time of the report only.
+    """
 
     iteration: int
     iterations: int
@@ -41,6 +44,7 @@ class Progress:
     gaussians: int
     seconds: float
     quantity: str = "loss"
+    state: Callable[[], State] | None = None
 
 
 ProgressReport = Callable[[Progress], None]

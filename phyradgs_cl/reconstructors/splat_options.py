@@ -44,7 +44,7 @@ class SplatOptions:
     what the scan says. ``pixel_footprint`` lets pixels average over their area.
     """
 
-    motion: Motion = Motion("micro-views", 8, 5)
+    motion: Motion = Motion("exact")
     affine: bool = False
     detector_model: str = "scan"
     pixel_footprint: bool = False
@@ -92,12 +92,23 @@ class SplatOptions:
         voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
         return int(min(max(voxels / 16, 1000), 50_000))
 
+    @property
+    def asks_for_gaussians(self) -> bool:
+        """Whether the size of the first cloud is somebody's own wish and not a preset's."""
+        return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
+
     def as_dict(self) -> dict[str, object]:
         return asdict(self)
 
 
 PUBLISHED_CONTROL = DensityControl(threshold=5e-5)
-_PAPER = SplatOptions(gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL)
+_PAPER = SplatOptions(
+    motion=Motion("micro-views", 8, 5),
+    gaussians=50_000,
+    iterations=20_000,
+    rates=PUBLISHED_RATES,
+    control=PUBLISHED_CONTROL,
+)
 _RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 PRESETS = {"default": SplatOptions(), "paper": _PAPER, "released": _RELEASED}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run

@@ -91,6 +91,8 @@ def reconstruct_splats(
     }
     if options.motion.name == "exact":
         facts |= run.time_facts()
+    if rt.profile:
+        facts["evaluated_pairs"] = run.evaluated_pairs()
     state = run.state() if run.interrupted_at is not None else None
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, record, facts, state)
@@ -166,7 +168,8 @@ class SplatRun:
     def _report(self, report: ProgressReport, started: float) -> dict[str, float]:
         loss, seconds, count = self._checked_loss(), time.perf_counter() - started, self.gaussians.count
         try:
-            report(Progress(self.iteration, self.options.iterations, loss, count, seconds))
+            total = self.options.iterations
+            report(Progress(self.iteration, total, loss, count, seconds, state=self.state))
         except KeyboardInterrupt:
             self.interrupted_at = self.iteration
         return {"iteration": self.iteration, "loss": loss, "gaussians": count, "seconds": seconds}
@@ -235,6 +238,14 @@ class SplatRun:
         self.projector.forward(self.gaussians, cells)
         shares = self.projector.work(self.gaussians, cells).rule_shares()
         return {"segments": self.frames.most_cells, "time_rules": shares}
+
+    def evaluated_pairs(self) -> dict[str, int]:
+        """Gaussian–pixel pairs that a launch evaluates, of the last cloud in the first frame, by kernel."""
+        self.adam.activate(self.raw, self.gaussians.rows, self.gaussians.count, self.gaussians.stride)
+        cells = self.frames.get(0)[0]
+        self.projector.forward(self.gaussians, cells)
+        evaluated = self.projector.work(self.gaussians, cells).evaluated
+        return {"splat_forward": evaluated, "splat_backward": evaluated}
 
     # --- stop and go on ---------------------------------------------------------------------------------
 
@@ -366,7 +377,7 @@ def first_population(
         scale_factor=options.initial_scale,
         rng=rng,
     )
-    if options.gaussians and cloud.count < asked:
+    if options.asks_for_gaussians and cloud.count < asked:
         log.warning(
             "%d Gaussians asked for, %d voxels of the first volume attenuate enough: starting with %d",
             asked,

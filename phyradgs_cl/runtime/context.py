@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 import warnings
-from collections import defaultdict
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +14,7 @@ import pyopencl as cl
 
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
+from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 from phyradgs_cl.runtime.source import kernel_source
 
 log = logging.getLogger(__name__)
@@ -69,7 +70,10 @@ class Runtime:
         if self.pixel_items and self.lanes != 1:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
         self.profile = profile
-        self.events: dict[str, list[cl.Event]] = defaultdict(list)
+        self._profile = Profile()
+        self._allocated_bytes = 0
+        self.peak_bytes = 0
+        """Most device memory that was held at one time, since the start or the last ``reset_peak``."""
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], cl.Kernel] = {}
 
@@ -125,7 +129,18 @@ class Runtime:
         except cl.Error as error:
             found = f"{nbytes / 2**20:.0f} MiB refused ({error})"
             raise DeviceError(f"memory of {self.device.name}", found, "enough free memory") from error
-        return DeviceArray(buffer, shape, kind)
+        array = DeviceArray(buffer, shape, kind)
+        self._count(nbytes)
+        weakref.finalize(array, self._count, -nbytes)
+        return array
+
+    def _count(self, nbytes: int) -> None:
+        self._allocated_bytes += nbytes
+        self.peak_bytes = max(self.peak_bytes, self._allocated_bytes)
+
+    def reset_peak(self) -> None:
+        """``peak_bytes`` counts from what is held now."""
+        self.peak_bytes = self._allocated_bytes
 
     def zeros(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
         array = self.empty(shape, dtype)
@@ -137,7 +152,7 @@ class Runtime:
         event = cl.enqueue_fill_buffer(
             self.queue, array.buffer, pattern, 0, max(array.nbytes, array.dtype.itemsize)
         )
-        self._record("fill", event)
+        self._record("fill", event, array.nbytes)
 
     def upload(self, values: np.ndarray, dtype: np.typing.DTypeLike | None = None) -> DeviceArray:
         values = np.ascontiguousarray(values, dtype=dtype)
@@ -165,9 +180,8 @@ class Runtime:
         return value[0]
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
-        self._record(
-            "copy", cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes)
-        )
+        event = cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes)
+        self._record("copy", event, 2 * source.nbytes)
 
     # --- launches -----------------------------------------------------------------------------------
 
@@ -178,8 +192,10 @@ class Runtime:
             return
         rounded = (-(-int(shape[0]) // group) * group, *(int(n) for n in shape[1:]))
         local = (group, *([1] * (len(rounded) - 1)))
+        arrays = [a for a in args if isinstance(a, DeviceArray)]
         kernel.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
-        self._record(kernel.function_name, cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, local))
+        event = cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, local)
+        self._record(kernel.function_name, event, sum(a.nbytes for a in arrays) if self.profile else 0)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
         """The work-group size for this class of device."""
@@ -190,19 +206,23 @@ class Runtime:
 
     # --- profile ------------------------------------------------------------------------------------
 
-    def _record(self, name: str, event: cl.Event) -> None:
+    def _record(self, name: str, event: cl.Event, nbytes: int) -> None:
         if self.profile:
-            self.events[name].append(event)
+            self._profile.add(name, event, nbytes)
+
+    def kernel_uses(self) -> dict[str, KernelUse]:
+        """Launches, seconds and bytes by kernel since the last call, the longest first; needs ``profile=True``."""
+        self.queue.finish()
+        return self._profile.uses()
 
     def kernel_seconds(self) -> dict[str, float]:
         """Device time by kernel since the last call, seconds; needs ``profile=True``."""
-        self.queue.finish()
-        seconds = {
-            name: sum(e.profile.end - e.profile.start for e in events) * 1e-9
-            for name, events in self.events.items()
-        }
-        self.events.clear()
-        return seconds
+        return {name: use.seconds for name, use in self.kernel_uses().items()}
+
+    def best_rates(self) -> Rates:
+        """What the device copies and computes at best, measured now (a second); needs ``profile=True``."""
+        kernel = self.kernel("rates", "multiply_add")
+        return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 
 
 def default_lanes(device: DeviceInfo) -> int:

@@ -68,6 +68,11 @@ def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
     devices = list_devices()
+    if not devices and pocl.unwritable_cache() is not None:
+        found = f"no device, and PoCL's cache {pocl.unwritable_cache()} cannot be written"
+        raise DeviceError(
+            "OpenCL", found, "at least one", f"set {pocl.CACHE_VARIABLE} to a folder that can be written"
+        )
     if not devices:
         raise DeviceError(
             "OpenCL",
@@ -103,6 +108,8 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
 def _describe(index: int, platform: cl.Platform, device: cl.Device) -> DeviceInfo:
     is_pocl = "portable computing language" in platform.name.lower()
     kind = _kind(device)
+    if is_pocl:
+        pocl.tell_of_cache()
     if is_pocl and kind == "cpu" and device.int_ptr not in _repaired:
         _repaired[device.int_ptr] = pocl.repair_unknown_target(device.int_ptr)
     text = f"{platform.name} {platform.vendor} {device.name}".lower()

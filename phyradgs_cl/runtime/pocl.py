@@ -14,7 +14,9 @@ import ctypes
 import logging
 import os
 import platform
+import stat
 import struct
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,21 +24,75 @@ log = logging.getLogger(__name__)
 
 _RECORD_BYTES = 2048
 _USER_SPACE = 1 << 47
+CACHE_VARIABLE = "POCL_CACHE_DIR"
+_unwritable: Path | None = None
 _kept_alive: list[ctypes.Array] = []
 
 
 def prepare_environment() -> None:
     """Gives PoCL a kernel cache of its own for this processor, unless the user has chosen one.
 
-    PoCL names its cache after the LLVM target, so two unknown processors would share binaries.
+    PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a cache that
+    can be written it has no device at all: then there is one in the temporary folder.
     """
-    if "POCL_CACHE_DIR" in os.environ or platform.system() != "Linux":
+    global _unwritable
+    if platform.system() != "Linux":
         return
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = home / "phyradgs-cl" / f"pocl-{equivalent_target() or platform.machine()}"
-    with contextlib.suppress(OSError):
+    wish = os.environ.get(CACHE_VARIABLE)
+    folder = Path(wish) if wish else _own_cache()
+    if not _can_write(folder):
+        _unwritable = folder
+        try:
+            folder = _temporary_cache()
+        except OSError:  # not there either: PoCL will have no device
+            return
+    os.environ[CACHE_VARIABLE] = str(folder)
+
+
+def unwritable_cache() -> Path | None:
+    """The cache that cannot be written, where that has not been said yet."""
+    return _unwritable
+
+
+def tell_of_cache() -> None:
+    """Says, once, that kernels are kept elsewhere than they should be; for those who do use PoCL."""
+    global _unwritable
+    if _unwritable is not None:
+        log.warning(
+            "PoCL's kernel cache %s cannot be written: kernels are kept in %s; set %s to a folder that can",
+            _unwritable,
+            os.environ.get(CACHE_VARIABLE),
+            CACHE_VARIABLE,
+        )
+        _unwritable = None
+
+
+def _own_cache() -> Path:
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # a user without a home
+        home = Path("/nonexistent")
+    return home / "phyradgs-cl" / f"pocl-{equivalent_target() or platform.machine()}"
+
+
+def _can_write(folder: Path) -> bool:
+    try:
         folder.mkdir(parents=True, exist_ok=True)
-        os.environ["POCL_CACHE_DIR"] = str(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _temporary_cache() -> Path:
+    """A folder that is this user's alone: what lies in it is run."""
+    folder = Path(tempfile.gettempdir()) / f"phyradgs-cl-{os.getuid()}"
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+            return folder
+    return Path(tempfile.mkdtemp(prefix="phyradgs-cl-"))
 
 
 def equivalent_target() -> str | None:

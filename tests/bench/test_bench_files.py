@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from phyradgs_cl.bench import KINDS, BenchJob, BenchSize, Row, listed, listed_seeds, plan_runs, rows_of
+from phyradgs_cl.bench import (
+    KINDS,
+    RESULTS,
+    BenchJob,
+    BenchSize,
+    Row,
+    listed,
+    listed_seeds,
+    plan_runs,
+    rows_of,
+    run_bench,
+)
 from phyradgs_cl.bench.published import TABLE1, TABLE2
 from phyradgs_cl.bench.results import KEY, Present, append_line, read_lines
 from phyradgs_cl.bench.volumes import find_volumes
@@ -39,6 +51,20 @@ def test_a_file_without_any_result_is_refused(tmp_path: Path) -> None:
         read_lines(path)
     with pytest.raises(OutputError, match="missing"):
         append_line(tmp_path / "missing" / "results.jsonl", {})
+
+
+def test_devices_and_pipes_are_no_results_files(tmp_path: Path) -> None:
+    endless, pipe = tmp_path / "endless.jsonl", tmp_path / "pipe.jsonl"
+    endless.symlink_to("/dev/zero")
+    os.mkfifo(pipe)
+    for path in (endless, pipe):
+        with pytest.raises(InputError, match="not a regular file"):
+            read_lines(path)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / RESULTS).symlink_to(pipe)
+    with pytest.raises(InputError, match="not a regular file"):
+        run_bench(BenchJob("quick", folder, rows=["FDK"]), pytest.fail)  # type: ignore[arg-type]
 
 
 def test_a_run_is_present_with_the_same_identity_and_options() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from phyradgs_cl.bench.raw_counts import Panel, measured_attenuation
 from phyradgs_cl.bench.results import read_lines
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import phantom_scene
 
@@ -315,3 +317,79 @@ def test_the_command_runs_resumes_and_makes_tables(
     assert run(["bench", "table1", "--volumes", str(folder / "out"), "-o", str(folder / "none")]) == 2
     assert not (folder / "none").exists()
     assert json.loads((folder / "out" / RESULTS).read_text().splitlines()[0])["size"] == "XS"
+
+
+def test_a_partial_run_loses_no_line_of_a_table(job: BenchJob, rt: Runtime) -> None:
+    job = replace(job, protocols=["rapid", "standard"])
+    tables = run_bench(job, lambda: rt)
+    before = {path: path.read_bytes() for path in tables}
+    partial = replace(job, rows=["FDK"], names=["ball"], protocols=["rapid"])
+    for again in (lambda: run_bench(partial, no_runtime), lambda: remake_tables(partial)):
+        assert again() == tables
+        assert {path: path.read_bytes() for path in tables} == before
+    run_bench(replace(partial, rows=["SART micro-views"], names=["box"]), lambda: rt)
+    grown = {path: path.read_text() for path in tables if path.suffix != ".png"}
+    assert all("SART micro-views" in text for text in grown.values())
+    remake_tables(job)
+    assert {path: path.read_text() for path in grown} == grown
+
+
+def test_other_iterations_and_readouts_have_tables_of_their_own(job: BenchJob, tmp_path: Path) -> None:
+    assert (
+        BenchJob("table1", tmp_path).stem == BenchJob("table1", tmp_path, iterations=3000).stem == "table1_S"
+    )
+    assert BenchJob("table2", tmp_path, iterations=10, axis="columns").stem == "table2_S_i10_columns"
+    assert job.stem == "table1_T"
+
+
+def test_rows_to_come_are_said_and_alone_refused(
+    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(InputError, match="--rows: found NAF, which this program does not have yet"):
+        run_bench(replace(job, rows=["NAF"]), no_runtime)
+    assert not job.output.exists()
+    run_bench(replace(job, rows=["NAF", "FDK"], names=["ball"]), lambda: rt)
+    assert "--rows: NAF: not in this program yet, left out" in caplog.text
+
+
+def test_volumes_at_the_resolution_of_the_grid_are_said_once(
+    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture
+) -> None:
+    job = replace(job, rows=["FDK"], seeds=(0, 1))
+    run_bench(job, lambda: rt)
+    assert "inverse crime" not in caplog.text
+    same = BenchSize("E", 24, 16, 8)
+    run_bench(replace(job, size=same, output=job.output.with_name("same")), lambda: rt)
+    told = [r.getMessage() for r in caplog.records if "inverse crime" in r.getMessage()]
+    assert len(told) == 2  # a line for each of the two volumes
+    assert "24×24×24 voxels are projected" in told[0]
+
+
+def test_a_damaged_line_is_said_once(job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture) -> None:
+    job = replace(job, rows=["FDK"], names=["ball"])
+    job.output.mkdir()
+    (job.output / RESULTS).write_text('{"run": "fd')
+    run_bench(job, lambda: rt)
+    assert [r.getMessage() for r in caplog.records if "damaged" in r.getMessage()] == [
+        f"{job.output / RESULTS}: line 1 is damaged and left out"
+    ]
+
+
+def test_ctrl_c_in_the_last_iteration_keeps_the_run_and_stops(
+    job: BenchJob, rt: Runtime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    original = bench_run.reconstruct
+
+    def pressed(*arguments: object, **named: object) -> object:
+        with stop_on_interrupt():
+            signal.raise_signal(signal.SIGINT)
+        return original(*arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(bench_run, "reconstruct", pressed)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_bench(job, lambda: rt)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert len(read_lines(job.output / RESULTS)) == 1

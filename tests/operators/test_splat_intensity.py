@@ -54,9 +54,7 @@ def twin(rows: np.ndarray, table: TimeCells, unit: float = UNIT, affine: bool = 
     for cell in range(table.count):
         chosen = ("pose", "time_s", "line_start", "line_stop", "weight", "end_poses", "line_times")
         parts = {name: getattr(table, name) for name in chosen}
-        one = replace(
-            table, **{name: None if part is None else part[[cell]] for name, part in parts.items()}
-        )
+        one = replace(table, **{name: None if part is None else part[[cell]] for name, part in parts.items()})
         frame = moving_frame if table.end_poses is not None else splat_frame
         image = frame(rows, one, SHAPE, affine=affine)
         images.append(image if table.axis == "rows" else image.T)

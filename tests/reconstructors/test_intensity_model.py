@@ -128,8 +128,7 @@ def test_splats_that_model_intensity_beat_line_integrals(rt, scan, motion) -> No
     peak = float(scan.reference.max())
     by_log, by_intensity = (splats(rt, scan, motion, model) for model in ("log", "intensity"))
     gain_db = psnr(by_intensity.volume, scan.reference, peak) - psnr(by_log.volume, scan.reference, peak)
-    assert gain_db > 0.1, f"{gain_db:.2f} dB"
-    assert by_intensity.record[-1]["loss"] < by_log.record[-1]["loss"]
+    assert gain_db > 0.2, f"{gain_db:.2f} dB"
     assert (by_log.facts["detector_model"], by_intensity.facts["detector_model"]) == ("log", "intensity")
 
 

@@ -159,3 +159,38 @@ def test_counts_belong_to_the_motions_that_have_them(method, key) -> None:
             method_options(method, None, changes)
         for other in having - set(motions_of(method)):
             assert other not in refusal.value.expected
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, "exact"),
+        ({"strips": 4}, "micro-views"),
+        ({"sub_intervals": 3}, "micro-views"),
+        ({"strips": 4, "sub_intervals": 3}, "micro-views"),
+        ({"segments": 3}, "exact"),
+        ({"time_error": 0.01}, "exact"),
+        ({"motion": "static"}, "static"),
+    ],
+)
+def test_strips_mean_micro_views_where_the_motion_is_exact(given, expected) -> None:
+    motion = method_options("phyradgs", None, given).motion
+    assert motion.name == expected
+    for key, value in given.items():
+        assert key == "motion" or getattr(motion, key) == value
+
+
+def test_the_papers_presets_have_its_micro_views() -> None:
+    for preset in ("paper", "released"):
+        motion = method_options("phyradgs", preset).motion
+        assert (motion.name, motion.strips, motion.sub_intervals) == ("micro-views", 8, 5)
+
+
+def test_counts_of_two_models_exclude_each_other() -> None:
+    with pytest.raises(InputError, match="--strips|--segments"):
+        method_options("phyradgs", None, {"strips": 4, "segments": 3})
+
+
+def test_a_static_method_stays_static_until_it_is_told() -> None:
+    with pytest.raises(InputError, match="--strips"):
+        method_options("sirt", None, {"strips": 4})

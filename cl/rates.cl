@@ -1,0 +1,21 @@
+/* What the device can do at best, measured: multiply-adds on registers. Copies are the driver's own. */
+#include "common/lanes.h"
+
+/* 8 independent chains of multiply-adds a work-item, so that latency does not count: 16 LANES `steps` operations */
+__kernel void multiply_add(const int steps, const float factor, __global float *out)
+{
+    const vf a = (vf)(factor), b = (vf)(1.0f - factor);
+    vf c0 = (vf)((float)(get_global_id(0) % 7)), c1 = c0 + 1.0f, c2 = c0 + 2.0f, c3 = c0 + 3.0f;
+    vf c4 = c0 + 4.0f, c5 = c0 + 5.0f, c6 = c0 + 6.0f, c7 = c0 + 7.0f; /* by name: an array would live in memory */
+    for (int step = 0; step < steps; ++step) {
+        c0 = mad(c0, a, b);
+        c1 = mad(c1, a, b);
+        c2 = mad(c2, a, b);
+        c3 = mad(c3, a, b);
+        c4 = mad(c4, a, b);
+        c5 = mad(c5, a, b);
+        c6 = mad(c6, a, b);
+        c7 = mad(c7, a, b);
+    }
+    out[get_global_id(0)] = v_sum(((c0 + c1) + (c2 + c3)) + ((c4 + c5) + (c6 + c7)));
+}

@@ -1,0 +1,20 @@
+"""The device that a call is given: a wish, or a Runtime that is already there."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from phyradgs_cl.runtime import Runtime
+
+Device = str | Runtime | None
+
+
+def runtime_of(device: Device) -> Runtime:
+    """The Runtime for what ``--device`` takes; None is the best device."""
+    return device if isinstance(device, Runtime) else _runtime_by_name(device)
+
+
+@lru_cache(maxsize=4)
+def _runtime_by_name(name: str | None) -> Runtime:
+    """One Runtime a device, so that programs are built once."""
+    return Runtime(name)

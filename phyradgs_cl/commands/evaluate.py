@@ -1,0 +1,39 @@
+"""evaluate: a volume against the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.options import file_argument, file_option
+from phyradgs_cl.workflow import run_evaluation
+
+EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"
+
+
+def evaluate_command(
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file.")],
+    reference: Annotated[
+        Path,
+        file_option("--reference", help="Scan with a known truth, or a volume on the same grid."),
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    picture: Annotated[
+        Path | None,
+        file_option(
+            "--picture",
+            help="PNG of slices: result, truth, difference.",
+            show_default="VOLUME with .png",
+        ),
+    ] = None,
+) -> None:
+    """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
+    facts = run_evaluation(volume, reference, picture or volume.with_suffix(".png"))
+    if as_json:
+        say(json.dumps(facts))
+    else:
+        say(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   picture {facts['picture']}")

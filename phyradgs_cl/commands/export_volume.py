@@ -1,0 +1,46 @@
+"""export: a volume for other programs."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.options import file_argument, file_option
+from phyradgs_cl.exporters import EXPORTS, export_volume
+
+EXAMPLE = "Example: phyradgs export volume.h5 --to nii --mu-water-per-mm 0.0195"
+Export = Enum("Export", {name: name for name in EXPORTS}, type=str)  # type: ignore[misc]
+
+
+def export_command(
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file.")],
+    to: Annotated[
+        Export,  # type: ignore[valid-type]
+        typer.Option(
+            "--to", help="nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        file_option(
+            "--output",
+            "-o",
+            help="File to write, or for dicom a new folder; nii.gz is compressed.",
+            show_default="VOLUME with the format's suffix",
+        ),
+    ] = None,
+    mu_water_per_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="Attenuation of water in 1/mm: writes Hounsfield units.", show_default="none: values in 1/mm"
+        ),
+    ] = None,
+) -> None:
+    """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
+    written = export_volume(volume, to.value, output, mu_water_per_mm)  # type: ignore[attr-defined]
+    unit = "" if to.value in ("ply", "npz") else ", HU" if mu_water_per_mm is not None else ", 1/mm"  # type: ignore[attr-defined]
+    say(f"{written}: {to.value}{unit}")  # type: ignore[attr-defined]

@@ -1,0 +1,166 @@
+"""import: a scan of another program becomes one of ours."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.options import Axis, DetectorModel, file_argument, file_option
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
+from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
+from phyradgs_cl.io import check_writable, write_scan
+from phyradgs_cl.settings import offset_pair
+
+EXAMPLE = (
+    "Example: phyradgs import chest_50.pickle -o scan.h5\n\n"
+    "Example: phyradgs import scan.xml -o scan.h5 --exposure-s 0.03 --readout-s 0.02 --frame-time-s 0.05"
+)
+
+
+def _words(name: str, words: tuple[str, ...]) -> type[Enum]:
+    return Enum(name, {word: word for word in words}, type=str)  # type: ignore[return-value]
+
+
+FormatName = _words("FormatName", tuple(FORMATS))
+AngleAt, Part = _words("AngleAt", ANGLE_AT), _words("Part", PARTS)
+Quantity, Rotates = _words("Quantity", QUANTITIES), _words("Rotates", ROTATES)
+Row0, Column0 = _words("Row0", ROW_0), _words("Column0", COLUMN_0)
+
+
+def _number(help: str, default: str = "the file's") -> typer.models.OptionInfo:
+    return typer.Option(help=help, show_default=default)
+
+
+def import_command(
+    source: Annotated[Path, file_argument("SRC", "File or folder of another program; see docs/import.md.")],
+    output: Annotated[
+        Path, file_option("--output", "-o", help="Scan file to write; an existing one is replaced whole.")
+    ],
+    form: Annotated[
+        FormatName | None,  # type: ignore[valid-type]
+        typer.Option("--format", help="Format of SRC.", show_default="recognised"),
+    ] = None,
+    exposure_s: Annotated[float | None, _number("Exposure of a line, s.")] = None,
+    readout_s: Annotated[
+        float | None, _number("From the first line's opening to the last line's, s.")
+    ] = None,
+    frame_time_s: Annotated[
+        float | None,
+        _number(
+            "From one frame's opening to the next, s: the gantry turned without a stop.",
+            "the file's, else at rest",
+        ),
+    ] = None,
+    angle_at: Annotated[
+        AngleAt | None,  # type: ignore[valid-type]
+        typer.Option(
+            help="What a frame's angle belongs to: start or middle of its exposure.", show_default="start"
+        ),
+    ] = None,
+    readout: Annotated[
+        Axis | None, typer.Option(help="What is read out at one time.", show_default="the format's")
+    ] = None,
+    readout_direction: Annotated[
+        int | None,
+        typer.Option(
+            help="1 reads our row 0 (lowest) or column 0 (left) first, -1 last.", show_default="the format's"
+        ),
+    ] = None,
+    source_to_axis_mm: Annotated[float | None, _number("Source to rotation axis, mm.")] = None,
+    source_to_detector_mm: Annotated[float | None, _number("Source to detector, mm.")] = None,
+    pixel_size_mm: Annotated[
+        str | None, typer.Option(help="Pixel size V,U in mm.", metavar="V,U", show_default="the file's")
+    ] = None,
+    detector_offset: Annotated[
+        str | None, typer.Option(help="Detector offset V,U in mm.", metavar="V,U", show_default="the file's")
+    ] = None,
+    unit_mm: Annotated[float, typer.Option(help="Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
+    rotates: Annotated[
+        Rotates | None,  # type: ignore[valid-type]
+        typer.Option(help="What the stored angles turn.", show_default="the format's"),
+    ] = None,
+    row_0: Annotated[
+        Row0 | None,  # type: ignore[valid-type]
+        typer.Option("--row-0", help="Where the first stored row is.", show_default="the format's"),
+    ] = None,
+    column_0: Annotated[
+        Column0 | None,  # type: ignore[valid-type]
+        typer.Option(
+            "--column-0", help="Where the first stored column is, seen from the source.", show_default="left"
+        ),
+    ] = None,
+    quantity: Annotated[
+        Quantity | None,  # type: ignore[valid-type]
+        typer.Option(help="What the pixels hold.", show_default="the file's"),
+    ] = None,
+    flat_value: Annotated[
+        float | None, _number("Counts without an object, where there are no flat frames.")
+    ] = None,
+    detector_model: Annotated[
+        DetectorModel | None,
+        typer.Option(
+            help="What is averaged over an exposure: line integrals or intensity.", show_default="log"
+        ),
+    ] = None,
+    part: Annotated[
+        Part,  # type: ignore[valid-type]
+        typer.Option(help="Projections of a benchmark folder (r2, phyradgs, naf)."),
+    ] = Part["train"],
+    first_view: Annotated[
+        int | None,
+        typer.Option(
+            help="Where this scan begins in a JSON of several (phyradgs-real).", show_default="the whole"
+        ),
+    ] = None,
+) -> None:
+    """Import a scan of another program: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF."""
+    options = ImportOptions(
+        exposure_s=exposure_s,
+        readout_s=readout_s,
+        frame_time_s=frame_time_s,
+        angle_at=_value(angle_at),
+        readout_axis=_value(readout),
+        readout_direction=readout_direction,
+        source_to_axis_mm=source_to_axis_mm,
+        source_to_detector_mm=source_to_detector_mm,
+        pixel_size_mm=offset_pair("--pixel-size-mm", pixel_size_mm),
+        detector_offset_mm=offset_pair("--detector-offset", detector_offset),
+        unit_mm=unit_mm,
+        rotates=_value(rotates),
+        row_0=_value(row_0),
+        column_0=_value(column_0),
+        quantity=_value(quantity),
+        flat_value=flat_value,
+        detector_model=_value(detector_model),
+        part=str(_value(part)),
+        first_view=first_view,
+    )
+    _refuse_overwriting(source, output)
+    check_writable(output)
+    chosen = _value(form) or recognise(source)
+    scan = import_scan(source, options, chosen)
+    write_scan(output, scan)
+    frames, rows, columns = scan.projections.shape
+    masked = 0 if scan.pixel_mask is None else int(np.count_nonzero(scan.pixel_mask))
+    kind = "fly-scan" if scan.is_fly else "at rest"
+    say(
+        f"{output}: {chosen}, {frames} frames of {rows}×{columns}, {kind}, "
+        f"largest line integral {scan.projections.max():.3g}, {masked} pixels masked"
+    )
+
+
+def _value(word: Enum | None) -> str | None:
+    return None if word is None else str(word.value)
+
+
+def _refuse_overwriting(source: Path, output: Path) -> None:
+    """An output inside what is read could be, or become, part of it."""
+    target, origin = output.resolve(), source.resolve()
+    if target == origin:
+        raise InputError("--output", f"the input {source} itself", "another file to write")

@@ -1,0 +1,41 @@
+"""report: a reconstruction as an HTML page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.options import Device, Output, file_argument, file_option
+from phyradgs_cl.report import write_report
+from phyradgs_cl.report.page import DEFAULT_VIEWS
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import device_wish
+
+EXAMPLE = "Example: phyradgs report volume.h5 -o report.html"
+MOST_VIEWS = 24
+
+
+def report_command(
+    run: Annotated[Path, file_argument("RUN", "Volume file of a reconstruction.")],
+    output: Output,
+    scan: Annotated[
+        Path | None,
+        file_option(
+            "--scan", help="Its scan.", show_default="the one that the volume file names, if unchanged"
+        ),
+    ] = None,
+    views: Annotated[
+        int,
+        typer.Option(
+            min=0, max=MOST_VIEWS, help="Frames to compute from the volume and compare with the measurement."
+        ),
+    ] = DEFAULT_VIEWS,
+    device: Device = None,
+) -> None:
+    """Write one HTML page about a reconstruction: slices, convergence, projections, scan, provenance."""
+    wish = device_wish(device)
+    write_report(run, output, lambda: Runtime(wish), scan=scan, views=views)
+    say(f"{output}: {output.stat().st_size / 1e6:.1f} MB")

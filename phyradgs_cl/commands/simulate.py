@@ -1,0 +1,188 @@
+"""simulate: a phantom or a volume to a scan file."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Output, file_option
+from phyradgs_cl.progress import Ticker
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import device_wish, offset_pair, pulse_pair
+from phyradgs_cl.simulation import SimulationOptions
+from phyradgs_cl.workflow import (
+    SimulationJob,
+    load_scanner_for,
+    make_scan_protocol,
+    refuse_jitter,
+    run_simulation,
+)
+
+EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
+
+
+class PhantomName(str, Enum):
+    foot = "foot"
+    jaw = "jaw"
+    shepp_logan = "shepp-logan"
+    spheres = "spheres"
+
+
+class ProtocolName(str, Enum):
+    rapid = "rapid"
+    standard = "standard"
+    static = "static"
+
+
+class Noise(str, Enum):
+    none = "none"
+    tigre = "tigre"
+    beer = "beer"
+
+
+def simulate_command(
+    output: Output,
+    phantom: Annotated[
+        PhantomName | None, typer.Option(help="Built-in phantom.", show_default="foot, without --volume")
+    ] = None,
+    volume: Annotated[
+        Path | None,
+        file_option("--volume", help="HDF5 file with a dataset /volume (z, y, x), or one of our volumes."),
+    ] = None,
+    scanner: Annotated[str, typer.Option(help="Scanner by name (r2, carm) or a TOML file.")] = "r2",
+    protocol: Annotated[
+        ProtocolName,
+        typer.Option(
+            help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
+            "rapid, or of the fly-scan that the options below describe."
+        ),
+    ] = ProtocolName.rapid,
+    views: Annotated[int | None, typer.Option(help="Frames in the turn.", show_default="protocol's")] = None,
+    exposure_deg: Annotated[
+        float | None, typer.Option(help="Arc of one exposure, degrees.", show_default="protocol's")
+    ] = None,
+    readout_ratio: Annotated[
+        float | None, typer.Option(help="Readout over exposure time, T_ro/T_exp.", show_default="0.86")
+    ] = None,
+    start_deg: Annotated[
+        float | None, typer.Option(help="Gantry angle at the start, degrees.", show_default="0")
+    ] = None,
+    readout: Annotated[
+        Axis | None, typer.Option(help="What is read out at one time.", show_default="scanner's")
+    ] = None,
+    readout_direction: Annotated[
+        int | None, typer.Option(help="1 reads index 0 first, -1 last.", show_default="scanner's")
+    ] = None,
+    pulse: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START,LENGTH",
+            help="When the beam is on, after a frame's start, in shares of the exposure.",
+            show_default="scanner's: always on",
+        ),
+    ] = None,
+    lag: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of a recorded frame that comes from the frames before, 0 to 0.9.",
+            show_default="scanner's: 0",
+        ),
+    ] = None,
+    detector_model: Annotated[
+        DetectorModel,
+        typer.Option(help="Average line integrals (log) or transmitted intensity over the exposure."),
+    ] = DetectorModel.log,
+    peak: Annotated[
+        float, typer.Option(help="Scale attenuation so that the largest line integral is this; 0 leaves it.")
+    ] = 0.0,
+    noise: Annotated[
+        Noise,
+        typer.Option(
+            help="tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."
+        ),
+    ] = Noise.none,
+    dose: Annotated[float, typer.Option(help="Photons a pixel without object.")] = 1e4,
+    electronic_noise: Annotated[
+        float, typer.Option(help="Standard deviation of electronic noise, counts.")
+    ] = 10.0,
+    jitter_deg: Annotated[
+        float | None,
+        typer.Option(
+            help="Wander of the gantry about constant speed (std, degrees), written to the encoder table.",
+            show_default="0",
+        ),
+    ] = None,
+    detector: Annotated[
+        int | None,
+        typer.Option(
+            help="Detector columns (rows in proportion); the panel keeps its size.", show_default="scanner's"
+        ),
+    ] = None,
+    detector_offset: Annotated[
+        str | None, typer.Option(help="Detector offset V,U in mm.", show_default="scanner's")
+    ] = None,
+    size: Annotated[
+        int | None,
+        typer.Option(
+            help="Voxels along the longest side of the grid and truth.",
+            show_default="scanner's or the file's",
+        ),
+    ] = None,
+    pixel_samples: Annotated[
+        int,
+        typer.Option(
+            help="Rays along each side of a pixel, over whose area they are averaged; 1: its centre."
+        ),
+    ] = 1,
+    time_samples: Annotated[
+        int,
+        typer.Option(help="Times at which every line is projected in its exposure; 0 chooses by the motion."),
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of phantom, noise and jitter.")] = 0,
+    device: Device = None,
+) -> None:
+    """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
+    readout_axis = readout.value if readout else None
+    refuse_jitter(protocol.value, jitter_deg)
+    wish = device_wish(device)
+    job = SimulationJob(
+        output,
+        phantom.value if phantom else None,
+        volume,
+        scanner,
+        detector,
+        offset_pair("--detector-offset", detector_offset),
+        size,
+        pixel_samples,
+    )
+    described = load_scanner_for(job)
+    options = SimulationOptions(
+        protocol=make_scan_protocol(
+            protocol.value,
+            described,
+            views=views,
+            exposure_deg=exposure_deg,
+            readout_ratio=readout_ratio,
+            pulse=pulse_pair("--pulse", pulse),
+            start_deg=start_deg,
+        ),
+        readout_axis=readout_axis or described.readout_axis,
+        readout_direction=described.readout_direction if readout_direction is None else readout_direction,
+        detector_model=detector_model.value,
+        peak=peak,
+        noise=noise.value,
+        dose=dose,
+        electronic_noise=electronic_noise,
+        jitter_deg=0.0 if jitter_deg is None else jitter_deg,
+        lag=described.lag if lag is None else lag,
+        time_samples=time_samples,
+        seed=seed,
+    )
+    with Ticker("frame") as ticker:
+        scan = run_simulation(job, described, options, Runtime(wish), ticker.show)
+    frames, rows, columns = scan.projections.shape
+    say(f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}")

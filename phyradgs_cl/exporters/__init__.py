@@ -1,0 +1,79 @@
+"""Volumes in other programs' formats, with spacing, origin and directions; `export_volume` is the door."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters.dicom import write_dicom
+from phyradgs_cl.exporters.gaussians import gaussians_of, write_npz, write_ply
+from phyradgs_cl.exporters.meta_image import write_meta_image
+from phyradgs_cl.exporters.nifti import write_nifti
+from phyradgs_cl.exporters.npy import write_npy
+from phyradgs_cl.exporters.nrrd import write_nrrd
+from phyradgs_cl.exporters.placed import Placed, hounsfield, placed
+from phyradgs_cl.exporters.tiff import write_tiff
+from phyradgs_cl.io import read_volume
+
+__all__ = ["EXPORTS", "Placed", "default_output", "export_volume", "hounsfield", "placed"]
+
+VOXELS: dict[str, Callable[[Path, Placed], None]] = {
+    "nii": write_nifti,
+    "mha": write_meta_image,
+    "nrrd": write_nrrd,
+    "tiff": write_tiff,
+    "npy": write_npy,
+    "dicom": write_dicom,
+}
+CLOUDS = {"ply": write_ply, "npz": write_npz}
+EXPORTS = (*VOXELS, *CLOUDS)
+_SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": ()}
+
+
+def export_volume(
+    path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None
+) -> Path:
+    """Write a volume file in another format, whole or not at all; returns what was written.
+
+    Args:
+        path: a volume file of this package.
+        to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels.
+        output: file, or folder for dicom; None puts it beside ``path``.
+        mu_water_per_mm: water's attenuation; the values are then Hounsfield units.
+
+    Raises:
+        InputError: no such format, a volume that is damaged or has no Gaussians, a name that does not fit.
+        OutputError: it cannot be written.
+    """
+    checks.one_of("--to", to, EXPORTS)
+    path = Path(path)
+    target = default_output(path, to) if output is None else Path(output)
+    _check_name(target, to, path)
+    if to in CLOUDS and mu_water_per_mm is not None:
+        raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
+    stored = read_volume(path)
+    if to in CLOUDS:
+        CLOUDS[to](target, gaussians_of(stored, str(path)))
+    else:
+        VOXELS[to](target, placed(stored, mu_water_per_mm))
+    return target
+
+
+def default_output(path: Path, to: str) -> Path:
+    """The volume's name with the format's suffix; for DICOM a folder."""
+    return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
+
+
+def _suffixes(to: str) -> tuple[str, ...]:
+    return _SUFFIXES.get(to, (f".{to}",))
+
+
+def _check_name(target: Path, to: str, source: Path) -> None:
+    """Other programs go by the suffix, so a wrong one is refused."""
+    suffixes = _suffixes(to)
+    if suffixes and not target.name.lower().endswith(suffixes):
+        raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
+    if target.resolve() == source.resolve():
+        raise InputError("output", f"the input {source} itself", "another name")

@@ -1,0 +1,89 @@
+"""A DICOM series: a folder of CT images, one a slice, in Hounsfield units or in 1/mm with a rescale slope.
+
+Attributes of the CT Image module (DICOM PS3.3, A.3 and C.8.2): position and orientation in LPS, 16 bits a voxel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.exporters.folder_beside import folder_written_beside
+from phyradgs_cl.exporters.libraries import needed
+from phyradgs_cl.exporters.placed import Placed
+
+_CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
+_EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
+_LARGEST = 32_767
+
+
+def write_dicom(path: Path, volume: Placed) -> None:
+    """A new folder with 0001.dcm from the lowest slice up."""
+    pydicom = needed("pydicom")
+    slope = rescale_slope(volume)
+    seed = hashlib.sha256(
+        volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
+    ).hexdigest()
+    uid = {
+        name: pydicom.uid.generate_uid(entropy_srcs=[seed, volume.unit, name])
+        for name in ("study", "series", "frame")
+    }
+    with folder_written_beside(path) as folder:
+        for index, plane in enumerate(volume.values):
+            image = _common(pydicom, volume, slope, uid)
+            instance = pydicom.uid.generate_uid(entropy_srcs=[seed, volume.unit, str(index)])
+            image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = instance
+            _place(image, volume, index)
+            image.PixelData = np.rint(plane / float(slope)).astype("<i2").tobytes()
+            image.save_as(folder / f"{index + 1:04d}.dcm", enforce_file_format=True)
+
+
+def rescale_slope(volume: Placed) -> str:
+    """Value of one stored step as DICOM's decimal string: 1 HU where 16 bits hold the range, else just enough."""
+    peak = float(np.abs(volume.values).max())
+    if volume.is_hu and peak <= _LARGEST:
+        return "1"
+    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # not above 16 characters, not rounded below
+
+
+def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> Any:
+    """What all slices share."""
+    image = pydicom.dataset.Dataset()
+    image.file_meta = pydicom.dataset.FileMetaDataset()
+    image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE
+    image.file_meta.TransferSyntaxUID = _EXPLICIT_LITTLE
+    image.StudyInstanceUID, image.SeriesInstanceUID = uid["study"], uid["series"]
+    image.FrameOfReferenceUID = uid["frame"]
+    for name in ("PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "AccessionNumber"):
+        setattr(image, name, "")
+    image.PatientName, image.StudyID = "phyradgs-cl^volume", "1"
+    for name in ("ReferringPhysicianName", "PositionReferenceIndicator", "KVP", "AcquisitionNumber"):
+        setattr(image, name, None)
+    image.Modality, image.Manufacturer, image.SeriesNumber = "CT", "phyradgs-cl", 1
+    image.SeriesDescription = f"values in {volume.unit}"
+    image.ImageType, image.PatientPosition = ["DERIVED", "PRIMARY", "AXIAL"], "HFS"
+    image.Columns, image.Rows, _ = volume.shape_xyz
+    image.SamplesPerPixel, image.PhotometricInterpretation = 1, "MONOCHROME2"
+    image.BitsAllocated, image.BitsStored, image.HighBit, image.PixelRepresentation = 16, 16, 15, 1
+    image.RescaleSlope, image.RescaleIntercept = slope, "0"
+    image.RescaleType = "HU" if volume.is_hu else "US"
+    return image
+
+
+def _place(image: Any, volume: Placed, index: int) -> None:
+    """Where slice ``index`` lies. PixelSpacing runs from row to row first."""
+    (dx, dy, dz), (x, y, z) = volume.spacing_mm, volume.origin_mm
+    image.InstanceNumber = index + 1
+    image.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+    image.ImagePositionPatient = [_decimal(place) for place in (x, y, z + index * dz)]
+    image.PixelSpacing = [_decimal(dy), _decimal(dx)]
+    image.SliceThickness = image.SpacingBetweenSlices = _decimal(dz)
+    image.SliceLocation = _decimal(z + index * dz)
+
+
+def _decimal(number: float) -> str:
+    """At most 16 characters, as DICOM's decimal strings must be."""
+    return f"{number:.10g}" if 1e-4 <= abs(number) < 1e9 or number == 0 else f"{number:.8e}"

@@ -1,0 +1,55 @@
+"""The Gaussians of a volume file: points with properties (.ply), or NumPy arrays (.npz)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import StoredVolume, written_beside
+
+_SHAPES = {"mean": 3, "scale": 3, "quaternion": 4, "density": None}
+_PLY_NAMES = (
+    *("x", "y", "z", "scale_0", "scale_1", "scale_2"),
+    *("rot_0", "rot_1", "rot_2", "rot_3", "density"),
+)
+
+
+def gaussians_of(stored: StoredVolume, culprit: str) -> dict[str, np.ndarray]:
+    """mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in 1/mm; float32."""
+    if stored.gaussians is None:
+        remedy = "reconstruct with --method phyradgs or r2"
+        raise InputError(f"{culprit}:/entry/gaussians", "nothing there", "Gaussians", remedy)
+    count = len(stored.gaussians.get("mean", ()))
+    found = {}
+    for name, width in _SHAPES.items():
+        values = stored.gaussians.get(name)
+        shape = (count,) if width is None else (count, width)
+        if values is None or values.shape != shape:
+            what = "nothing there" if values is None else f"shape {values.shape}"
+            raise InputError(f"{culprit}:/entry/gaussians/{name}", what, f"shape {shape}")
+        found[name] = values.astype(np.float32)
+    return found
+
+
+def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
+    """Four arrays by their names, no pickle."""
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **cloud)
+
+
+def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:
+    """Binary PLY: a vertex a Gaussian, every number in the unit that the header's comments state."""
+    columns = [cloud["mean"], cloud["scale"], cloud["quaternion"], cloud["density"][:, None]]
+    rows = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
+    properties = "".join(f"property float {name}\n" for name in _PLY_NAMES)
+    head = (
+        "ply\nformat binary_little_endian 1.0\n"
+        "comment radiative Gaussians: density * exp(-1/2 d^T (R diag(scale^2) R^T)^-1 d)\n"
+        "comment x y z and scale in mm, rot quaternion w x y z, density in 1/mm; all linear\n"
+        f"element vertex {len(rows)}\n{properties}end_header\n"
+    )
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        file.write(head.encode("ascii"))
+        file.write(rows.tobytes())

@@ -1,0 +1,59 @@
+"""Scans in other programs' formats: read, checked as if by strangers, and turned into this package's conventions.
+
+`import_scan` is the door; one module a format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.data_exchange import import_data_exchange
+from phyradgs_cl.importers.naf import import_naf
+from phyradgs_cl.importers.nxtomo import import_nxtomo
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.phyradgs_real import import_phyradgs_real
+from phyradgs_cl.importers.phyradgs_synthetic import import_phyradgs
+from phyradgs_cl.importers.r2_gaussian import import_r2
+from phyradgs_cl.importers.recognise import recognise
+from phyradgs_cl.importers.rtk import import_rtk
+from phyradgs_cl.importers.tiff_folder import import_tiff
+
+__all__ = ["FORMATS", "ImportOptions", "import_scan", "recognise"]
+
+FORMATS: dict[str, Callable[[Path, ImportOptions], Scan]] = {
+    "r2": import_r2,
+    "phyradgs": import_phyradgs,
+    "phyradgs-real": import_phyradgs_real,
+    "naf": import_naf,
+    "rtk": import_rtk,
+    "data-exchange": import_data_exchange,
+    "nxtomo": import_nxtomo,
+    "tiff": import_tiff,
+}
+
+
+def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
+    """A scan from a file or folder of another program, with line integrals, upright, in mm, s and radians.
+
+    Args:
+        path: file or folder.
+        options: what the files do not say.
+        form: a key of ``FORMATS``; None recognises it.
+
+    Raises:
+        InputError: a format that is not known, files that are damaged, incomplete or not what they seem, options that
+            the format has no use for.
+    """
+    path = Path(path)
+    if not (path.is_dir() or path.is_file()):
+        found = "something that is neither a file nor a folder" if path.exists() else "nothing there"
+        raise InputError(str(path), found, "a scan to import", "check the path")
+    form = form or recognise(path)
+    checks.one_of("format", form, FORMATS)
+    scan = FORMATS[form](path, options or ImportOptions())
+    scan.check_timing()
+    return scan

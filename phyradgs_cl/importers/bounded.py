@@ -1,0 +1,71 @@
+"""Reading small texts and NumPy arrays whose size is bounded by the file's own."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.folder import regular_file
+
+MOST_TEXT_BYTES = 64 << 20
+
+
+def read_bytes(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
+    """A whole file of at most ``most`` bytes."""
+    size = regular_file(path, str(path)).stat().st_size
+    if size > most:
+        raise InputError(str(path), f"{size} bytes", f"at most {most} bytes for a description of a scan")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file") from error
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """The object that a JSON file holds."""
+    try:
+        content = json.loads(read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
+        raise InputError(str(path), f"text that is not JSON ({error})", "a JSON object") from error
+    if not isinstance(content, dict):
+        raise InputError(str(path), f"JSON {type(content).__name__}", "a JSON object")
+    return content
+
+
+def read_npy(path: Path, ndim: int) -> np.ndarray:
+    """A numeric array of a .npy file, C order; never a pickle, never larger than the file says."""
+    culprit = str(path)
+    regular_file(path, culprit)
+    try:
+        with open(path, "rb") as file:
+            version = np.lib.format.read_magic(file)
+            if version not in ((1, 0), (2, 0)):
+                raise InputError(culprit, f"version {version}", "a .npy file of version 1.0 or 2.0")
+            read = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
+            shape, fortran, dtype = read(file)
+            check_array(culprit, shape, dtype, path.stat().st_size - file.tell(), ndim)
+            values = np.fromfile(file, dtype, math.prod(shape))
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # NumPy hands on whatever Python's parser and tokeniser stumble over
+        raise InputError(culprit, f"a damaged .npy file ({error})", "a NumPy array") from error
+    values = values.reshape(shape, order="F" if fortran else "C")
+    return np.ascontiguousarray(values)
+
+
+def check_array(
+    culprit: str, shape: tuple[int, ...], dtype: np.dtype, available_bytes: int, ndim: int
+) -> None:
+    """InputError unless an uncompressed array of numbers fits into the bytes that there are."""
+    if dtype.kind not in "iuf" or dtype.itemsize not in (1, 2, 4, 8):
+        raise InputError(culprit, f"type {dtype}", "plain real numbers")
+    if len(shape) != ndim or min(shape, default=0) < 1:
+        raise InputError(culprit, f"shape {shape}", f"{ndim} axes, none of them empty")
+    needed = math.prod(shape) * dtype.itemsize
+    if needed > available_bytes:
+        found = f"shape {shape}, {needed} bytes, in {available_bytes} bytes of data"
+        raise InputError(culprit, found, "as many bytes as its header announces", "copy the file again")

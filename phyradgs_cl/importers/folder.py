@@ -1,0 +1,89 @@
+"""Files of a foreign folder, opened only where they really lie inside it.
+
+Names come from strangers' JSON, XML headers and listings: no absolute path, no "..", no symbolic link, nothing
+but regular files.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from phyradgs_cl.errors import InputError
+
+_MOST_FILES = 200_000
+_LONGEST_NAME = 4096
+
+
+@dataclass(frozen=True)
+class SafeFolder:
+    """A folder that the user named; only what is inside can be reached through it."""
+
+    root: Path
+
+    def __post_init__(self) -> None:
+        if not self.root.is_dir():
+            what = "a file" if self.root.exists() else "nothing there"
+            raise InputError(str(self.root), what, "a folder", "check the path")
+
+    def file(self, name: object, culprit: str) -> Path:
+        """The regular file ``name`` below the folder; ``culprit`` says where the name was found."""
+        text = checked_name(name, culprit)
+        path = self.root
+        for part in PurePosixPath(text).parts:
+            path = path / part
+            if path.is_symlink():
+                raise InputError(culprit, f"{text!r}, which leads over a symbolic link", "a plain file")
+        return regular_file(path, culprit)
+
+    def exists(self, name: str) -> bool:
+        """Whether there is an entry of this plain name, whatever it is."""
+        return (self.root / name).exists() or (self.root / name).is_symlink()
+
+    def matching(self, *suffixes: str) -> list[Path]:
+        """Regular files of the folder itself whose names end so (any case), in natural order of their names."""
+        found = []
+        for number, path in enumerate(self.root.iterdir()):
+            if number >= _MOST_FILES:
+                raise InputError(str(self.root), f"more than {_MOST_FILES} files", "a folder with one scan")
+            if path.suffix.lower() in suffixes and not path.name.startswith("."):
+                found.append(self.file(path.name, f"{self.root}/{path.name}"))
+        return in_natural_order(found)
+
+
+def checked_name(name: object, culprit: str) -> str:
+    """A relative path without "..", with forward slashes; InputError for everything else."""
+    if not isinstance(name, str) or not name.strip() or len(name) > _LONGEST_NAME or "\0" in name:
+        raise InputError(culprit, repr(name)[:80], "the name of a file in the same folder")
+    text = name.replace("\\", "/")
+    outside = PureWindowsPath(name).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
+    if outside:
+        raise InputError(
+            culprit, repr(name)[:80], "a name inside the folder", "copy the file into the folder"
+        )
+    return text
+
+
+def regular_file(path: Path, culprit: str) -> Path:
+    """The path of a file that exists and is neither a folder nor a device."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        raise InputError(culprit, f"no file {path}", "a file that exists", "check the path") from None
+    if not stat.S_ISREG(mode):  # a pipe would never end
+        what = "a folder" if stat.S_ISDIR(mode) else "something that is not a regular file"
+        raise InputError(culprit, f"{what} at {path}", "a regular file", "check the path")
+    return path
+
+
+def in_natural_order(paths: Sequence[Path]) -> list[Path]:
+    """Sorted by name with numbers by value: 2.tif before 10.tif."""
+    return sorted(paths, key=lambda path: _natural(path.name))
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d{1,18})", name)
+    return [(0, int(p), "") if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts if p]

@@ -1,0 +1,94 @@
+"""Poses that no circle describes: tables of them over time, upright, with a plain geometry to go by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition import ConeGeometry, PoseTable
+from phyradgs_cl.importers.timing import Timing
+
+_SLACK = 1e-6  # of a span: how far a table runs beyond the times that are asked for
+
+
+@dataclass(frozen=True)
+class Turned:
+    """How stored images have to be flipped so that v̂ points up and û to the right, seen from the source."""
+
+    rows: bool
+    columns: bool
+
+    def frames(self, array: np.ndarray) -> np.ndarray:
+        """Frames or masks (..., v, u), flipped."""
+        array = array[..., ::-1, :] if self.rows else array
+        return array[..., ::-1] if self.columns else array
+
+    def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
+        """Poses (..., 12) of the flipped images."""
+        pose = np.array(pose, np.float64)
+        if self.rows:
+            pose[..., 3:6] += (panel[0] - 1) * pose[..., 9:12]
+            pose[..., 9:12] *= -1
+        if self.columns:
+            pose[..., 3:6] += (panel[1] - 1) * pose[..., 6:9]
+            pose[..., 6:9] *= -1
+        return pose
+
+
+def turn_of(pose: np.ndarray) -> Turned:
+    """What stands a stored image upright, from one of its poses (12,)."""
+    source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
+    right = np.array([-source[1], source[0], 0.0])
+    return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
+
+
+def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
+    """The circular geometry nearest to poses (F, 12), by mean distances and offsets; sizes are taken from it.
+
+    The detector's distance is that of its plane, its offset that of its middle from the source's foot on the plane.
+    """
+    source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
+    pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
+    u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
+    centre = first + (panel[1] - 1) / 2 * step_u + (panel[0] - 1) / 2 * step_v
+    normal = np.cross(u_hat, v_hat)
+    ray = centre - source
+    offset_v, offset_u, away = (np.einsum("ij,ij->i", ray, axis) for axis in (v_hat, u_hat, normal))
+    to_axis = np.linalg.norm(source[:, :2], axis=1)
+    means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
+    return ConeGeometry(means[0], means[1], panel, (means[2], means[3]), (means[4], means[5]))
+
+
+def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, culprit: str) -> PoseTable:
+    """A pose table that covers every frame's window.
+
+    ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to frame 3, and beyond the
+    ends it goes on as it went. A gantry at rest gets a table whose value at each frame's middle is that frame's pose.
+    """
+    if not timing.is_fly:
+        at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
+        return _standing(pose_at, timing, at_s, culprit)
+    at_s = timing.angle_time_s
+    span_s = timing.shutter.span_s
+    before, after = at_s[0] - timing.start_s[0] + _SLACK * span_s, timing.start_s[-1] + span_s - at_s[-1]
+    first = at_s[0] - max(before, 0.0)
+    last = at_s[-1] + max(after, 0.0) + _SLACK * span_s
+    time_s = np.concatenate([[first], at_s, [last]])
+    position = np.concatenate([
+        [-(at_s[0] - first) / (at_s[1] - at_s[0])],
+        np.arange(len(at_s)),
+        [len(at_s) - 1 + (last - at_s[-1]) / (at_s[-1] - at_s[-2])],
+    ])  # fmt: skip
+    return PoseTable(time_s, pose_at(position), f"{culprit} poses")
+
+
+def _standing(
+    pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, at_s: np.ndarray, culprit: str
+) -> PoseTable:
+    """Each frame's pose held from its opening to its closing, so that nothing moves inside a window."""
+    frames = np.arange(len(at_s))
+    half_s = max(timing.shutter.span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
+    time_s = np.stack([at_s - half_s, at_s + half_s], -1).ravel()
+    return PoseTable(time_s, np.repeat(pose_at(frames.astype(np.float64)), 2, axis=0), f"{culprit} poses")

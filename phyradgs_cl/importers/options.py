@@ -1,0 +1,106 @@
+"""What the user says about a foreign scan that its files do not say, or say differently."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.errors import InputError
+
+PARTS = ("train", "test", "all")
+ANGLE_AT = ("start", "middle")
+QUANTITIES = ("attenuation", "transmission", "counts")
+ROTATES = ("gantry", "sample")
+ROW_0 = ("top", "bottom")
+COLUMN_0 = ("left", "right")
+
+_WORDS = {
+    "part": PARTS,
+    "angle_at": ANGLE_AT,
+    "quantity": QUANTITIES,
+    "rotates": ROTATES,
+    "row_0": ROW_0,
+    "column_0": COLUMN_0,
+    "readout_axis": AXES,
+    "readout_direction": (1, -1),
+    "detector_model": DETECTOR_MODELS,
+}
+_POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm")
+_TIMES = ("exposure_s", "readout_s")
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Options of an import; None leaves it to the file, or to the format's custom.
+
+    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next, which says
+    that the gantry turned without a stop; ``angle_at``: whether a frame's angle is that of the opening of its
+    first line, or of the middle of that line's exposure. Readout axis and direction are those of the imported
+    scan, whose row 0 is the lowest and whose column 0 is on the left, seen from the source.
+
+    Geometry: distances, pixel size (v, u) and detector offset (v, u) in mm; ``unit_mm``: the length of one scene
+    unit in formats without a unit; ``rotates``: whether angles are the gantry's or the sample's; ``row_0`` and
+    ``column_0``: where the first stored row and column are, seen from the source.
+
+    Pixels: ``quantity`` that is stored; ``flat_value``: counts without an object, where there are no flat frames.
+    ``part``: which projections of a benchmark folder; ``first_view``: where this scan begins in a file of several.
+    """
+
+    exposure_s: float | None = None
+    readout_s: float | None = None
+    frame_time_s: float | None = None
+    angle_at: str | None = None
+    readout_axis: str | None = None
+    readout_direction: int | None = None
+    source_to_axis_mm: float | None = None
+    source_to_detector_mm: float | None = None
+    pixel_size_mm: tuple[float, float] | None = None
+    detector_offset_mm: tuple[float, float] | None = None
+    unit_mm: float = 1.0
+    rotates: str | None = None
+    row_0: str | None = None
+    column_0: str | None = None
+    quantity: str | None = None
+    flat_value: float | None = None
+    detector_model: str | None = None
+    part: str = "train"
+    first_view: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, allowed in _WORDS.items():
+            if getattr(self, name) is not None:
+                checks.one_of(option_name(name), getattr(self, name), allowed)
+        for name in _POSITIVE:
+            if getattr(self, name) is not None:
+                checks.positive(option_name(name), getattr(self, name))
+        for name in _TIMES:
+            if getattr(self, name) is not None:
+                checks.at_least(option_name(name), getattr(self, name), 0)
+        if self.first_view is not None:
+            checks.within(option_name("first_view"), self.first_view, 0, 1_000_000)
+        for length in self.pixel_size_mm or ():
+            checks.positive(option_name("pixel_size_mm"), length)
+        for length in self.detector_offset_mm or ():
+            checks.within(option_name("detector_offset_mm"), length, -1e6, 1e6)
+
+    def refuse_unused(self, form: str, used: tuple[str, ...]) -> None:
+        """InputError for an option that the format ``form`` would pass over in silence."""
+        for item in fields(self):
+            if item.name not in used and getattr(self, item.name) != item.default:
+                expected = "none of it: the files say it, or it has no meaning there"
+                raise InputError(
+                    f"{option_name(item.name)} with format {form}",
+                    str(getattr(self, item.name)),
+                    expected,
+                    "leave the option out",
+                )
+
+
+_OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offset"}
+
+
+def option_name(field: str) -> str:
+    """How the command line calls a field of ImportOptions."""
+    return _OPTIONS.get(field, "--" + field.replace("_", "-"))

@@ -1,0 +1,63 @@
+"""Which format a file or folder is in, from what is in it; nothing is guessed from numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import phyradgs_real, phyradgs_synthetic, r2_gaussian, tiff
+from phyradgs_cl.importers.folder import SafeFolder
+from phyradgs_cl.importers.hdf5_frames import opened
+from phyradgs_cl.importers.meta_image import SUFFIXES as STACKS
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_BY_SUFFIX = {".pickle": "naf", ".pkl": "naf", ".xml": "rtk", ".toml": "tiff"}
+
+
+def recognise(path: Path) -> str:
+    """The name of the format; InputError if none fits, or more than one."""
+    if not path.exists():
+        raise InputError(str(path), "nothing there", "a scan to import", "check the path")
+    found = _of_folder(SafeFolder(path)) if path.is_dir() else _of_file(path)
+    if len(found) == 1:
+        return found[0]
+    what = f"several: {', '.join(found)}" if found else "no known format"
+    raise InputError(str(path), what, "one of the formats of docs/import.md", "say which with --format")
+
+
+def _of_folder(folder: SafeFolder) -> list[str]:
+    if folder.exists(phyradgs_synthetic.META):
+        return ["phyradgs"]
+    if folder.exists(r2_gaussian.META):
+        return ["r2"]
+    found = []
+    if folder.matching(".xml") and folder.matching(*STACKS):
+        found.append("rtk")
+    if folder.matching(".toml"):
+        found.append("tiff")
+    if folder.matching(".json") and (
+        folder.exists(phyradgs_real.PROJECTIONS) or folder.matching(*tiff.SUFFIXES)
+    ):
+        found.append("phyradgs-real")
+    return found
+
+
+def _of_file(path: Path) -> list[str]:
+    if path.name == phyradgs_synthetic.META:
+        return ["phyradgs"]
+    if path.name == r2_gaussian.META:
+        return ["r2"]
+    if path.suffix.lower() == ".json":
+        return ["phyradgs-real"]
+    if not path.is_file():
+        raise InputError(str(path), "something that is not a regular file", "a file or a folder")
+    with open(path, "rb") as file:
+        is_hdf5 = file.read(len(_HDF5)) == _HDF5
+    if is_hdf5:
+        with opened(path) as source:
+            exchange = isinstance(source.find("/exchange"), h5py.Group)
+        return ["data-exchange" if exchange else "nxtomo"]
+    kind = _BY_SUFFIX.get(path.suffix.lower())
+    return [kind] if kind else []

@@ -1,0 +1,72 @@
+"""What R2-Gaussian's, PhyRadGS's and NAF's files share: TIGRE's frame, with images and volumes turned.
+
+Projections are stored [v, u] with row 0 at +z, volumes [x, y, z]; angles are the gantry's, in radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers.fields import Fields
+
+ROW_0 = "top"
+
+
+def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
+    """The cone of a scanner's table; its lengths count in ``unit_mm``.
+
+    ``nDetector``, ``sDetector`` and ``dDetector`` run [v, u], ``offDetector`` [u, v].
+    """
+    mode = scanner.word("mode", default="cone")
+    if mode != "cone":
+        raise InputError(scanner.name("mode"), repr(mode), "'cone'", "parallel beams have no source distance")
+    to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
+    if to_detector <= to_axis:
+        raise InputError(scanner.name("DSD"), f"{to_detector:g}", f"more than DSO ({to_axis:g})")
+    rows, columns = scanner.counts("nDetector", 2)
+    pitch = pitches(scanner, "Detector", (rows, columns))
+    offset_u, offset_v = offset(scanner, "offDetector", 2)
+    return ConeGeometry(
+        to_axis * unit_mm,
+        to_detector * unit_mm,
+        (rows, columns),
+        (float(pitch[0] * unit_mm), float(pitch[1] * unit_mm)),
+        (float(offset_v * unit_mm), float(offset_u * unit_mm)),
+    )
+
+
+def read_grid(scanner: Fields, unit_mm: float) -> Grid:
+    """The voxel grid of a scanner's table, whose triples run [x, y, z]."""
+    counts = scanner.counts("nVoxel", 3)
+    size = pitches(scanner, "Voxel", counts) * unit_mm
+    origin = offset(scanner, "offOrigin", 3) * unit_mm
+    return Grid(tuple(counts[::-1]), tuple(size[::-1].tolist()), tuple(origin[::-1].tolist()))
+
+
+def pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
+    """Size of one pixel or voxel along each axis: dDetector or dVoxel, else the whole size over the count."""
+    if scanner.has(f"d{what}"):
+        return scanner.lengths(f"d{what}", len(counts))
+    return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)
+
+
+def offset(scanner: Fields, key: str, count: int) -> np.ndarray:
+    """(count,) lengths, 0 where the table has none; a third number of offDetector is not used."""
+    if not scanner.has(key):
+        return np.zeros(count)
+    values = scanner.numbers(key)
+    if len(values) < count:
+        raise InputError(scanner.name(key), f"{len(values)} values", f"{count} numbers")
+    return values[:count]
+
+
+def turned_volume(culprit: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
+    """A stored volume [x, y, z] as (z, y, x) float32 in 1/mm."""
+    checks.shape(culprit, volume, grid.shape[::-1])
+    checks.finite(culprit, volume)
+    turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
+    return np.ascontiguousarray(turned, np.float32)

@@ -1,0 +1,105 @@
+"""From a list of angles, and what is known about time, to shutter, trajectory and opening times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Shutter
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.options import ImportOptions, option_name
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """When frames were taken. ``start_s`` (F,) opening of each first-read line; ``is_fly``: the gantry never stops.
+
+    ``angle_at``: what a frame's stored angle belongs to, "start" or "middle" of its first line's exposure.
+    """
+
+    shutter: Shutter
+    start_s: np.ndarray
+    is_fly: bool
+    angle_at: str = "start"
+
+    @property
+    def angle_time_s(self) -> np.ndarray:
+        """(F,): the moments that the stored angles belong to."""
+        return self.start_s + (self.shutter.exposure_s / 2 if self.angle_at == "middle" else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredTiming:
+    """What a format itself says; None where it is silent. ``start_s`` (F,) means that the gantry did not stop."""
+
+    exposure_s: float | None = None
+    readout_s: float | None = None
+    frame_time_s: float | None = None
+    start_s: np.ndarray | None = None
+    axis: str = "rows"
+    direction: int = 1
+    pulse: tuple[float, float] | None = None  # in exposures, as the scanner's TOML gives it
+    angle_at: str = "start"
+
+
+def make_timing(
+    culprit: str, frames: int, options: ImportOptions, stored: StoredTiming | None = None
+) -> Timing:
+    """Timing of ``frames`` frames; the options win over what is stored.
+
+    Start times, or the time from frame to frame, say that the gantry turned all the while; then there must be an
+    exposure. Without them every frame is taken at rest.
+    """
+    stored = stored or StoredTiming()
+    exposure_s = _first(options.exposure_s, stored.exposure_s, 0.0)
+    readout_s = _first(options.readout_s, stored.readout_s, 0.0)
+    direction = stored.direction if options.readout_direction is None else options.readout_direction
+    pulse_s = tuple(part * exposure_s for part in stored.pulse) if stored.pulse and exposure_s > 0 else None
+    shutter = Shutter(exposure_s, readout_s, options.readout_axis or stored.axis, direction, pulse_s)
+    angle_at = options.angle_at or stored.angle_at
+    frame_time_s = _first(options.frame_time_s, stored.frame_time_s, None)
+    if options.frame_time_s is None and stored.start_s is not None:
+        start_s = np.asarray(stored.start_s, np.float64)
+        checks.shape(f"{culprit} start times", start_s, (frames,))
+    elif frame_time_s is not None:
+        start_s = np.arange(frames) * frame_time_s
+    else:
+        return Timing(shutter, np.arange(frames) * max(shutter.span_s, 1.0), False, angle_at)
+    _check_flight(culprit, shutter, start_s)
+    return Timing(shutter, start_s, True, angle_at)
+
+
+def turning(geometry: ConeGeometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
+    """A circular orbit through gantry angles (F,), each frame at the mean speed around it.
+
+    A frame's speed is the slope of the angles over time there (one-sided at both ends); equal angles at start and
+    end of the exposure where the gantry stands.
+    """
+    angle_rad = np.asarray(angle_rad, np.float64)
+    exposure_s = timing.shutter.exposure_s
+    if not timing.is_fly:
+        return CircularOrbit(geometry, FrameSweeps(timing.start_s, exposure_s, angle_rad, angle_rad))
+    unwrapped = np.unwrap(angle_rad)
+    speed = np.gradient(unwrapped, timing.angle_time_s)
+    first = unwrapped - speed * (timing.angle_time_s - timing.start_s)
+    return CircularOrbit(geometry, FrameSweeps(timing.start_s, exposure_s, first, first + speed * exposure_s))
+
+
+def _first(*values: float | None) -> float | None:
+    return next((value for value in values if value is not None), None)
+
+
+def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray) -> None:
+    if shutter.exposure_s <= 0:
+        raise InputError(
+            f"{culprit} exposure",
+            "none, with a gantry that does not stop",
+            "a time above 0 s",
+            f"say {option_name('exposure_s')}, or leave the frame time out for frames taken at rest",
+        )
+    checks.finite(f"{culprit} start times", start_s)
+    if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):
+        found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"
+        raise InputError(f"{culprit} start times", found, "at least two frames, one after the other in time")

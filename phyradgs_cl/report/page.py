@@ -1,0 +1,149 @@
+"""A reconstruction as one HTML page that needs nothing but itself."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl import __version__
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.report import sections
+from phyradgs_cl.report.facts import label, number
+from phyradgs_cl.report.markup import Markup, element, joined, raw_text
+from phyradgs_cl.report.projections import View, computed_views
+from phyradgs_cl.report.run import Run, load_run
+from phyradgs_cl.runtime import Runtime
+
+DEFAULT_VIEWS = 3
+_HEADINGS = ("slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance")
+
+
+@np.errstate(all="ignore")  # absurd values are shown as they are
+def write_report(
+    volume: Path,
+    output: Path,
+    make_runtime: Callable[[], Runtime],
+    *,
+    scan: Path | None = None,
+    views: int = DEFAULT_VIEWS,
+) -> Run:
+    """Writes the page of a volume file, whole or not at all; returns what was found for it.
+
+    Args:
+        volume: a volume file of ours.
+        output: the page.
+        make_runtime: gives the device that projects the volume; not asked without a scan or with ``views`` 0.
+        scan: its scan; None takes the one that the volume's provenance names, if it is there unchanged.
+        views: frames that are projected from the volume and compared with the measurement.
+
+    Raises:
+        InputError: files that cannot be read, or are of another kind; an output that is one of them.
+        OutputError: the page cannot be written.
+        DeviceError: no device to project with.
+    """
+    check_writable(output)
+    run = load_run(volume, scan)
+    for path in (volume, run.scan_path):
+        if path is not None and Path(output).resolve() == path.resolve():
+            raise InputError("-o", f"the input file {path} itself", "another file to write")
+    shown = computed_views(run, make_runtime(), views) if run.scan is not None and views > 0 else []
+    page = report_page(run, shown)
+    with written_beside(output) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return run
+
+
+def report_page(run: Run, views: Sequence[View] = ()) -> str:
+    """The page as text; ``views`` as from ``computed_views``."""
+    parts = {
+        "slices": sections.slices_section(run),
+        "metrics": sections.metrics_section(run, views),
+        "convergence": sections.convergence_section(run),
+        "projections": sections.projections_section(run, views),
+        "scan": sections.scan_section(run),
+        "geometry": sections.geometry_section(run),
+        "shutter": sections.shutter_section(run),
+        "provenance": sections.provenance_section(run),
+    }
+    there = {name: parts[name] for name in _HEADINGS if parts[name] is not None}
+    links = [element("a", name.capitalize(), href=f"#{name}") for name in there]
+    skip = element("a", "To the content", href="#slices", class_="skip")
+    body = joined(
+        skip,
+        element("header", *_top(run), element("nav", *links, aria_label="Sections")),
+        element("main", *_in_pairs(there)),
+        element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
+    )
+    return "<!doctype html>\n" + element("html", _head(_title(run)), _body(body), lang="en") + "\n"
+
+
+def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
+    """The sections; two that need half the width side by side where there is room."""
+    narrow = [part for name in ("metrics", "convergence") if (part := there.get(name)) is not None]
+    pair = element("div", *narrow, class_="pair") if narrow else Markup()
+    rest = {name: part for name, part in there.items() if name not in ("metrics", "convergence")}
+    return [rest.pop("slices"), pair, *rest.values()]
+
+
+def _head(title: str) -> Markup:
+    """Styles and a policy that lets nothing in: no network, no script but the page's own."""
+    digest = base64.b64encode(hashlib.sha256(_file("page.js").encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    policy += "; base-uri 'none'; form-action 'none'"
+    return element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=policy),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", title),
+        raw_text("style", _file("page.css")),
+    )
+
+
+def _body(content: Markup) -> Markup:
+    return element("body", content, raw_text("script", _file("page.js")))
+
+
+def _title(run: Run) -> str:
+    method = run.stored.provenance.get("method", "volume")
+    return f"{run.path.name} – {method}"
+
+
+def _top(run: Run) -> list[Markup]:
+    title = run.scan.title if run.scan is not None else run.path.name
+    motion = f", motion {run.motion.name}" if run.motion is not None else ""
+    method = run.stored.provenance.get("method", "unknown method")
+    told = f"{run.path.name}: {method}{motion}"
+    if run.scan_path is not None:
+        told += f", from {run.scan_path.name}"
+    notes = [element("p", note, class_="warning", role="note") for note in run.notes]
+    tiles = [element("li", element("b", value), element("span", name)) for name, value in _tiles(run)]
+    return [element("h1", title), element("p", told), *notes, element("ul", *tiles, class_="tiles")]
+
+
+def _tiles(run: Run) -> list[tuple[str, str]]:
+    """The numbers that one asks for first."""
+    tiles = [("method", str(run.stored.provenance.get("method", "unknown"))[:40])]
+    psnr, ssim = run.metrics.get("psnr_db"), run.metrics.get("ssim")
+    if isinstance(psnr, int | float):
+        tiles.append(("PSNR", f"{psnr:.2f} dB"))
+    if isinstance(ssim, int | float):
+        tiles.append(("SSIM", f"{ssim:.4f}"))
+    if run.record and (names := [k for k in run.record[-1] if k in ("loss", "residual")]):
+        tiles.append((f"last {label(names[0])}", number(run.record[-1][names[0]])))
+    gaussians, seconds = (run.stored.provenance.get(key) for key in ("gaussians", "seconds"))
+    if isinstance(gaussians, int) and gaussians > 0:
+        tiles.append(("Gaussians", f"{gaussians:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")))
+    if isinstance(seconds, int | float):
+        tiles.append(("run time", f"{number(float(seconds))} s"))
+    return tiles
+
+
+def _file(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")

@@ -1,0 +1,60 @@
+"""PNG pictures of 8-bit values, grey or by a table of colours, and the tables."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
+
+
+def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
+    """A PNG of an image (rows, columns) uint8, row 0 at the top.
+
+    colours: (256, 3) uint8, what every value looks like; None is grey.
+    """
+    rows, columns = image.shape
+    kind = 0 if colours is None else 3
+    # No filter: slices are small, and a page opens as fast.
+    lines = np.zeros((rows, columns + 1), np.uint8)
+    lines[:, 1:] = image
+    header = struct.pack(">IIBBBBB", columns, rows, 8, kind, 0, 0, 0)
+    palette = b"" if colours is None else _chunk(b"PLTE", colours.tobytes())
+    body = _chunk(b"IDAT", zlib.compress(lines.tobytes(), 9))
+    return _SIGNATURE + _chunk(b"IHDR", header) + palette + body + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    check = struct.pack(">I", zlib.crc32(kind + content))
+    return struct.pack(">I", len(content)) + kind + content + check
+
+
+def data_uri(png: bytes) -> str:
+    """The address of a picture that is in the page itself."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
+    """Values (any shape) as 0 to 255 from ``low`` to ``high``, clipped; what overflowed on its way here is 0."""
+    span = high - low if high > low else 1.0
+    share = np.nan_to_num((image.astype(np.float64) - low) / span)
+    return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
+
+
+def upright(image: NDArray[np.generic]) -> NDArray[np.generic]:
+    """An image (rows, columns) whose row 0 is the lowest, as a picture, whose row 0 is the top."""
+    return np.ascontiguousarray(image[::-1])
+
+
+def diverging() -> NDArray[np.uint8]:
+    """Colours (256, 3) from blue over white, in the middle, to red: for differences."""
+    at = np.linspace(-1, 1, 256)[:, None]
+    ends = np.where(at < 0, np.array(_BLUE), np.array(_RED))
+    # The root makes small differences visible, as a white page swallows them.
+    mixed = np.array(_WHITE) + np.abs(at) ** 0.8 * (ends - np.array(_WHITE))
+    return np.rint(mixed).astype(np.uint8)

@@ -1,0 +1,71 @@
+"""A picture of a volume's three middle slices, for a look at a run that is under way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl import checks
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import written_beside
+from phyradgs_cl.report.png import bytes_of, png_bytes, upright
+
+_GAP = 4  # pixels between slices
+_SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
+_PERCENTILE = 99.9  # a few hot voxels would make the rest dark
+
+
+def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
+    """Writes a grey PNG of the middle slices, axial, coronal and sagittal from left to right, whole or not at all.
+
+    Args:
+        volume: (nz, ny, nx) in 1/mm; y (axial) and z (the others) point up, x, x and y to the right.
+        grid: its grid; slices have their true proportions.
+        path: file to write.
+
+    Raises:
+        InputError: a volume that does not fit its grid, NaN or infinity.
+        OutputError: the file cannot be written.
+    """
+    checks.shape("volume", volume, grid.shape)
+    checks.finite("volume", volume)
+    picture = png_bytes(preview_image(volume, grid))
+    with written_beside(path) as temporary:
+        temporary.write_bytes(picture)
+
+
+def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:
+    """The picture (rows, columns) uint8, row 0 at the top; the slices stand side by side on one ground line."""
+    low, high = grey_range(volume)
+    per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
+    slices = []
+    for axis in range(3):
+        image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
+        size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
+        slices.append(upright(_resampled(image, [max(1, round(side * per_mm)) for side in size_mm])))
+    height, width = max(s.shape[0] for s in slices), sum(s.shape[1] for s in slices) + 2 * _GAP
+    picture = np.zeros((height, width), np.uint8)
+    left = 0
+    for image in slices:
+        picture[height - image.shape[0] :, left : left + image.shape[1]] = image
+        left += image.shape[1] + _GAP
+    return picture
+
+
+def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
+    """From 0 (or below, where there is no more than that) to a high percentile: what black and white stand for."""
+    high = float(np.percentile(volume, _PERCENTILE))
+    if high > 0:
+        return 0.0, high
+    low, high = float(volume.min()), float(volume.max())
+    return low, high if high > low else low + 1.0
+
+
+def _resampled(image: NDArray[np.uint8], shape: list[int]) -> NDArray[np.uint8]:
+    """The nearest pixel's value at every place: voxels stay visible as such."""
+    rows, columns = (
+        ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(shape, image.shape, strict=True)
+    )
+    return image[rows[:, None], columns]

@@ -1,0 +1,172 @@
+"""The sections of a page, each from a run to HTML; a section that has nothing to show is None."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from phyradgs_cl.report.curve import convergence_charts
+from phyradgs_cl.report.facts import flattened, label, number, shown, unit
+from phyradgs_cl.report.geometry_drawing import orbit_drawing, side_drawing
+from phyradgs_cl.report.markup import Markup, element, joined
+from phyradgs_cl.report.png import bytes_of, data_uri, diverging, png_bytes, upright
+from phyradgs_cl.report.projections import TIMES_A_LINE, View
+from phyradgs_cl.report.run import Run
+from phyradgs_cl.report.shutter_drawing import frames_drawing, shutter_drawing, shutter_words
+from phyradgs_cl.report.slices import planes_of, windows_of
+from phyradgs_cl.report.viewer import viewer
+
+_MOST_ROWS = 400  # of provenance
+
+
+def slices_section(run: Run) -> Markup:
+    """The volume, or the volume against the truth."""
+    stored = run.stored
+    windows = windows_of(stored.volume, run.reference)
+    planes = planes_of(stored.volume, run.reference, stored.grid, windows)
+    size = " × ".join(number(side) for side in stored.grid.size_mm)
+    told = f"{' × '.join(map(str, stored.grid.shape))} voxels (z, y, x), {size} mm"
+    left_out = any(len(plane.indices) < plane.count for plane in planes)
+    told += "; the page has evenly chosen slices of them" if left_out else ""
+    return _section("slices", "Slices", element("p", told + ".", class_="note"), viewer(planes, windows))
+
+
+def metrics_section(run: Run, views: Sequence[View]) -> Markup | None:
+    """Numbers against the truth, and against the measurement where frames were computed."""
+    facts: dict[str, object] = dict(run.metrics)
+    if run.reference is not None:
+        error = run.stored.volume.astype(np.float64) - run.reference
+        facts["root_mean_square_error_per_mm"] = float(np.sqrt(np.mean(error**2)))
+        facts["mean_error_per_mm"] = float(np.mean(error))
+    if views:
+        facts["residual_of_the_shown_frames"] = float(np.sqrt(np.mean([view.rms**2 for view in views])))
+    if not facts:
+        return None
+    told = "Against the reference that the scan carries." if run.reference is not None else None
+    return _section("metrics", "Metrics", told and element("p", told, class_="note"), facts_table(facts))
+
+
+def convergence_section(run: Run) -> Markup | None:
+    charts = convergence_charts(run.record)
+    if not charts:
+        return None
+    return _section("convergence", "Convergence", _charts(charts))
+
+
+def scan_section(run: Run) -> Markup | None:
+    if run.scan is None:
+        return None
+    facts = {k: v for k, v in run.scan_facts.items() if k != "sha256"}
+    return _section("scan", "Scan", element("div", facts_table(facts), class_="columns"))
+
+
+def geometry_section(run: Run) -> Markup | None:
+    if run.scan is None:
+        return None
+    above = "From above: where the source stands in the middle of every frame"
+    above += (
+        ", and the arc through which it moves in the first; grey, the panel at the arc's end."
+        if run.scan.is_fly
+        else "."
+    )
+    charts = [
+        (above, orbit_drawing(run.scan)),
+        ("From the side: the cone of the first frame.", side_drawing(run.scan)),
+    ]
+    return _section("geometry", "Geometry", _charts(charts))
+
+
+def shutter_section(run: Run) -> Markup | None:
+    if run.scan is None:
+        return None
+    words = shutter_words(run.scan)
+    one = words[0].upper() + words[1:] + "."
+    if run.motion is not None:
+        one += f" {_motion_words(run)}"
+    several = "The first frames on one axis of time."
+    charts = [(one, shutter_drawing(run.scan, run.motion)), (several, frames_drawing(run.scan))]
+    return _section("shutter", "Shutter in space and time", _charts(charts))
+
+
+def projections_section(run: Run, views: Sequence[View]) -> Markup | None:
+    """Measured, computed and residual frames; one range of grey values for all, one of residuals."""
+    if not views or run.scan is None:
+        return None
+    low = min(0.0, *(float(v.measured.min()) for v in views))
+    high = max(float(v.measured.max()) for v in views)
+    limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
+    shape = run.scan.geometry.detector_shape
+    proportion = (
+        shape[1] * run.scan.geometry.pixel_size_mm[1],
+        shape[0] * run.scan.geometry.pixel_size_mm[0],
+    )
+    told = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
+    told += f"blue −{number(limit)}, red +{number(limit)}. "
+    if run.scan.is_fly:
+        told += f"Every line is computed from the volume at {TIMES_A_LINE} times of its own exposure."
+    else:
+        told += "Every frame is computed from its one pose."
+    rows = [_view(view, (low, high), limit, proportion) for view in views]
+    return _section("projections", "Projections", element("p", told, class_="note"), *rows)
+
+
+def provenance_section(run: Run) -> Markup:
+    """Everything that the volume file keeps about its making, but the convergence record."""
+    facts = {k: v for k, v in run.stored.provenance.items() if k not in ("record", "options")}
+    options = run.stored.provenance.get("options")
+    parts: list[object] = [facts_table(facts)]
+    if isinstance(options, Mapping):
+        told = element("summary", "All options of the method")
+        parts.append(element("details", told, facts_table(options)))
+    return _section("provenance", "Provenance", *parts)
+
+
+def facts_table(facts: Mapping[str, object]) -> Markup:
+    """A row a fact: name, value with unit."""
+    rows = list(flattened(facts))[:_MOST_ROWS]
+    cells = [(label(key), shown(value, unit(key))) for key, value in rows]
+    lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in cells]
+    return element("table", element("tbody", *lines))
+
+
+def _view(view: View, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
+    residual = png_bytes(upright(bytes_of(view.residual, -limit, limit)), diverging())
+    pictures = [
+        ("measured", png_bytes(upright(bytes_of(view.measured, *window)))),
+        ("computed", png_bytes(upright(bytes_of(view.computed, *window)))),
+        (f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)", residual),
+    ]
+    style = f"aspect-ratio: {proportion[0]:.6g} / {proportion[1]:.6g}"
+    figures = []
+    for words, png in pictures:
+        image = element("img", src=data_uri(png), alt=f"frame {view.frame}, {words}", style=style)
+        figures.append(
+            element("figure", element("div", image, class_="picture"), element("figcaption", words))
+        )
+    return element("div", element("h3", f"Frame {view.frame}"), *figures, class_="view")
+
+
+def _motion_words(run: Run) -> str:
+    motion = run.motion
+    if motion is None:
+        return ""
+    words = {
+        "static": "the dashed line is the one pose of a frame",
+        "static-start": "the dashed line is the one pose of a frame",
+        "micro-views": f"dots are the poses of {motion.strips} strips × {motion.sub_intervals} sub-intervals",
+        "per-row": f"dots are the {motion.sub_intervals} poses of some of the lines",
+        "exact": "dashed lines bound the segments in which Gaussians move",
+    }[motion.name]
+    return f"The run's motion is {motion.name}: {words}."
+
+
+def _charts(charts: Iterable[tuple[str, Markup]]) -> Markup:
+    figures = [element("figure", drawing, element("figcaption", words)) for words, drawing in charts]
+    return element("div", *figures, class_="charts")
+
+
+def _section(identifier: str, heading: str, *content: object) -> Markup:
+    title = element("h2", heading, id=f"{identifier}-heading")
+    body = joined(*(part for part in content if part))
+    return element("section", title, body, id=identifier, aria_labelledby=f"{identifier}-heading")

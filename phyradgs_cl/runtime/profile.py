@@ -1,0 +1,124 @@
+"""Where a run's device time goes: launches, time and bytes by kernel, beside what the device can do at best.
+
+Times are OpenCL events. Bytes are those of a launch's buffers, each counted once: what a kernel has to touch at least if it
+touches all of them. The best is measured on the spot: copies by the driver, multiply-adds by a kernel of ours.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+
+_FOLD_AT = 20_000  # events that are kept at most; folding waits for the queue
+_COPY_BYTES = 1 << 26
+_STEPS = 20_000
+_REPEATS = 5
+
+
+@dataclass
+class KernelUse:
+    """One kernel's share of a run."""
+
+    launches: int = 0
+    seconds: float = 0.0
+    bytes: int = 0
+
+
+class Profile:
+    """Collects the events of a queue with profiling."""
+
+    def __init__(self) -> None:
+        self._events: list[tuple[str, cl.Event, int]] = []
+        self._uses: dict[str, KernelUse] = defaultdict(KernelUse)
+
+    def add(self, name: str, event: cl.Event, nbytes: int) -> None:
+        self._events.append((name, event, nbytes))
+        if len(self._events) >= _FOLD_AT:
+            self._fold()
+
+    def uses(self) -> dict[str, KernelUse]:
+        """By kernel, the longest first, since the last call."""
+        self._fold()
+        found = dict(sorted(self._uses.items(), key=lambda item: -item[1].seconds))
+        self._uses = defaultdict(KernelUse)
+        return found
+
+    def _fold(self) -> None:
+        for name, event, nbytes in self._events:
+            event.wait()
+            use = self._uses[name]
+            use.launches += 1
+            use.seconds += (event.profile.end - event.profile.start) * 1e-9
+            use.bytes += nbytes
+        self._events.clear()
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What the device reached in this program: bytes moved (read and written) and floating-point operations a second."""
+
+    copy_bytes_per_s: float
+    flops_per_s: float
+
+
+def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs: dict[str, int]) -> str:
+    """A table of ``uses`` (Profile.uses), the longest first, and the share of ``wall_s`` that all of them fill.
+
+    ``pairs``: Gaussian–pixel pairs that one launch of a kernel evaluates, where that is known.
+    """
+    busy_s = sum(use.seconds for use in uses.values())
+    heads = ("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")
+    rows = [heads]
+    for name, use in uses.items():
+        speed = use.bytes / use.seconds if use.seconds > 0 else 0.0
+        evaluated = pairs.get(name, 0) * use.launches
+        rows.append(
+            (
+                name,
+                str(use.launches),
+                f"{use.seconds:.3f}",
+                f"{use.seconds / max(busy_s, 1e-12):.1%}",
+                f"{1e3 * use.seconds / use.launches:.3f}",
+                f"{speed / 1e9:.1f}",
+                f"{speed / rates.copy_bytes_per_s:.0%}",
+                f"{evaluated / use.seconds / 1e9:.2f}" if evaluated else "",
+                f"{1e9 * use.seconds / evaluated:.3f}" if evaluated else "",
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
+    lines = [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in rows
+    ]
+    lines.append(
+        f"kernels {busy_s:.2f} s of {wall_s:.2f} s ({busy_s / max(wall_s, 1e-12):.0%}); best measured here: "
+        f"copy {rates.copy_bytes_per_s / 1e9:.1f} GB/s, multiply-add {rates.flops_per_s / 1e9:.0f} Gflop/s"
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def measure_rates(
+    queue: cl.CommandQueue, multiply_add: cl.Kernel, lanes: int, units: int, group: int
+) -> Rates:
+    """Both rates, the best of a few runs; ``queue`` needs profiling."""
+    context = queue.context
+    source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
+    cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)
+    copies = [cl.enqueue_copy(queue, target, source, byte_count=_COPY_BYTES) for _ in range(_REPEATS)]
+    items = max(units, 1) * 16 * max(group, 1)
+    steps = _STEPS if lanes > 1 else _STEPS // 4
+    out = cl.Buffer(context, cl.mem_flags.READ_WRITE, 4 * items)
+    multiply_add.set_args(np.int32(steps), np.float32(0.75), out)
+    sums = [cl.enqueue_nd_range_kernel(queue, multiply_add, (items,), (group,)) for _ in range(_REPEATS)]
+    queue.finish()
+    best_copy_s, best_sum_s = (min(_seconds(e) for e in events) for events in (copies, sums))
+    return Rates(2 * _COPY_BYTES / best_copy_s, 16.0 * lanes * steps * items / best_sum_s)
+
+
+def _seconds(event: cl.Event) -> float:
+    return max((event.profile.end - event.profile.start) * 1e-9, 1e-9)

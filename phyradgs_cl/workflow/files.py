@@ -1,0 +1,113 @@
+"""Files by what they are: scans, references and volumes, and what each says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import (
+    file_kind,
+    read_scan,
+    read_volume,
+    scan_summary,
+    volume_summary,
+)
+from phyradgs_cl.phantoms import load_volume
+
+_KINDS = {
+    "scan": "a scan",
+    "volume": "a volume of phyradgs-cl",
+    "plain-volume": "a bare volume (dataset /volume)",
+}
+
+
+def load_scan(path: str | Path) -> Scan:
+    """A scan file as line integrals; see ``io.read_scan``."""
+    with expecting(path, "scan"):
+        return read_scan(path, counts_to_attenuation)
+
+
+@contextmanager
+def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
+    """An InputError of the body about a file of another kind than ``kinds`` says just that."""
+    try:
+        yield
+    except InputError as error:
+        found = None
+        with suppress(InputError):
+            found = file_kind(path)
+        if found is None or found in kinds:
+            raise
+        expected = " or ".join(_KINDS[kind] for kind in kinds)
+        remedy = "see 'phyradgs info' for what a file holds"
+        raise InputError(str(path), _KINDS[found], expected, remedy) from error
+
+
+def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
+    """An output that is one of the inputs would destroy it."""
+    for path in inputs:
+        if Path(output).resolve() == Path(path).resolve():
+            raise InputError(option, f"the input file {path} itself", "another file to write")
+
+
+def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
+    """The reference in a scan, a volume file, or a bare /volume dataset (which has no grid)."""
+    kind = file_kind(path)
+    if kind == "scan":
+        scan = load_scan(path)
+        if scan.reference is None:
+            raise InputError(
+                f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth"
+            )
+        return scan.reference, scan.grid
+    if kind == "volume":
+        stored = read_volume(path)
+        return stored.volume, stored.grid
+    from_file = _bare_volume(path)
+    return from_file, None
+
+
+def summary(path: Path) -> dict[str, object]:
+    """Facts about a scan or volume file for people."""
+    kind = file_kind(path)
+    if kind == "scan":
+        return {"kind": "scan", **scan_summary(path)}
+    if kind == "volume":
+        facts = volume_summary(path)
+        provenance = dict(facts.pop("provenance", {}) or {})
+        provenance.pop("record", None)
+        options = provenance.pop("options", None)
+        return {"kind": "volume", **facts, **_asked_for(options), **provenance}
+    volume = _bare_volume(path)
+    return {
+        "kind": "bare volume",
+        "shape": volume.shape,
+        "minimum": float(volume.min()),
+        "maximum": float(volume.max()),
+    }
+
+
+def _asked_for(options: object) -> dict[str, object]:
+    """What a run was asked for, in words; the file has every option."""
+    if not isinstance(options, Mapping):
+        return {}
+    told: dict[str, object] = {}
+    motion = options.get("motion")
+    if isinstance(motion, Mapping):
+        strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
+        counts = {"micro-views": f" {strips} × {sub_intervals}", "per-row": f", {sub_intervals} times a line"}
+        told["motion"] = f"{motion.get('name')}{counts.get(str(motion.get('name')), '')}"
+    if "iterations" in options:
+        told["iterations_asked"] = options["iterations"]
+    return told
+
+
+def _bare_volume(path: Path) -> np.ndarray:
+    return load_volume(path).volume

@@ -1,0 +1,228 @@
+"""From a scan file to a volume file, with checkpoints on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import __version__, checks
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.io import (
+    check_writable,
+    checkpoint_path,
+    only_run,
+    read_checkpoint,
+    sha256_of,
+    write_checkpoint,
+    write_volume,
+)
+from phyradgs_cl.metrics import compare
+from phyradgs_cl.reconstructors import (
+    METHODS,
+    InputOptions,
+    Progress,
+    ProgressReport,
+    Reconstruction,
+    State,
+    method_options,
+    reconstruct,
+)
+from phyradgs_cl.reconstructors.interrupt import (
+    InterruptedAfterwards,
+    finish_despite_interrupt,
+    keep_finished_work,
+)
+from phyradgs_cl.reconstructors.system import averages
+from phyradgs_cl.runtime import Runtime, profile_text
+from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ReconstructionJob:
+    """Which scan to reconstruct by which method into which file."""
+
+    scan: Path
+    output: Path
+    method: str = "phyradgs"
+    preset: str | None = None
+    changes: Mapping[str, Any] | None = None
+    seed: int = 0
+    resume: bool = False
+    config: Path | None = None
+    before: InputOptions = InputOptions()
+    checkpoint_every_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        checks.within("--checkpoint-every (seconds)", self.checkpoint_every_s, 0, 1e9)
+
+
+class _Keeper:
+    """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end.
+
+    There is one checkpoint a run: it is replaced in one step, so that a kill at any moment leaves the last whole one. Where
+    it cannot be written the run goes on, since that is what the work is worth.
+    """
+
+    def __init__(self, path: Path, fingerprint: str, every_s: float, report: ProgressReport) -> None:
+        self.path, self.fingerprint, self.every_s, self.report = path, fingerprint, every_s, report
+        self.last_s = time.monotonic()
+        self.failed = False
+
+    def __call__(self, progress: Progress) -> None:
+        self.report(progress)
+        due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
+        if due and progress.state is not None and progress.iteration < progress.iterations:
+            self._keep(dict(progress.state()))
+            self.last_s = time.monotonic()
+
+    def _keep(self, state: dict[str, np.ndarray]) -> None:
+        try:
+            write_checkpoint(self.path, state, self.fingerprint)
+        except OutputError as error:
+            if not self.failed:
+                log.warning("no checkpoint: %s", error)
+            self.failed = True
+
+
+@np.errstate(all="ignore")
+def run_reconstruction(
+    job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
+) -> tuple[Reconstruction, dict[str, float]]:
+    """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
+
+    An interrupted run writes the volume as far as it got, and a checkpoint beside it that ``resume`` continues; a run
+    that is killed leaves its last checkpoint. Raises OutputError while another run is at work on the same output.
+    """
+    options = method_options(job.method, job.preset, job.changes)
+    check_writable(job.output)
+    refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
+    with only_run(job.output):
+        return _reconstructed(job, options, make_runtime, report)
+
+
+def _reconstructed(
+    job: ReconstructionJob, options: Any, make_runtime: Callable[[], Runtime], report: ProgressReport
+) -> tuple[Reconstruction, dict[str, float]]:
+    scan = load_scan(job.scan)
+    scan.check_timing()
+    _warn_of_doubts(job, scan, options)
+    rt = make_runtime()
+    scan_hash = sha256_of(job.scan)
+    fingerprint = _fingerprint(scan_hash, job, options)
+    extra: dict[str, Any] = {"before": job.before}
+    if job.resume:
+        extra["resume"] = _resumed(job, fingerprint)
+    keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
+    result: Reconstruction | None = None
+    try:
+        with keep_finished_work():
+            result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=keeper, **extra)
+            with finish_despite_interrupt():
+                metrics = compare(result.volume, scan.reference) if scan.reference is not None else {}
+                _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
+                _keep_checkpoint(job, result, fingerprint)
+    except InterruptedAfterwards:
+        if result is None or result.state is None:  # else told already, in the result
+            raise
+    return result, metrics  # type: ignore[return-value]
+
+
+def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
+    """Says what can be reconstructed, but is hardly what was meant."""
+    motion: Motion = options.motion
+    if (
+        scan.detector_model == "intensity"
+        and not hasattr(options, "detector_model")
+        and _averages(scan, options)
+    ):
+        found = "%s averages intensity over an exposure; --method %s averages line integrals"
+        log.warning(found, job.scan, job.method)
+    if scan.is_fly and motion.name == "micro-views" and motion.strips > scan.lines:
+        found = "%d strips are more than the %d lines of %s: a strip a line is the most there is"
+        log.warning(found, motion.strips, scan.lines, job.scan)
+    late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
+    if scan.is_fly and late.size:
+        found = (
+            "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
+        )
+        log.warning(found, job.scan, late[0] + 1, late[0])
+    if (largest := float(scan.projections.max())) <= 0:
+        found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
+        log.warning("%s: %s: there is no object in it, or the sign is wrong", job.scan, found)
+
+
+def _averages(scan: Scan, options: Any) -> bool:
+    """Whether the method merges several poses into a line: of one pose, both detector models are the same."""
+    if options.motion.name == "exact":
+        return scan.is_fly
+    return getattr(options, "has_sub_intervals", True) and averages(options.motion.cells(scan, 0))
+
+
+def profile_report(rt: Runtime, result: Reconstruction) -> str:
+    """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
+    uses = rt.kernel_uses()
+    pairs = {str(name): int(n) for name, n in dict(result.facts.get("evaluated_pairs", {})).items()}  # type: ignore[call-overload]
+    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)  # type: ignore[arg-type]
+
+
+def _write_result(
+    job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
+) -> None:
+    cloud = result.gaussians
+    arrays = None
+    if cloud is not None:
+        names = ("mean", "scale", "quaternion", "density")
+        arrays = {name: np.asarray(getattr(cloud, name), np.float32) for name in names}
+    write_volume(job.output, result.volume, result.grid, provenance, arrays, metrics or None)
+
+
+def _provenance(
+    result: Reconstruction, scan_hash: str, job: ReconstructionJob, rt: Runtime
+) -> dict[str, object]:
+    return {
+        **result.facts,
+        "program": f"phyradgs-cl {__version__}",
+        "python": platform.python_version(),
+        "device": rt.device.name,
+        "device_version": rt.device.version,
+        "seed": job.seed,
+        "input": asdict(job.before),
+        "scan": str(job.scan),
+        "scan_sha256": scan_hash,
+        "record": result.record,
+    }
+
+
+def _fingerprint(scan_hash: str, job: ReconstructionJob, options: object) -> str:
+    text = json.dumps([scan_hash, job.method, repr(options), repr(job.before), job.seed])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
+    resumable = [name for name, method in METHODS.items() if method.is_resumable]
+    if job.method not in resumable:
+        raise InputError(
+            "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(resumable)}"
+        )
+    return read_checkpoint(checkpoint_path(job.output), fingerprint)
+
+
+def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
+    path = checkpoint_path(job.output)
+    if result.state is None:
+        with suppress(OSError):  # the volume is there, whatever lies in the checkpoint's place
+            path.unlink()
+    else:
+        write_checkpoint(path, dict(result.state), fingerprint)

@@ -1,0 +1,79 @@
+"""Scans and reconstructions from Python."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phyradgs_cl import api
+from phyradgs_cl.errors import InputError
+
+
+def test_every_exported_name_is_there() -> None:
+    assert api.__all__ == sorted(api.__all__)
+    assert all(hasattr(api, name) for name in api.__all__)
+
+
+def test_a_scan_goes_to_a_file_and_back(scan, tmp_path) -> None:
+    api.save_scan(tmp_path / "scan.h5", scan)
+    again = api.load_scan(tmp_path / "scan.h5")
+    assert np.array_equal(again.projections, scan.projections)
+    assert np.array_equal(again.reference, scan.reference) and again.shutter == scan.shutter
+
+
+@pytest.mark.parametrize("method", ["sart", "phyradgs"])
+def test_a_reconstruction_goes_to_a_file_and_back(rt, scan, tmp_path, method) -> None:
+    result = api.reconstruct(scan, method, iterations=2, device=rt)
+    metrics = api.compare(result.volume, scan.reference)
+    api.save_volume(tmp_path / "volume.h5", result, metrics)
+    again = api.load_volume(tmp_path / "volume.h5")
+    assert np.array_equal(again.volume, result.volume) and again.grid == result.grid
+    assert again.record == result.record and again.facts["method"] == method
+    assert (again.gaussians is None) == (method == "sart")
+    if again.gaussians is not None:
+        assert np.allclose(again.gaussians.rows(), result.gaussians.rows(), rtol=1e-6, atol=1e-7)
+
+
+def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
+    result = api.reconstruct(
+        scan, "sart", motion="per-row", sub_intervals=3, iterations=1, median_filter=3, device=rt
+    )
+    plain = api.reconstruct(scan, "sart", motion="per-row", sub_intervals=3, iterations=1, device=rt)
+    assert result.facts["options"]["motion"]["sub_intervals"] == 3
+    assert not np.array_equal(result.volume, plain.volume)
+    nested = api.reconstruct(scan, "phyradgs", iterations=1, control={"every": 7}, device=rt)
+    assert nested.facts["options"]["control"]["every"] == 7
+
+
+def test_a_simulation_takes_the_options_of_the_command(rt, scan) -> None:
+    assert scan.projections.shape == (6, 20, 20) and scan.grid.shape == (12, 12, 12)
+    noisy = api.simulate("jaw", size=12, detector=20, noise="beer", dose=100.0, seed=3, views=2, device=rt)
+    still = api.simulate("jaw", size=12, detector=20, protocol="static", views=3, device=rt)
+    assert len(noisy.projections) == 2 and noisy.is_fly and not still.is_fly
+
+
+def test_a_volume_file_can_be_scanned(rt, scan, tmp_path) -> None:
+    result = api.Reconstruction(scan.reference, scan.grid)
+    api.save_volume(tmp_path / "v.h5", result)
+    again = api.simulate(tmp_path / "v.h5", size=6, detector=10, views=2, device=rt)
+    assert again.grid.shape == (6, 6, 6) and again.projections.max() > 0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: api.simulate("foot", dosis=3), "option dosis.*dose"),
+        (lambda: api.simulate("foot", size=0), "size"),
+        (lambda: api.simulate("elbow"), "elbow"),
+        (lambda: api.simulate("foot", protocol="slow"), "protocol"),
+        (lambda: api.load_scan("nowhere.h5"), "nowhere.h5"),
+    ],
+)
+def test_what_is_wrong_is_named(call, words) -> None:
+    with pytest.raises(InputError, match=words):
+        call()
+
+
+def test_an_unknown_option_of_a_method_is_named(scan) -> None:
+    with pytest.raises(InputError, match="iteration.*did you mean"):
+        api.reconstruct(scan, "sart", iteration=3)

@@ -1,0 +1,106 @@
+"""estimate and --profile: what a run would take, and where one spent its time."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from phyradgs_cl import estimate as room
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.estimate import duration, estimate
+from phyradgs_cl.reconstructors import method_options
+from phyradgs_cl.reconstructors.result import Reconstruction
+from phyradgs_cl.workflow import load_scan
+
+SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4"]
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+@pytest.fixture(scope="module")
+def scan(cli, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("estimate") / "scan.h5"
+    assert cli.run([*SIMULATE, "--time-samples", "2", "-o", str(path)]) == 0
+    return path
+
+
+class Clock:
+    """A clock that only reconstructions move: ``start`` seconds each and ``each`` an iteration."""
+
+    def __init__(self, start: float, each: float) -> None:
+        self.now, self.start, self.each, self.iterations = 0.0, start, each, []
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def reconstruct(self, scan, method, rt, options, *, before=None) -> Reconstruction:
+        iterations = getattr(options, "iterations", 1)
+        self.iterations.append(iterations)
+        self.now += self.start + iterations * self.each
+        return None  # nobody looks
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Clock:
+    made = Clock(2.0, 0.25)
+    monkeypatch.setattr(room, "time", made)
+    monkeypatch.setattr(room, "reconstruct", made.reconstruct)
+    return made
+
+
+@pytest.mark.parametrize(("method", "iterations"), [("phyradgs", 3000), ("r2", 7), ("sirt", 40), ("sart", 1)])
+def test_time_is_that_of_a_run_whose_iterations_are_alike(rt, scan, clock, method, iterations) -> None:
+    options = method_options(method, None, {"iterations": iterations})
+    found = estimate(load_scan(scan), method, options, rt)
+    assert found.seconds == pytest.approx(2.0 + 0.25 * iterations)
+    assert found.iterations == iterations
+    assert sum(clock.iterations) <= 200
+
+
+def test_what_has_no_iterations_is_run(rt, scan, clock) -> None:
+    found = estimate(load_scan(scan), "fdk", method_options("fdk"), rt)
+    assert (found.seconds, found.iterations) == (2.25, 0)
+    assert "iterations" not in found.text()
+
+
+def test_memory_is_what_a_run_holds(rt, scan) -> None:
+    rt.reset_peak()
+    before = rt.peak_bytes
+    found = estimate(load_scan(scan), "sirt", method_options("sirt", None, {"iterations": 5}), rt)
+    assert found.device_bytes > before
+    assert found.host_bytes > 10_000_000
+
+
+@pytest.mark.parametrize("method", ["phyradgs", "fista-tv", "fdk"])
+def test_the_command_says_time_and_memory(cli, scan, capsys, method) -> None:
+    assert cli.run(["estimate", str(scan), "--method", method]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"{method} on ")
+    assert re.search(r"^time +\S+ (s|min)", text, re.M) and re.search(r"^memory +\d+ MiB", text, re.M)
+
+
+def test_a_wrong_option_is_named_as_reconstruct_names_it(cli, scan, capsys) -> None:
+    assert cli.run(["estimate", str(scan), "--motion", "per-row"]) == 2
+    assert "--motion" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(8.26, "8.26 s"), (260.0, "4 min 20 s"), (11100.0, "3 h 05 min")]
+)
+def test_durations_for_people(seconds, text) -> None:
+    assert duration(seconds) == text
+
+
+def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
+    output = str(tmp_path / "v.h5")
+    assert cli.run(["reconstruct", str(scan), "-o", output, "--iterations", "5", "--profile"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"^splat_forward +6 ", text, re.M) and re.search(r"^splat_backward +5 ", text, re.M)
+    assert "Gpairs/s" in text and "Gflop/s" in text
+    assert cli.run(["reconstruct", str(scan), "-o", output, "--iterations", "5"]) == 0
+    assert "Gpairs/s" not in capsys.readouterr().out

@@ -1,0 +1,113 @@
+"""Runs that are killed leave their last checkpoint, and go on from it to the bits of a run that was not."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.io import checkpoint_path, read_volume
+from phyradgs_cl.io.lock import lock_path
+
+TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
+RUNS = {
+    "phyradgs": ["--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
+    "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "300"],
+    "cgls": ["--method", "cgls", "--iterations", "300", "--set", "noise_stop=0"],
+    "fista-tv": ["--method", "fista-tv", "--iterations", "200"],
+}
+# STRESS=50 is what `make stress` sets
+KILLS = int(os.environ.get("STRESS", "1"))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scan") / "scan.h5"
+    assert load_cli().run(["simulate", *TINY, "--noise", "tigre", "-o", str(path)]) == 0
+    return path
+
+
+def volume(path: Path) -> np.ndarray:
+    return read_volume(path).volume
+
+
+def command(scan: Path, output: Path, options: list[str]) -> list[str]:
+    """A run that keeps a checkpoint at every report."""
+    start = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(output)]
+    return [*start, *options, "--checkpoint-every", "1e-6"]
+
+
+def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
+    """SIGKILL ``after_s`` seconds after the first new checkpoint, or as the run has ended by itself."""
+    path = checkpoint_path(output)
+    before = path.stat().st_mtime_ns if path.exists() else None
+    process = subprocess.Popen(run, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < deadline:
+        if path.exists() and path.stat().st_mtime_ns != before:
+            break
+        time.sleep(0.002)
+    time.sleep(after_s)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name) -> None:
+    whole, killed = tmp_path / "whole.h5", tmp_path / "killed.h5"
+    subprocess.run(command(scan, whole, RUNS[name]), check=True, capture_output=True)
+    assert list(tmp_path.iterdir()) == [whole]
+    rng = np.random.default_rng(len(name))
+    run = command(scan, killed, RUNS[name])
+    for kill in range(KILLS):
+        kill_in_the_middle(run if kill == 0 else [*run, "--resume"], killed, float(rng.uniform(0, 0.05)))
+        if killed.exists():  # it was too fast: from the start again
+            killed.unlink()
+            run = command(scan, killed, RUNS[name])
+            checkpoint_path(killed).unlink(missing_ok=True)
+            kill_in_the_middle(run, killed, 0.0)
+    resume = ["--resume"] if checkpoint_path(killed).exists() else []
+    subprocess.run([*run, *resume], check=True, capture_output=True)
+    np.testing.assert_array_equal(volume(killed), volume(whole))
+    assert not checkpoint_path(killed).exists() and not lock_path(killed).exists()
+
+
+def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
+    output = tmp_path / "volume.h5"
+    first = subprocess.Popen(
+        command(scan, output, ["--iterations", "100000"]),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not checkpoint_path(output).exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        second = subprocess.run(
+            command(scan, output, ["--method", "fdk"]), capture_output=True, text=True, check=False
+        )
+    finally:
+        first.kill()
+        first.wait()
+    assert second.returncode == 2
+    assert second.stderr.count("\n") == 1 and str(first.pid) in second.stderr and "volume.h5" in second.stderr
+
+
+def test_a_checkpoint_that_cannot_be_written_is_a_warning(scan, tmp_path) -> None:
+    output = tmp_path / "volume.h5"
+    checkpoint_path(output).mkdir()
+    done = subprocess.run(
+        command(scan, output, ["--method", "sirt", "--iterations", "3"]),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0 and done.stderr.count("no checkpoint") == 1
+    assert output.exists()

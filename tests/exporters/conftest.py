@@ -1,0 +1,35 @@
+"""A volume that no flip or exchange of axes leaves as it is, with Gaussians, in a file of ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import write_volume
+
+GRID = Grid((5, 6, 7), (2.0, 1.5, 1.25), (10.0, -4.0, 3.0))
+
+
+def marked() -> np.ndarray:
+    """(z, y, x) float32 in 1/mm: every voxel its own number, one voxel far above all, in no symmetric place."""
+    values = np.random.default_rng(5).uniform(0, 0.03, GRID.shape).astype(np.float32)
+    values[4, 1, 2] = 0.09
+    return values
+
+
+@pytest.fixture
+def volume_file(tmp_path) -> Path:
+    rng = np.random.default_rng(6)
+    quaternion = rng.normal(size=(9, 4))
+    cloud = {
+        "mean": rng.normal(size=(9, 3)).astype(np.float32),
+        "scale": rng.uniform(0.5, 2, (9, 3)).astype(np.float32),
+        "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(np.float32),
+        "density": rng.uniform(0.01, 0.02, 9).astype(np.float32),
+    }
+    path = tmp_path / "volume.h5"
+    write_volume(path, marked(), GRID, {"method": "phyradgs"}, cloud)
+    return path

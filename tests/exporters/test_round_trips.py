@@ -1,0 +1,231 @@
+"""What other programs' own libraries read: the bright voxel at its place in mm, every value, every direction."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import nibabel
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk
+import tifffile
+
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.exporters import EXPORTS, export_volume
+from phyradgs_cl.io import read_volume
+
+MU_WATER = 0.02
+BRIGHT = (4, 1, 2)  # z, y, x
+
+
+@pytest.fixture
+def stored(volume_file):
+    return read_volume(volume_file)
+
+
+def world_mm(stored) -> tuple[float, float, float]:
+    """Where the bright voxel is: x, y, z of this package's world."""
+    z, y, x = (axis[i] for axis, i in zip(stored.grid.axes_mm(), BRIGHT, strict=True))
+    return float(x), float(y), float(z)
+
+
+@pytest.mark.parametrize("to", ["nii", "mha", "nrrd", "dicom"])
+def test_simpleitk_sees_our_millimetres(volume_file, stored, to) -> None:
+    """ITK's physical points are LPS, whatever the file's own frame is."""
+    path = export_volume(volume_file, to)
+    if to == "dicom":
+        names = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(path))
+        image = sitk.ReadImage(names)
+    else:
+        image = sitk.ReadImage(str(path))
+    values = sitk.GetArrayFromImage(image)
+    tolerance = 0.09 / 32767 if to == "dicom" else 0
+    np.testing.assert_allclose(values, stored.volume, rtol=0, atol=tolerance)
+    z, y, x = BRIGHT
+    np.testing.assert_allclose(image.TransformIndexToPhysicalPoint((x, y, z)), world_mm(stored), atol=1e-5)
+    np.testing.assert_allclose(image.GetSpacing(), stored.grid.voxel_size_mm[::-1], rtol=1e-6)
+    np.testing.assert_allclose(image.GetDirection(), np.eye(3).ravel(), atol=1e-6)
+
+
+def test_all_formats_put_the_object_in_one_place(volume_file) -> None:
+    """The centre of mass in ITK's physical space agrees, so that exports overlay in one viewer."""
+    centres = []
+    for to in ("nii", "mha", "nrrd"):
+        image = sitk.ReadImage(str(export_volume(volume_file, to)))
+        peak = int(np.argmax(sitk.GetArrayFromImage(image)))
+        z, y, x = np.unravel_index(peak, image.GetSize()[::-1])
+        centres.append(image.TransformIndexToPhysicalPoint((int(x), int(y), int(z))))
+    np.testing.assert_allclose(centres, np.broadcast_to(centres[0], (3, 3)), atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_nibabel(volume_file, stored, tmp_path, suffix) -> None:
+    """RAS: x and y change their sign, z is superior; sform and qform say the same."""
+    path = export_volume(volume_file, "nii", tmp_path / f"out{suffix}")
+    image = nibabel.load(path)
+    np.testing.assert_array_equal(np.asarray(image.dataobj), stored.volume.transpose(2, 1, 0))
+    z, y, x = BRIGHT
+    wx, wy, wz = world_mm(stored)
+    np.testing.assert_allclose((image.affine @ [x, y, z, 1])[:3], (-wx, -wy, wz), atol=1e-5)
+    np.testing.assert_allclose(image.get_qform(), image.get_sform(), atol=1e-5)
+    assert nibabel.aff2axcodes(image.affine) == ("L", "P", "S")
+    assert image.header.get_xyzt_units()[0] == "mm" and image.header["sform_code"] == 1
+    np.testing.assert_allclose(image.header.get_zooms(), stored.grid.voxel_size_mm[::-1])
+    assert b"1/mm" in image.header["descrip"].tobytes()
+
+
+def test_a_compressed_nifti_repeats(volume_file, tmp_path) -> None:
+    a, b = (export_volume(volume_file, "nii", tmp_path / f"{n}.nii.gz").read_bytes() for n in "ab")
+    assert a == b and a[:2] == b"\x1f\x8b"
+
+
+def test_tifffile_as_imagej_reads_it(volume_file, stored) -> None:
+    path = export_volume(volume_file, "tiff")
+    assert path.suffix == ".tif"
+    with tifffile.TiffFile(path) as tiff:
+        np.testing.assert_array_equal(tiff.asarray(), stored.volume)
+        assert tiff.series[0].axes == "ZYX" and tiff.is_imagej
+        facts = tiff.imagej_metadata
+        dz, dy, dx = stored.grid.voxel_size_mm
+        assert (facts["spacing"], facts["unit"], facts["slices"]) == (dz, "mm", 5)
+        per_mm = [a / b for a, b in (tiff.pages[0].tags[f"{axis}Resolution"].value for axis in "XY")]
+        np.testing.assert_allclose(per_mm, (1 / dx, 1 / dy), rtol=1e-6)
+        origin = np.array([facts[f"{axis}origin"] for axis in "xyz"])
+        position = (np.array(BRIGHT[::-1]) - origin) * (dx, dy, dz)  # ImageJ's calibration
+        np.testing.assert_allclose(position, world_mm(stored), atol=1e-5)
+        assert "1/mm" in facts["Info"]
+
+
+def test_npy(volume_file, stored) -> None:
+    path = export_volume(volume_file, "npy")
+    np.testing.assert_array_equal(np.load(path), stored.volume)
+    facts = json.loads(path.with_suffix(".json").read_text())
+    assert facts["values"] == "1/mm" and facts["axes"] == ["z", "y", "x"]
+    place = np.array(facts["first_centre_mm"]) + np.array(BRIGHT) * facts["voxel_size_mm"]
+    np.testing.assert_allclose(place[::-1], world_mm(stored))
+
+
+def test_pydicom(volume_file, stored) -> None:
+    path = export_volume(volume_file, "dicom", mu_water_per_mm=MU_WATER)
+    slices = [pydicom.dcmread(file) for file in sorted(path.iterdir())]
+    assert len(slices) == 5
+    hu = 1000 * (stored.volume.astype(float) / MU_WATER - 1)
+    for index, image in enumerate(slices):
+        assert image.Modality == "CT" and image.RescaleType == "HU"
+        values = image.pixel_array * float(image.RescaleSlope) + float(image.RescaleIntercept)
+        np.testing.assert_allclose(values, hu[index], atol=0.5 + 1e-3)
+        columns, rows = np.array(image.ImageOrientationPatient, float).reshape(2, 3)
+        between_rows, between_columns = image.PixelSpacing
+        position = np.array(image.ImagePositionPatient, float)
+        place = position + BRIGHT[2] * between_columns * columns + BRIGHT[1] * between_rows * rows
+        if index == BRIGHT[0]:
+            np.testing.assert_allclose(place, world_mm(stored), atol=1e-6)
+    assert len({image.SOPInstanceUID for image in slices}) == 5
+    assert len({(image.SeriesInstanceUID, image.FrameOfReferenceUID) for image in slices}) == 1
+    for image in slices:
+        assert all(len(str(n)) <= 16 for n in image.ImagePositionPatient)
+
+
+@pytest.mark.parametrize("to", ["nii", "mha", "nrrd", "tiff", "npy"])
+def test_hounsfield_units(volume_file, stored, to) -> None:
+    path = export_volume(volume_file, to, mu_water_per_mm=MU_WATER)
+    read = {"tiff": tifffile.imread, "npy": np.load}.get(
+        to, lambda p: sitk.GetArrayFromImage(sitk.ReadImage(str(p)))
+    )
+    expected = 1000 * (stored.volume.astype(float) / MU_WATER - 1)
+    np.testing.assert_allclose(read(path), expected, rtol=1e-6, atol=1e-3)
+
+
+def test_the_range_of_metal_fits_into_dicom(volume_file, stored) -> None:
+    """Beyond 16 bits of single HU the rescale slope grows."""
+    path = export_volume(volume_file, "dicom", mu_water_per_mm=0.0001)
+    image = pydicom.dcmread(path / "0005.dcm")
+    values = image.pixel_array * float(image.RescaleSlope) + float(image.RescaleIntercept)
+    assert values.max() == pytest.approx(1000 * (0.09 / 0.0001 - 1), rel=1e-4)
+    assert len(str(image.RescaleSlope)) <= 16
+
+
+def test_gaussians_as_npz_and_ply(volume_file, stored) -> None:
+    with np.load(export_volume(volume_file, "npz"), allow_pickle=False) as arrays:
+        for name, values in stored.gaussians.items():
+            np.testing.assert_array_equal(arrays[name], values)
+    head, _, body = export_volume(volume_file, "ply").read_bytes().partition(b"end_header\n")
+    lines = head.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"] and "element vertex 9" in lines
+    names = [line.split()[-1] for line in lines if line.startswith("property float")]
+    rows = np.frombuffer(body, "<f4").reshape(9, len(names))
+    columns = dict(zip(names, rows.T, strict=True))
+    np.testing.assert_array_equal(columns["z"], stored.gaussians["mean"][:, 2])
+    np.testing.assert_array_equal(columns["scale_1"], stored.gaussians["scale"][:, 1])
+    np.testing.assert_array_equal(columns["rot_0"], stored.gaussians["quaternion"][:, 0])
+    np.testing.assert_array_equal(columns["density"], stored.gaussians["density"])
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------
+
+WRONG = {
+    "an unknown format": ({"to": "obj"}, "--to"),
+    "a suffix of another format": ({"to": "nii", "output": "out.mha"}, ".nii"),
+    "a name without suffix": ({"to": "mha", "output": "out"}, ".mha"),
+    "water that is zero": ({"to": "nii", "mu_water_per_mm": 0.0}, "--mu-water-per-mm"),
+    "water that is NaN": ({"to": "nii", "mu_water_per_mm": float("nan")}, "--mu-water-per-mm"),
+    "water for Gaussians": ({"to": "ply", "mu_water_per_mm": 0.02}, "--mu-water-per-mm"),
+    "no such folder": ({"to": "nii", "output": "none/out.nii"}, "none"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_wishes_are_one_line(volume_file, tmp_path, case) -> None:
+    wish, word = WRONG[case]
+    before = sorted(tmp_path.iterdir())
+    wish = {**wish, **({"output": tmp_path / wish["output"]} if "output" in wish else {})}
+    with pytest.raises((InputError, OutputError)) as caught:
+        export_volume(volume_file, **wish)
+    assert word in str(caught.value) and "\n" not in str(caught.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_no_gaussians_no_cloud(volume_file, stored) -> None:
+    from phyradgs_cl.io import write_volume
+
+    write_volume(volume_file, stored.volume, stored.grid, {})
+    with pytest.raises(InputError, match="/entry/gaussians"):
+        export_volume(volume_file, "ply")
+
+
+def test_a_folder_with_content_is_never_replaced(volume_file, tmp_path) -> None:
+    (tmp_path / "series").mkdir()
+    (tmp_path / "series" / "thesis.tex").write_text("dear")
+    with pytest.raises(OutputError, match="series"):
+        export_volume(volume_file, "dicom", tmp_path / "series")
+    assert (tmp_path / "series" / "thesis.tex").read_text() == "dear"
+    assert not list(tmp_path.glob(".*part"))
+
+
+@pytest.mark.parametrize("to", EXPORTS)
+def test_a_failure_leaves_nothing(volume_file, tmp_path, monkeypatch, to) -> None:
+    """A disk that fills up at the last moment: no part of the new, and the old as it was."""
+    old = {}
+    if to != "dicom":
+        first = export_volume(volume_file, to)
+        old = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        assert first in old
+    before = sorted(tmp_path.iterdir())
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OutputError):
+        export_volume(volume_file, to)
+    assert sorted(tmp_path.iterdir()) == before
+    assert all(path.read_bytes() == data for path, data in old.items())
+
+
+@pytest.mark.parametrize(("to", "package"), [("tiff", "tifffile"), ("dicom", "pydicom")])
+def test_a_missing_package_is_named(volume_file, monkeypatch, to, package) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=f"{package}: .*formats"):
+        export_volume(volume_file, to)

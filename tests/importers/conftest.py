@@ -1,0 +1,146 @@
+"""One small scan of an asymmetric object in closed form: foreign files are written from it, imports must end at it."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter, pixel_centres
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_scan, write_scan
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
+
+# With import-mode importlib nothing in this folder has a name of its own: tests import the helpers by these.
+sys.modules["conftest_of_importers"] = sys.modules[__name__]
+for _helper in ("writers", "hostile"):
+    _spec = importlib.util.spec_from_file_location(
+        f"{_helper}_of_importers", Path(__file__).with_name(f"{_helper}.py")
+    )
+    sys.modules[_spec.name] = importlib.util.module_from_spec(_spec)
+    _spec.loader.exec_module(sys.modules[_spec.name])
+
+FRAMES = 6
+# No two lengths alike and nothing centred, so that every exchange of axes, signs or factors shows.
+GEOMETRY = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, -6.0))
+GRID = Grid((7, 9, 8), (2.0, 1.5, 1.75), (1.0, -2.0, 3.0))
+BALLS = EllipsoidPhantom(
+    (
+        Ellipsoid((3.0, -2.0, 1.0), (5.0, 4.0, 3.0), 0.03),
+        Ellipsoid((-4.0, 3.0, 4.5), (2.0, 2.5, 1.5), 0.08),
+        Ellipsoid((1.0, 5.0, -4.0), (1.5, 1.0, 2.0), 0.12),
+    ),
+    "three balls",
+)
+WORLD_POINTS = np.array([[3.0, -2.0, 1.0], [-4.0, 3.0, 4.5], [1.0, 5.0, -4.0], [0.0, 0.0, 0.0]])
+RTOL = 1e-6
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a foreign file describes: the scan, and the gantry's angle at every frame's opening (F,) rad."""
+
+    scan: Scan
+    angle_rad: np.ndarray
+
+
+def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) as (row, column) where world points (n, 3) fall for a pose (12,): plain linear algebra."""
+    source, first, step_u, step_v = pose.reshape(4, 3)
+    found = []
+    for point in points:
+        # source + s (point − source) = first + c step_u + r step_v
+        _, column, row = np.linalg.solve(np.stack([point - source, -step_u, -step_v], 1), first - source)
+        found.append((row, column))
+    return np.array(found)
+
+
+def image(geometry: ConeGeometry, angle_rad: float) -> np.ndarray:
+    """Line integrals (v, u) of the three balls."""
+    pose = geometry.pose(angle_rad)
+    return BALLS.line_integrals(pose[:3], pixel_centres(pose, geometry.detector_shape))
+
+
+@pytest.fixture
+def make_truth() -> Callable[..., Truth]:
+    """A factory of scans; ``fly`` turns the gantry on during the exposures (frames show its opening pose)."""
+
+    def make(
+        fly: bool = False, axis: str = "rows", direction: int = 1, geometry: ConeGeometry = GEOMETRY
+    ) -> Truth:
+        angle_rad = np.deg2rad(10.0 + 25.0 * np.arange(FRAMES))
+        frames = np.stack([image(geometry, a) for a in angle_rad]).astype(np.float32)
+        exposure_s, frame_time_s = 0.4, 1.25
+        start_s = np.arange(FRAMES) * frame_time_s
+        arc = np.deg2rad(25.0) * exposure_s / frame_time_s if fly else 0.0
+        shutter = Shutter(exposure_s, 0.3, axis, direction) if fly else Shutter(0.0)
+        sweeps = FrameSweeps(start_s, shutter.exposure_s, angle_rad, angle_rad + arc)
+        orbit = CircularOrbit(geometry, sweeps)
+        reference = BALLS.voxelise(GRID)
+        scan = Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference)
+        return Truth(scan, angle_rad)
+
+    return make
+
+
+@pytest.fixture
+def assert_same(tmp_path) -> Callable[..., None]:
+    """Compares an imported scan, through a file of ours, with the same scan written natively."""
+
+    def stored(scan: Scan, name: str) -> Scan:
+        write_scan(tmp_path / name, scan)
+        return read_scan(tmp_path / name, counts_to_attenuation)
+
+    def compare(
+        found: Scan, truth: Truth, *, grid: bool = True, timing: bool = True, pixels: float = RTOL
+    ) -> None:
+        ours, native = stored(found, "imported.h5"), stored(truth.scan, "native.h5")
+        assert ours.projections.shape == native.projections.shape
+        valid = np.ones(native.projections.shape, bool)
+        if ours.pixel_mask is not None:
+            valid &= ~np.broadcast_to(ours.pixel_mask, valid.shape)
+        worst = np.abs(ours.projections - native.projections)[valid].max()
+        assert worst <= pixels * native.projections.max()
+        assert ours.is_fly == native.is_fly
+        if timing:
+            compare_timing(ours, native)
+        compare_poses(ours, native)
+        if grid:
+            assert ours.grid.shape == native.grid.shape
+            np.testing.assert_allclose(ours.grid.voxel_size_mm, native.grid.voxel_size_mm, rtol=RTOL)
+            np.testing.assert_allclose(ours.grid.offset_mm, native.grid.offset_mm, rtol=RTOL, atol=RTOL)
+            np.testing.assert_allclose(ours.reference, native.reference, rtol=RTOL, atol=1e-9)
+
+    return compare
+
+
+def compare_timing(ours: Scan, native: Scan) -> None:
+    """Exposure, readout, reading order, and the times between frames."""
+    assert ours.shutter.exposure_s == pytest.approx(native.shutter.exposure_s, rel=RTOL)
+    assert ours.shutter.readout_s == pytest.approx(native.shutter.readout_s, rel=RTOL)
+    if native.is_fly:
+        assert (ours.shutter.axis, ours.shutter.direction) == (native.shutter.axis, native.shutter.direction)
+        elapsed = [scan.frame_start_s - scan.frame_start_s[0] for scan in (ours, native)]
+        np.testing.assert_allclose(*elapsed, rtol=RTOL, atol=1e-9)
+
+
+def compare_poses(ours: Scan, native: Scan) -> None:
+    """Where world points fall, at five shares of every frame's window."""
+    for frame in range(native.frames):
+        for share in (0.0, 0.3, 0.5, 0.8, 1.0):
+            poses = [
+                scan.trajectory.pose(
+                    frame, np.array([scan.frame_start_s[frame] + share * scan.shutter.span_s])
+                )[0]
+                for scan in (ours, native)
+            ]
+            np.testing.assert_allclose(
+                projected(poses[0], WORLD_POINTS), projected(poses[1], WORLD_POINTS), rtol=0, atol=RTOL
+            )
+            np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=1e-5)

@@ -1,0 +1,432 @@
+"""Damage done to good foreign files, format by format: what a stranger, or a broken disk, may hand over."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import tifffile
+
+Damage = Callable[[Path], None]
+SECRET = np.full((10, 14), 7.0, np.float32)
+
+
+def truncated(name: str, keep: float = 0.6) -> Damage:
+    def damage(path: Path) -> None:
+        file = path / name if name else path
+        data = file.read_bytes()
+        file.write_bytes(data[: int(len(data) * keep)])
+
+    return damage
+
+
+def filled(name: str, data: bytes) -> Damage:
+    return lambda path: (path / name if name else path).write_bytes(data) and None
+
+
+def removed(name: str) -> Damage:
+    return lambda path: (path / name).unlink()
+
+
+def in_json(name: str, change: Callable[[dict[str, Any]], object]) -> Damage:
+    def damage(path: Path) -> None:
+        content = json.loads((path / name).read_text())
+        change(content)
+        (path / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def in_text(name: str, old: str, new: str) -> Damage:
+    def damage(path: Path) -> None:
+        text = (path / name).read_bytes().decode("latin-1")
+        assert old in text, old
+        (path / name).write_bytes(text.replace(old, new, 1).encode("latin-1"))
+
+    return damage
+
+
+def in_hdf5(change: Callable[[h5py.File], object]) -> Damage:
+    def damage(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            change(file)
+
+    return damage
+
+
+def replaced(file: h5py.File, address: str, value: object, **attributes: object) -> None:
+    del file[address]
+    file.create_dataset(address, data=value).attrs.update(attributes)
+
+
+def outside(path: Path) -> Path:
+    """A file beside the folder, which no import may touch."""
+    np.save(path.parent / "secret.npy", SECRET)
+    return path.parent / "secret.npy"
+
+
+def symlinked(name: str) -> Damage:
+    def damage(path: Path) -> None:
+        target = outside(path)
+        (path / name).unlink()
+        os.symlink(target, path / name)
+
+    return damage
+
+
+def symlinked_folder(path: Path) -> None:
+    (path / "proj_train").rename(path.parent / "elsewhere")
+    os.symlink(path.parent / "elsewhere", path / "proj_train")
+
+
+def named(key: str, name: object) -> Damage:
+    """The first frame of an R2 folder under another name."""
+
+    def damage(path: Path) -> None:
+        text = str(outside(path)) if name == "ABSOLUTE" else name
+        in_json("meta_data.json", lambda meta: meta[key][0].update(file_path=text))(path)
+
+    return damage
+
+
+def npy_header(shape: str, descr: str = "'<f4'", body: bytes = b"\0" * 560) -> bytes:
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + body
+
+
+class Bomb:
+    """Runs a shell command when it is unpickled by anything that runs what a pickle says."""
+
+    def __init__(self, canary: Path) -> None:
+        self.canary = canary
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.canary}",)
+
+
+def pickled(change: Callable[[dict[str, Any], Path], object], protocol: int = 4) -> Damage:
+    def damage(path: Path) -> None:
+        content = pickle.loads(path.read_bytes())
+        content = change(content, path) or content
+        path.write_bytes(pickle.dumps(content, protocol))
+
+    return damage
+
+
+def with_bomb(key: str) -> Damage:
+    return pickled(lambda d, path: d.update({key: Bomb(path.parent / "canary")}))
+
+
+def object_array(d: dict[str, Any], path: Path) -> None:
+    d["train"]["projections"] = np.array([Bomb(path.parent / "canary"), None], object)
+
+
+def doubled(times: int) -> bytes:
+    """Opcodes of a tuple of a tuple of ...: short to write, endless to print, to hash or to walk."""
+    steps = [b"0h" + bytes([i]) + b"h" + bytes([i]) + b"\x86\x94" for i in range(times)]
+    return b"K\x01K\x02\x86\x94" + b"".join(steps)
+
+
+def tuple_bomb_value(path: Path) -> None:
+    path.write_bytes(b"\x80\x04}\x8c\x03DSO" + doubled(60) + b"s.")
+
+
+def tuple_bomb_key(path: Path) -> None:
+    path.write_bytes(b"\x80\x04}" + doubled(60) + b"K\x01s.")
+
+
+def huge_array_pickle(path: Path) -> None:
+    """_reconstruct with a shape of a terabyte and hardly any bytes."""
+    path.write_bytes(
+        b"\x80\x04}\x8c\x05image"
+        b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85C\x01b\x87R"
+        b"(K\x01\x8a\x05\x00\x00\x00\x00\x40\x85cnumpy\ndtype\n\x8c\x02f4\x89\x88\x87R"
+        b"(K\x03\x8c\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89C\x04\0\0\0\0tbs."
+    )
+
+
+def encode_bomb(path: Path) -> None:
+    """One text of 64 KiB turned into bytes 100,000 times: 6 GB out of a file of some 600 kB."""
+    text = b"X" + struct.pack("<I", 1 << 16) + b"a" * (1 << 16)
+    setup = b"c_codecs\nencode\n\x94" + text + b"\x8c\x06latin1\x86\x94"
+    path.write_bytes(b"\x80\x04" + setup + b"00](" + b"h\x00h\x01R" * 100_000 + b"e.")
+
+
+PROJ = "proj_train/0000.npy"
+R2: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "no description": (removed("meta_data.json"), ()),
+    "not JSON": (filled("meta_data.json", b"\xff\xfe{"), ("JSON",)),
+    "a JSON list": (filled("meta_data.json", b"[]"), ("JSON list",)),
+    "JSON that is too deep": (filled("meta_data.json", b"[" * 200_000), ("JSON",)),
+    "no scanner": (in_json("meta_data.json", lambda m: m.pop("scanner")), ("scanner", "nothing")),
+    "parallel beams": (in_json("meta_data.json", lambda m: m["scanner"].update(mode="parallel")), ("mode",)),
+    "a distance that is text": (in_json("meta_data.json", lambda m: m["scanner"].update(DSO="far")), ("DSO",)),
+    "a distance that is NaN": (in_json("meta_data.json", lambda m: m["scanner"].update(DSO=float("nan"))), ("DSO",)),
+    "a distance of many digits": (filled("meta_data.json", b'{"scanner": {"DSO": ' + b"9" * 4000 + b"}}"), ("DSO",)),
+    "a detector before the axis": (in_json("meta_data.json", lambda m: m["scanner"].update(DSD=400)), ("DSD",)),
+    "a detector of no rows": (in_json("meta_data.json", lambda m: m["scanner"].update(nDetector=[0, 4])), ("nDetector",)),
+    "half a pixel": (in_json("meta_data.json", lambda m: m["scanner"].update(nDetector=[10, 13.5])), ("nDetector",)),
+    "a huge grid": (in_json("meta_data.json", lambda m: m["scanner"].update(nVoxel=[10**6] * 3)), ("vol_gt",)),
+    "no frames": (in_json("meta_data.json", lambda m: m.update(proj_train=[])), ("proj_train",)),
+    "a frame without an angle": (in_json("meta_data.json", lambda m: m["proj_train"][1].pop("angle")), ("[1].angle",)),
+    "a frame that is no table": (in_json("meta_data.json", lambda m: m["proj_train"].insert(0, 3)), ("proj_train[0]",)),
+    "a frame twice": (in_json("meta_data.json", lambda m: m["proj_train"].append(m["proj_train"][0])), ("again",)),
+    "a path with ..": (named("proj_train", "../secret.npy"), ("'../secret.npy'", "inside")),
+    "a path with .. inside": (named("proj_train", "proj_train/../../secret.npy"), ("inside",)),
+    "a Windows path with ..": (named("proj_train", "..\\secret.npy"), ("inside",)),
+    "a drive": (named("proj_train", "C:secret.npy"), ("inside",)),
+    "an absolute path": (named("proj_train", "ABSOLUTE"), ("inside",)),
+    "a name with NUL": (named("proj_train", "a\0b"), ("file_path",)),
+    "a name that is a number": (named("proj_train", 3), ("file_path",)),
+    "a folder as a frame": (named("proj_train", "proj_train"), ("folder",)),
+    "a link to outside": (symlinked(PROJ), ("symbolic link",)),
+    "a folder that is a link": (symlinked_folder, ("symbolic link",)),
+    "a truth outside": (in_json("meta_data.json", lambda m: m.update(vol="../secret.npy")), ("inside",)),
+    "a missing frame": (removed(PROJ), ("no file",)),
+    "a truncated frame": (truncated(PROJ), ("bytes",)),
+    "a pickle as a frame": (filled(PROJ, b"cos\nsystem\n(S'touch canary'\ntR."), ("damaged .npy",)),
+    "an archive as a frame": (filled(PROJ, b"PK\x03\x04" + b"\0" * 100), ("damaged .npy",)),
+    "an object array": (filled(PROJ, npy_header("(10, 14)", "'|O'")), ("type object",)),
+    "a structured array": (filled(PROJ, npy_header("(10, 14)", "[('a', '<f4')]")), ("type",)),
+    "a frame declared huge": (filled(PROJ, npy_header("(1000000, 1000000)")), ("bytes",)),
+    "a frame declared negative": (filled(PROJ, npy_header("(-10, -14)")), ("shape",)),
+    "a header that calls": (filled(PROJ, npy_header("__import__('os').system('touch canary')")), ("damaged .npy",)),
+    "a frame of another size": (filled(PROJ, npy_header("(14, 10)")), ("(14, 10)",)),
+    "a stack as a frame": (filled(PROJ, npy_header("(1, 10, 14)")), ("(1, 10, 14)",)),
+    "a truth of another size": (filled("vol_gt.npy", npy_header("(5, 4, 7)")), ("vol_gt.npy",)),
+    "a truth with NaN": (filled("vol_gt.npy", npy_header("(8, 9, 7)", body=b"\xff" * 2016)), ("vol_gt.npy", "NaN")),
+}  # fmt: skip
+
+FPS = "meta_data_motion_blur_rolling_shutter_fps18.json"
+PHYRADGS: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "no marks": (in_json(FPS, lambda m: m["simulate_train"][2].pop("last_line_end")), ("[2].last_line_end",)),
+    "no exposure": (in_json(FPS, lambda m: m["simulate_train"][0].update(first_line_end=np.deg2rad(10))), ("exposure",)),
+    "one frame backwards": (in_json(FPS, lambda m: m["simulate_train"][1].update(first_line_end=-9)), ("exposure",)),
+    "readouts that differ": (in_json(FPS, lambda m: m["simulate_train"][1].update(last_line_end=9)), ("readout",)),
+    "a path with ..": (in_json(FPS, lambda m: m["simulate_train"][0].update(file_path="../secret.npy")), ("inside",)),
+    "a description that is a link": (symlinked(FPS), ("symbolic link",)),
+}  # fmt: skip
+
+
+def _shutter(meta: dict[str, Any]) -> dict[str, Any]:
+    return meta["views"][0]["rolling_shutter"]["source"]
+
+
+GEO = "geometric_motion_rs.json"
+REAL: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "no views": (in_json(GEO, lambda m: m.update(views=[])), ("views",)),
+    "a view without its matrix": (in_json(GEO, lambda m: m["views"][1].pop("detector")), ("views[1].detector",)),
+    "a matrix of three rows": (in_json(GEO, lambda m: m["views"][1]["detector"].pop()), ("views[1].detector",)),
+    "a matrix of text": (in_json(GEO, lambda m: m["views"][0].update(detector=[["a"] * 4] * 4)), ("detector",)),
+    "a matrix that shears": (in_json(GEO, lambda m: m["views"][0]["detector"][0].__setitem__(1, 0.7)), ("orthonormal",)),
+    "a radius of 0": (in_json(GEO, lambda m: m["rolling_shutter_geometry"]["source"].update(radius=0)), ("radius",)),
+    "an angle missing": (in_json(GEO, lambda m: _shutter(m).pop("first_row_end_angle")), ("first_row_end_angle",)),
+    "too few frames": (removed("projections/3.tif"), ("5 TIFF files for 6 views",)),
+    "a frame that is a link": (symlinked("projections/3.tif"), ("symbolic link",)),
+    "a truncated frame": (truncated("projections/3.tif"), ("3.tif",)),
+    "two descriptions": (filled("other.json", b"{}"), ("geometric_motion_rs.json, other.json",)),
+}  # fmt: skip
+
+NAF: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "empty": (filled("", b""), ("damaged pickle",)),
+    "truncated": (truncated(""), ("damaged pickle",)),
+    "not a pickle": (filled("", b"hello, world"), ("damaged pickle",)),
+    "a list": (filled("", pickle.dumps([1, 2])), ("table",)),
+    "a call of os.system": (with_bomb("DSD"), ("posix.system", "nothing was executed")),
+    "a call in an unused key": (with_bomb("unused"), ("posix.system",)),
+    "a call by the old opcode": (filled("", b"(S'touch canary'\nios\nsystem\n."), ("INST",)),
+    "a call by GLOBAL": (filled("", b"cos\nsystem\n(S'touch canary'\ntR."), ("os.system",)),
+    "eval": (filled("", b"c__builtin__\neval\n(S'1'\ntR."), ("eval",)),
+    "an extension": (filled("", b"\x80\x02\x82\x01."), ("EXT1",)),
+    "a persistent object": (filled("", b"P3\n."), ("PERSID",)),
+    "an object by NEWOBJ": (pickled(lambda d, _: d.update(DSD=Path("x"))), ("pathlib",)),
+    "numpy.load": (filled("", b"cnumpy\nload\n(S'x'\ntR."), ("numpy.load",)),
+    "an array of objects": (pickled(object_array), ("posix.system",)),
+    "an array of nothing": (pickled(lambda d, _: d.update(image=np.array([None]))), ("damaged pickle",)),
+    "a structured array": (pickled(lambda d, _: d.update(image=np.zeros(3, "f4,f4"))), ("damaged pickle",)),
+    "an array of text": (pickled(lambda d, _: d.update(image=np.array(["a"]))), ("damaged pickle",)),
+    "a complex array": (pickled(lambda d, _: d.update(image=np.zeros((8, 9, 7), complex))), ("c16",)),
+    "an array declared huge": (huge_array_pickle, ("in 4 bytes",)),
+    "a number of many digits": (filled("", b"I" + b"9" * 100_000 + b"\n."), ("damaged pickle",)),
+    "tuples of tuples as a value": (tuple_bomb_value, ("DSO", "a tuple of 2")),
+    "tuples of tuples as a key": (tuple_bomb_key, ("a key",)),
+    "one text as bytes again and again": (encode_bomb, ("more bytes",)),
+    "an endless list": (filled("", b"\x80\x04](" + b"K\x01" * 3_500_000 + b"e."), ("opcodes",)),
+    "a list that holds itself": (filled("", b"\x80\x04}\x8c\x03DSO]\x94h\x00as."), ("DSO",)),
+    "an array never filled": (filled("", b"\x80\x04}\x8c\x03DSOcnumpy.core.multiarray\n_reconstruct\n)Rs."), ("DSO",)),
+    "a function as a value": (filled("", b"\x80\x04}\x8c\x03DSOcnumpy\ndtype\ns."), ("DSO",)),
+    "no projections": (pickled(lambda d, _: d["train"].pop("projections") is None), ("train.projections",)),
+    "frames of another size": (pickled(lambda d, _: d["train"].update(projections=np.zeros((4, 3, 3)))), ("(4, 3, 3)",)),
+    "too few angles": (pickled(lambda d, _: d["train"].update(angles=np.zeros(2))), ("train.angles", "2 values")),
+    "an angle that is NaN": (pickled(lambda d, _: d["train"].update(angles=np.full(4, np.nan))), ("train.angles",)),
+    "a truth of another size": (pickled(lambda d, _: d.update(image=np.zeros((2, 2, 2)))), ("image",)),
+}  # fmt: skip
+
+ENTITIES = """<!DOCTYPE RTKGEOMETRY [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>"""
+EXTERNAL = """<!DOCTYPE RTKGEOMETRY [<!ENTITY x SYSTEM "file:///etc/passwd">]>"""
+DOCTYPE = "<!DOCTYPE RTKGEOMETRY>"
+SID, CURVED = "SourceToIsocenterDistance", "<RadiusCylindricalDetector>9</RadiusCylindricalDetector>"
+ONE_MORE = "<Projection><GantryAngle>1</GantryAngle></Projection>"
+XML, MHA = "geometry.xml", "projections.mha"
+RTK: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "entities": (in_text(XML, DOCTYPE, ENTITIES), ("DOCTYPE",)),
+    "an external entity": (in_text(XML, DOCTYPE, EXTERNAL), ("DOCTYPE",)),
+    "an external DTD": (in_text(XML, DOCTYPE, '<!DOCTYPE RTKGEOMETRY SYSTEM "http://x/y.dtd">'), ("DOCTYPE",)),
+    "an undeclared entity": (in_text(XML, "<GantryAngle>", "<GantryAngle>&boom;"), ("well formed",)),
+    "truncated XML": (truncated(XML), ("well formed",)),
+    "another root": (filled(XML, b"<svg/>"), ("svg",)),
+    "an old version": (in_text(XML, 'version="3"', 'version="2"'), ("version",)),
+    "elements without end": (filled(XML, b"<RTKThreeDCircularGeometry>" + b"<a>" * 100_000), ("nested",)),
+    "no distance": (in_text(XML, f"{SID}>500.0</{SID}>", "X>1</X>"), (SID,)),
+    "a distance of 0": (in_text(XML, "Distance>500.0<", "Distance>0<"), ("SourceToIsocenterDistance",)),
+    "a detector before the axis": (in_text(XML, "Distance>800.0<", "Distance>80<"), ("SourceToDetectorDistance",)),
+    "an angle that is text": (in_text(XML, "<GantryAngle>", "<GantryAngle>ten "), ("GantryAngle",)),
+    "an infinite angle": (in_text(XML, "<GantryAngle>", "<GantryAngle>1e999"), ("GantryAngle",)),
+    "a curved detector": (in_text(XML, "<Projection>", f"{CURVED}<Projection>"), ("Radius",)),
+    "a projection more": (in_text(XML, "</RTKThree", f"{ONE_MORE}</RTKThree"), ("6 frames, 7",)),
+    "an encoding that nobody knows": (in_text(XML, '"1.0"?', '"1.0" encoding="klingon"?'), ("geometry.xml",)),
+    "no stack": (removed(MHA), ()),
+    "two stacks": (filled("other.mha", b""), ("other.mha",)),
+    "a stack that is a link": (symlinked(MHA), ("symbolic link",)),
+    "a truncated stack": (truncated(MHA), ("bytes",)),
+    "a stack declared huge": (in_text(MHA, "DimSize = 14 10 6", "DimSize = 140000 100000 6"), ("bytes",)),
+    "a stack declared negative": (in_text(MHA, "DimSize = 14 10 6", "DimSize = -14 -10 6"), ("shape",)),
+    "a size that is text": (in_text(MHA, "DimSize = 14", "DimSize = all"), ("DimSize",)),
+    "a size that is infinite": (in_text(MHA, "DimSize = 14", "DimSize = inf"), ("DimSize",)),
+    "voxels outside": (in_text(MHA, "ElementDataFile = LOCAL", "ElementDataFile = ../secret.npy"), ("inside",)),
+    "voxels anywhere": (in_text(MHA, "ElementDataFile = LOCAL", "ElementDataFile = /etc/passwd"), ("inside",)),
+    "voxels in a list": (in_text(MHA, "ElementDataFile = LOCAL", "ElementDataFile = LIST"), ("LIST",)),
+    "four axes": (in_text(MHA, "NDims = 3", "NDims = 4"), ("NDims",)),
+    "no voxel type": (in_text(MHA, "MET_FLOAT", "MET_OBJECT"), ("ElementType",)),
+    "no spacing": (in_text(MHA, "ElementSpacing = 2.5", "ElementSpacing = 0"), ("ElementSpacing",)),
+    "a skew stack": (in_text(MHA, "TransformMatrix = 1 0 0", "TransformMatrix = 0 0 1"), ("TransformMatrix",)),
+    "no header": (filled(MHA, b"\0" * 100_000), ("ElementDataFile",)),
+    "deflated rubbish": (in_text(MHA, "CompressedData = False", "CompressedData = True"), ("compressed",)),
+}  # fmt: skip
+
+
+def deflate_bomb(path: Path) -> None:
+    """Zeros that unpack to far more than the header says: only what it says is unpacked."""
+    header = (path / MHA).read_bytes().split(b"LOCAL\n")[0].replace(
+        b"Data = False", b"Data = True"
+    ) + b"LOCAL\n"
+    (path / MHA).write_bytes(header + zlib.compress(b"\0" * 800))
+
+
+RTK["deflated too short"] = (deflate_bomb, ("after unpacking",))
+
+
+def linked(file: h5py.File, address: str) -> None:
+    del file[address]
+    file[address] = h5py.ExternalLink("/etc/passwd", "/")
+
+
+EXCHANGE: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "truncated": (truncated(""), ("HDF5",)),
+    "no data": (in_hdf5(lambda f: f.pop("exchange/data")), ("/exchange/data",)),
+    "data elsewhere": (in_hdf5(lambda f: linked(f, "exchange/data")), ("/exchange/data", "passwd")),
+    "flat data": (in_hdf5(lambda f: replaced(f, "exchange/data", np.zeros(5))), ("/exchange/data",)),
+    "text data": (in_hdf5(lambda f: replaced(f, "exchange/data", [[["a"]]])), ("/exchange/data",)),
+    "no angles": (in_hdf5(lambda f: f.pop("exchange/theta")), ("/exchange/theta",)),
+    "too few angles": (in_hdf5(lambda f: replaced(f, "exchange/theta", np.zeros(3))), ("/exchange/theta",)),
+    "an angle that is NaN": (in_hdf5(lambda f: replaced(f, "exchange/theta", np.full(6, np.nan))), ("/exchange/theta",)),
+    "an unknown unit": (in_hdf5(lambda f: f["exchange/theta"].attrs.update(units="gon")), ("gon",)),
+    "flats of another size": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.ones((1, 2, 3)))), ("data_white",)),
+    "no flats": (in_hdf5(lambda f: f.pop("exchange/data_white")), ("--quantity",)),
+    "dead flats": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.zeros((1, 10, 14)))), ("no usable value",)),
+    "no pixel size": (in_hdf5(lambda f: f.pop("measurement")), ("--pixel-size-mm",)),
+}  # fmt: skip
+
+DETECTOR = "entry0000/instrument/detector"
+COUNT_TIME, MOVES = f"{DETECTOR}/count_time", "entry0000/sample/x_translation"
+NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "truncated": (truncated(""), ("HDF5",)),
+    "no data": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/data")), ("detector/data",)),
+    "data elsewhere": (in_hdf5(lambda f: linked(f, f"{DETECTOR}/data")), ("passwd",)),
+    "no distance": (in_hdf5(lambda f: f.pop("entry0000/instrument/source/distance")), ("--source-to-axis-mm",)),
+    "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("--source-to-detector-mm",)),
+    "no projections": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.ones(9, int))), ("image_key",)),
+    "a key short": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.zeros(3, int))), ("image_key",)),
+    "exposures that differ": (in_hdf5(lambda f: replaced(f, COUNT_TIME, np.arange(9.0), units="s")), ("count_time",)),
+    "a tilted detector": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/transformations/rx", 12.0, units="deg")), ("rx", "12")),
+    "a sample that moves": (in_hdf5(lambda f: f.create_dataset(MOVES, data=np.arange(9.0))), ("x_translation",)),
+    "a scan of this package": (in_hdf5(lambda f: f.create_group("entry0000/phyradgs")), ("as it is",)),
+    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("--quantity",)),
+}  # fmt: skip
+
+TOML = "scan.toml"
+TURNED = [(274, 3, 1, 6, True)]
+STANDING = "[timing]\nexposure_s = 1\nstart_s = [0, 0, 0, 0, 0, 0]\n[frames]"
+TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "not TOML": (filled(TOML, b"= = ="), ("TOML",)),
+    "not text": (filled(TOML, b"\xff\xfe\xff"), ("TOML",)),
+    "an unknown table": (in_text(TOML, "[angles]", "[angels]"), ("angels", "angles")),
+    "an unknown key": (in_text(TOML, "flats =", "flat ="), ("flat", "flats")),
+    "an unknown scanner key": (in_text(TOML, "to_axis_mm", "to_axis"), ("to_axis",)),
+    "no angles": (in_text(TOML, "values_deg", "rotates = 'gantry' #"), ("last_deg",)),
+    "too few angles": (in_text(TOML, "values_deg = [", "values_deg = [1, 2] # ["), ("values_deg",)),
+    "frames outside": (in_text(TOML, '"proj_*.tif"', '"../proj_*.tif"'), ("inside",)),
+    "frames anywhere": (in_text(TOML, '"proj_*.tif"', '"/tmp/*.tif"'), ("inside",)),
+    "frames everywhere": (in_text(TOML, '"proj_*.tif"', '"**/*.tif"'), ("pattern",)),
+    "no frames": (in_text(TOML, '"proj_*.tif"', '"x_*.tif"'), ("no file",)),
+    "a frame that is a link": (symlinked("proj_1.tif"), ("symbolic link",)),
+    "a frame that is no TIFF": (filled("proj_1.tif", b"GIF89a" + b"\0" * 100), ("proj_1.tif",)),
+    "an empty frame": (filled("proj_1.tif", b""), ("proj_1.tif",)),
+    "a truncated frame": (truncated("proj_1.tif"), ("proj_1.tif",)),
+    "a colour frame": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 14, 3), np.uint8)), ("shape",)),
+    "a turned frame": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 14)), extratags=TURNED), ("Orientation",)),
+    "a frame of another size": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 13))), ("(10, 13)",)),
+    "exposure without end": (in_text(TOML, "[frames]", "[timing]\nexposure_s = -1\n[frames]"), ("exposure_s",)),
+    "motion without exposure": (in_text(TOML, "[frames]", "[timing]\nframe_time_s = 1\n[frames]"), ("--exposure-s",)),
+    "times that stand still": (in_text(TOML, "[frames]", STANDING), ("start times",)),
+}  # fmt: skip
+
+
+def declared_huge(path: Path) -> None:
+    """The width and height of a page, raised in its tags; its one strip stays as it is."""
+    for compression in (None, "zlib"):
+        tifffile.imwrite(path / "proj_1.tif", np.zeros((10, 14)), compression=compression)
+        with tifffile.TiffFile(path / "proj_1.tif", mode="r+b") as tiff:
+            for tag in ("ImageWidth", "ImageLength", "RowsPerStrip"):
+                tiff.pages[0].tags[tag].overwrite(60_000)
+
+
+def deflated_zeros(megabytes: int) -> bytes:
+    """A thousandth of as many bytes, made without ever holding them."""
+    machine, block = zlib.compressobj(6), bytes(1 << 20)
+    return b"".join(machine.compress(block) for _ in range(megabytes)) + machine.flush()
+
+
+def inflated_strip(path: Path) -> None:
+    """A strip of 300 kB out of which 300 MB would come; the page needs 1 kB."""
+    tifffile.imwrite(path / "proj_1.tif", np.zeros((10, 14)), compression="zlib")
+    bomb = deflated_zeros(300)
+    with tifffile.TiffFile(path / "proj_1.tif", mode="r+b") as tiff:
+        at = (path / "proj_1.tif").stat().st_size
+        tiff.pages[0].tags["StripOffsets"].overwrite(at)
+        tiff.pages[0].tags["StripByteCounts"].overwrite(len(bomb))
+    with open(path / "proj_1.tif", "ab") as file:
+        file.write(b"\0" * (at - file.tell()) + bomb)
+
+
+def circular_pages(path: Path) -> None:
+    """The next-page offset of the first page points at the first page."""
+    file = path / "proj_1.tif"
+    data = bytearray(file.read_bytes())
+    first = struct.unpack_from("<I", data, 4)[0]
+    entries = struct.unpack_from("<H", data, first)[0]
+    struct.pack_into("<I", data, first + 2 + 12 * entries, first)
+    file.write_bytes(data)
+
+
+TIFF["a frame declared huge"] = (declared_huge, ("bytes",))
+TIFF["a strip that inflates"] = (inflated_strip, ("a strip of more than",))
+TIFF["pages in a circle"] = (circular_pages, ())

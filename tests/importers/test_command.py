@@ -1,0 +1,98 @@
+"""phyradgs import, as the command line runs it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+import writers_of_importers as w
+from typer.testing import CliRunner
+
+from phyradgs_cl.commands.import_scan import EXAMPLE, import_command
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan
+from phyradgs_cl.importers.options import option_name
+from phyradgs_cl.io import read_scan
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "import.md"
+
+
+@pytest.fixture
+def run():
+    app = typer.Typer(rich_markup_mode=None)
+    app.command("import", epilog=EXAMPLE)(import_command)
+    return lambda *arguments: CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def test_a_folder_becomes_a_scan(run, tmp_path, make_truth) -> None:
+    path, out = w.write_r2(tmp_path / "r2", make_truth()), tmp_path / "scan.h5"
+    done = run(path, "-o", out, "--part", "all", "--unit-mm", "2")
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert "r2, 6 frames of 10×14, at rest" in done.output
+    scan = read_scan(out, counts_to_attenuation)
+    assert scan.geometry.source_to_axis_mm == pytest.approx(1000)
+    assert scan.provenance["imported_from"] == str(path)
+
+
+def test_timing_by_options(run, tmp_path, make_truth) -> None:
+    path, out = w.write_rtk(tmp_path / "rtk", make_truth()), tmp_path / "scan.h5"
+    timing = ["--exposure-s", "0.4", "--readout-s", "0.3", "--frame-time-s", "1.25"]
+    done = run(path, "-o", out, *timing, "--readout", "columns", "--readout-direction", "-1")
+    assert done.exit_code == 0 and "fly-scan" in done.output, done.exception
+    shutter = read_scan(out, counts_to_attenuation).shutter
+    assert (shutter.exposure_s, shutter.readout_s, shutter.axis, shutter.direction) == (
+        0.4,
+        0.3,
+        "columns",
+        -1,
+    )
+
+
+def test_geometry_by_options(run, tmp_path, make_truth) -> None:
+    path, out = w.write_data_exchange(tmp_path / "dx.h5", make_truth()), tmp_path / "scan.h5"
+    cone = ["--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--detector-offset", "4,-6"]
+    done = run(path, "-o", out, *cone, "--pixel-size-mm", "3,2.5", "--rotates", "sample", "--row-0", "top")
+    assert done.exit_code == 0, done.exception
+    np.testing.assert_allclose(
+        read_scan(out, counts_to_attenuation).projections, make_truth().scan.projections, atol=1e-5
+    )
+
+
+def test_an_existing_output_survives_an_error(run, tmp_path, make_truth) -> None:
+    path, out = w.write_r2(tmp_path / "r2", make_truth()), tmp_path / "scan.h5"
+    out.write_bytes(b"precious")
+    (path / "proj_train" / "0000.npy").unlink()
+    assert isinstance(run(path, "-o", out).exception, InputError)
+    assert out.read_bytes() == b"precious" and not list(tmp_path.glob(".*"))
+
+
+def test_the_input_is_not_overwritten(run, tmp_path, make_truth) -> None:
+    path = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
+    assert isinstance(run(path, "-o", path).exception, InputError)
+    assert isinstance(run(path, "-o", tmp_path / "none" / "scan.h5").exception, OutputError)
+
+
+def test_formats_and_options_are_described() -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    missing = [form for form in FORMATS if f"`{form}`" not in text]
+    missing += [f.name for f in fields(ImportOptions) if f"`{option_name(f.name)}" not in text]
+    assert not missing
+
+
+def test_the_documentation_s_example_runs(tmp_path, make_truth, monkeypatch) -> None:
+    """The worked TOML of docs/import.md describes the folder that the writer makes."""
+    text = DOCS.read_text(encoding="utf-8")
+    toml = next(block for block in re.findall(r"```toml\n(.*?)```", text, re.S) if "[frames]" in block)
+    path = w.write_tiff(tmp_path / "scan", make_truth())
+    (path / "scan.toml").write_text(toml)
+    scan = import_scan(path)
+    assert scan.is_fly and scan.frames == 6
+    python = next(b for b in re.findall(r"```python\n(.*?)```", text, re.S))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(python, str(DOCS), "exec"), {})
+    assert read_scan(tmp_path / "scan.h5", counts_to_attenuation).is_fly

@@ -1,0 +1,129 @@
+"""Geometries that are no circle: RTK's tilts and offsets, and calibrated views of a real C-arm."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from conftest_of_importers import GEOMETRY, WORLD_POINTS, projected
+from writers_of_importers import AIR, write_phyradgs_real
+
+from phyradgs_cl.acquisition import CircularOrbit, PoseTable
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import ImportOptions, import_scan, recognise
+
+# Written by RTK 2.7: three projections, the third tilted about all axes with every offset in use.
+RTK_FILE = Path(__file__).with_name("data") / "rtk_tilted.xml"
+SPACING, ORIGIN = (2.5, 3.0), (-14.0, -16.5)
+FLY = ImportOptions(exposure_s=0.5, readout_s=0.25, frame_time_s=1.0)
+
+
+@pytest.fixture
+def rtk_folder(tmp_path) -> Path:
+    shutil.copy(RTK_FILE, tmp_path / "geometry.xml")
+    stack = sitk.GetImageFromArray(np.arange(3 * 10 * 14, dtype=np.float32).reshape(3, 10, 14))
+    stack.SetSpacing((*SPACING, 1.0))
+    stack.SetOrigin((*ORIGIN, 0.0))
+    sitk.WriteImage(stack, str(tmp_path / "stack.mha"))
+    return tmp_path
+
+
+def rtk_pixels(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) (row, column) by RTK's own 3×4 matrix; its axes (X, Y, Z) are (y, z, x) here."""
+    theirs = np.concatenate([points[:, [1, 2, 0]], np.ones((len(points), 1))], 1)
+    u, v, w = matrix @ theirs.T
+    return np.stack([(v / w - ORIGIN[1]) / SPACING[1], (u / w - ORIGIN[0]) / SPACING[0]], -1)
+
+
+def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder) -> None:
+    scan = import_scan(rtk_folder)
+    assert isinstance(scan.trajectory, PoseTable) and not scan.is_fly
+    texts = re.findall(r"<Matrix>(.*?)</Matrix>", RTK_FILE.read_text(), re.S)
+    for frame, text in enumerate(texts):
+        matrix = np.array(text.split(), float).reshape(3, 4)
+        for share in (0.0, 0.5, 1.0):
+            at = scan.frame_start_s[frame] + share * scan.shutter.middle_s
+            pose = scan.trajectory.pose(frame, np.array([at]))[0]
+            np.testing.assert_allclose(
+                projected(pose, WORLD_POINTS), rtk_pixels(matrix, WORLD_POINTS), atol=1e-6
+            )
+    np.testing.assert_array_equal(scan.projections[1, 2, :3], 140 + 28 + np.arange(3))
+
+
+def test_rtk_s_poses_move_through_the_frames(rtk_folder) -> None:
+    """With times the poses of the file are met as each exposure starts, and the table covers every window."""
+    still, fly = import_scan(rtk_folder), import_scan(rtk_folder, FLY)
+    assert fly.is_fly
+    for frame in range(3):
+        stands = still.trajectory.pose(frame, still.frame_start_s[frame : frame + 1])
+        passes = fly.trajectory.pose(frame, fly.frame_start_s[frame : frame + 1])
+        np.testing.assert_allclose(passes, stands, atol=1e-6)
+    middle = import_scan(rtk_folder, replace(FLY, angle_at="middle"))
+    for frame in range(3):
+        at = middle.frame_start_s[frame : frame + 1] + 0.25
+        stands = still.trajectory.pose(frame, still.frame_start_s[frame : frame + 1])
+        np.testing.assert_allclose(middle.trajectory.pose(frame, at), stands, atol=1e-6)
+
+
+REAL = ImportOptions(exposure_s=0.4, pixel_size_mm=GEOMETRY.pixel_size_mm, flat_value=AIR)
+REAL_GEOMETRY = replace(GEOMETRY, detector_offset_mm=(4.0, 0.0))
+
+
+def test_phyradgs_real(tmp_path, make_truth, assert_same) -> None:
+    """The first stored row, at the top, is read first: our last."""
+    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
+    path = write_phyradgs_real(tmp_path / "real", truth)
+    assert recognise(path) == "phyradgs-real"
+    scan = import_scan(path, REAL)
+    # counts of 16 bits: half a count of 50,000 · exp(−1.5) is 5e-5
+    assert_same(scan, truth, grid=False, pixels=1e-4)
+    brightest = import_scan(path, replace(REAL, flat_value=None))
+    np.testing.assert_allclose(brightest.projections, scan.projections, atol=1e-4)
+
+
+def test_one_scan_of_several_in_a_file(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
+    path = write_phyradgs_real(tmp_path / "real", truth)
+    file = path / "geometric_motion_rs.json"
+    meta = json.loads(file.read_text())
+    meta["views"] = meta["views"][::-1] + meta["views"]
+    file.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match="--first-view"):
+        import_scan(path, REAL)
+    assert_same(import_scan(path, replace(REAL, first_view=6)), truth, grid=False, pixels=1e-4)
+
+
+def test_circles_beside_the_axis(tmp_path, make_truth) -> None:
+    """Everything moved by one vector sees a point that moved along where it was."""
+    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
+    scan = import_scan(write_phyradgs_real(tmp_path / "real", truth, centre_mm=(3.0, -2.0)), REAL)
+    assert not isinstance(scan.trajectory, CircularOrbit)
+    for frame in range(scan.frames):
+        for share in (0.0, 0.4, 1.0):
+            after_s = share * scan.shutter.span_s
+            ours = scan.trajectory.pose(frame, scan.frame_start_s[frame] + np.array([after_s]))[0]
+            native = truth.scan.trajectory.pose(frame, truth.scan.frame_start_s[frame] + np.array([after_s]))[
+                0
+            ]
+            there = projected(ours, WORLD_POINTS + [3.0, -2.0, 0.0])
+            np.testing.assert_allclose(there, projected(native, WORLD_POINTS), atol=1e-4)
+
+
+def test_windows_that_overlap_are_moved_apart(tmp_path, make_truth) -> None:
+    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
+    sweeps = truth.scan.trajectory.kinematics
+    wide = replace(sweeps, angle_end_rad=sweeps.angle_start_rad + np.deg2rad(24))
+    orbit = CircularOrbit(REAL_GEOMETRY, wide)
+    truth = replace(truth, scan=replace(truth.scan, trajectory=orbit))
+    scan = import_scan(write_phyradgs_real(tmp_path / "real", truth), REAL)
+    assert np.diff(scan.frame_start_s).min() > scan.shutter.span_s
+    pose = scan.trajectory.pose(3, scan.frame_start_s[3] + np.array([scan.shutter.span_s]))[0]
+    end_rad = sweeps.angle_start_rad[3] + np.deg2rad(24) * (1 + 0.3 / 0.4)
+    native = REAL_GEOMETRY.pose(end_rad)
+    np.testing.assert_allclose(projected(pose, WORLD_POINTS), projected(native, WORLD_POINTS), atol=1e-5)

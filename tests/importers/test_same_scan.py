@@ -1,0 +1,209 @@
+"""A scan in every foreign format, imported, is the scan itself: pixels, geometry, timing, grid and truth."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import writers_of_importers as w
+
+from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
+
+FLY = ImportOptions(
+    exposure_s=0.4, readout_s=0.3, frame_time_s=1.25, readout_axis="columns", readout_direction=-1
+)
+CONE = {"source_to_axis_mm": 500.0, "source_to_detector_mm": 800.0, "detector_offset_mm": (4.0, -6.0)}
+
+
+def test_r2_gaussian(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth()
+    path = w.write_r2(tmp_path / "r2", truth)
+    assert recognise(path) == "r2"
+    assert import_scan(path).frames == truth.scan.frames - 2
+    assert import_scan(path, ImportOptions(part="test")).frames == 2
+    assert_same(import_scan(path, ImportOptions(part="all")), truth)
+
+
+def test_r2_gaussian_in_scene_units(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth()
+    path = w.write_r2(tmp_path / "r2", truth, unit_mm=40.0)
+    assert_same(import_scan(path, ImportOptions(part="all", unit_mm=40.0)), truth)
+
+
+def test_r2_gaussian_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns", direction=-1)
+    path = w.write_r2(tmp_path / "r2", truth)
+    assert_same(import_scan(path, replace(FLY, part="all")), truth)
+
+
+def test_naf_with_numpy_s_own_numbers(tmp_path, make_truth, assert_same) -> None:
+    """Scalars and small arrays of NumPy, lists of them, and arrays in Fortran order."""
+    content = w.naf_dict(make_truth())
+    for key in ("DSD", "DSO"):
+        content[key] = np.float64(content[key])
+    for key in ("nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector"):
+        content[key] = np.array(content[key])
+    for part in ("train", "val"):
+        content[part]["angles"] = list(content[part]["angles"])
+        content[part]["projections"] = np.asfortranarray(content[part]["projections"])
+    (tmp_path / "chest.pickle").write_bytes(pickle.dumps(content))
+    assert_same(import_scan(tmp_path / "chest.pickle", ImportOptions(part="all")), make_truth())
+
+
+def test_a_flat_value_wins_over_flats(tmp_path, make_truth) -> None:
+    path = w.write_data_exchange(tmp_path / "scan.h5", make_truth())
+    usual, flat = (import_scan(path, ImportOptions(**CONE, flat_value=v)).projections for v in (None, w.AIR))
+    assert np.abs(usual - flat).max() > 0.05
+
+
+@pytest.mark.parametrize(("axis", "direction"), [("columns", 1), ("rows", -1)])
+def test_phyradgs(tmp_path, make_truth, assert_same, axis, direction) -> None:
+    """The first stored line is read first: the left column, or the top row, which is our last."""
+    truth = make_truth(fly=True, axis=axis, direction=direction)
+    path = w.write_phyradgs(tmp_path / "phyradgs", truth)
+    assert recognise(path) == "phyradgs"
+    options = ImportOptions(exposure_s=0.4, readout_axis=None if axis == "columns" else axis)
+    assert_same(import_scan(path, options), truth)
+
+
+def test_a_phyradgs_folder_can_be_read_at_rest(tmp_path, make_truth, assert_same) -> None:
+    path = w.write_phyradgs(tmp_path / "phyradgs", make_truth(fly=True))
+    assert_same(import_scan(path, form="r2"), make_truth())
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_naf(tmp_path, make_truth, assert_same, protocol) -> None:
+    truth = make_truth()
+    path = w.write_naf(tmp_path / "chest_50.pickle", truth, protocol)
+    assert recognise(path) == "naf"
+    assert import_scan(path).frames == truth.scan.frames - 2
+    assert_same(import_scan(path, ImportOptions(part="all")), truth)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.dtype(">f4"), np.dtype(">f8")])
+def test_naf_in_other_number_types(tmp_path, make_truth, assert_same, dtype) -> None:
+    path = w.write_naf(tmp_path / "chest_50.pkl", make_truth(), dtype=dtype)
+    assert_same(import_scan(path, ImportOptions(part="all")), make_truth())
+
+
+@pytest.mark.parametrize("name", ["projections.mha", "projections.mhd"])
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("flip", [False, True])
+def test_rtk(tmp_path, make_truth, assert_same, flip, compressed, name) -> None:
+    truth = make_truth()
+    path = w.write_rtk(tmp_path / "rtk", truth, flip, compressed, name)
+    assert recognise(path) == "rtk" and recognise(path / "geometry.xml") == "rtk"
+    assert_same(import_scan(path), truth, grid=False)
+
+
+def test_rtk_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns", direction=-1)
+    assert_same(import_scan(w.write_rtk(tmp_path / "rtk", truth), FLY), truth, grid=False)
+
+
+def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth()
+    path = w.write_data_exchange(tmp_path / "scan.h5", truth, dead=(2, 11))
+    assert recognise(path) == "data-exchange"
+    scan = import_scan(path, ImportOptions(**CONE))
+    assert_same(scan, truth, grid=False)
+    assert scan.pixel_mask.shape == truth.scan.geometry.detector_shape
+    assert list(zip(*np.nonzero(scan.pixel_mask), strict=True)) == [(2, 11)]
+
+
+def test_data_exchange_with_mean_flats_and_darks(tmp_path, make_truth, assert_same) -> None:
+    """Some beamlines store one mean image (v, u), without an axis of frames."""
+    path = w.write_data_exchange(tmp_path / "scan.h5", make_truth())
+    with h5py.File(path, "r+") as file:
+        for name in ("data_white", "data_dark"):
+            mean = file[f"exchange/{name}"][()].mean(axis=0)
+            del file[f"exchange/{name}"]
+            file[f"exchange/{name}"] = mean
+    assert_same(import_scan(path, ImportOptions(**CONE)), make_truth(), grid=False)
+
+
+def test_data_exchange_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns", direction=-1)
+    path = w.write_data_exchange(tmp_path / "scan.h5", truth)
+    assert_same(import_scan(path, replace(FLY, **CONE)), truth, grid=False)
+
+
+@pytest.mark.parametrize("flips", [(False, False), (True, False), (False, True), (True, True)])
+def test_nxtomo(tmp_path, make_truth, assert_same, flips) -> None:
+    geometry = replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0))
+    truth = make_truth(geometry=geometry)
+    path = w.write_nxtomo(tmp_path / "theirs.nx", truth, flips)
+    assert recognise(path) == "nxtomo"
+    scan = import_scan(path)
+    assert_same(scan, truth, grid=False, timing=False)
+    assert scan.shutter.exposure_s == pytest.approx(0.4) and scan.title == "theirs"
+
+
+def test_nxtomo_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns", direction=-1)
+    path = w.write_nxtomo(tmp_path / "theirs.nx", truth)
+    options = replace(FLY, exposure_s=None, detector_offset_mm=(4.0, -6.0))
+    assert_same(import_scan(path, options), truth, grid=False)
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_tiff(tmp_path, make_truth, assert_same, compression) -> None:
+    truth = make_truth()
+    path = w.write_tiff(tmp_path / "tiff", truth, dead=(7, 3), compression=compression)
+    assert recognise(path) == "tiff"
+    scan = import_scan(path)
+    truth = replace(truth, scan=replace(truth.scan, reference=None))
+    assert_same(scan, truth, grid=False)
+    assert scan.grid.shape == truth.scan.grid.shape
+    np.testing.assert_allclose(scan.grid.offset_mm, truth.scan.grid.offset_mm)
+    assert list(zip(*np.nonzero(scan.pixel_mask), strict=True)) == [(7, 3)]
+
+
+TIMING = """[timing]
+exposure_s = 0.4
+readout_s = 0.3
+{when}
+[readout]
+axis = "columns"
+direction = -1
+"""
+
+
+@pytest.mark.parametrize("when", ["frame_time_s = 1.25", "start_s = [0, 1.25, 2.5, 3.75, 5, 6.25]"])
+def test_tiff_with_timing(tmp_path, make_truth, assert_same, when) -> None:
+    truth = make_truth(fly=True, axis="columns", direction=-1)
+    angles = "first_deg = 10.0\nstep_deg = 25.0"
+    path = w.write_tiff(tmp_path / "tiff", truth, TIMING.format(when=when), angles)
+    assert_same(import_scan(path), truth, grid=False)
+
+
+def test_angles_in_the_middle_of_the_exposure(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns", direction=-1)
+    middle_deg = np.rad2deg(truth.angle_rad) + 25.0 * 0.5 * 0.4 / 1.25
+    angles = f"first_deg = {middle_deg[0]}\nlast_deg = {middle_deg[-1]}\nat = 'middle'"
+    path = w.write_tiff(tmp_path / "tiff", truth, TIMING.format(when="frame_time_s = 1.25"), angles)
+    assert_same(import_scan(path), truth, grid=False)
+
+
+def test_stored_words_can_be_overruled(tmp_path, make_truth, assert_same) -> None:
+    """Frames stored bottom up and mirrored, angles of the sample: the options say so, the file does not."""
+    truth = make_truth()
+    path = w.write_tiff(
+        tmp_path / "tiff", truth, angles=f"values_deg = {(-np.rad2deg(truth.angle_rad)).tolist()}"
+    )
+    for file in path.glob("*.tif"):
+        image = w.tifffile.imread(file)
+        w.tifffile.imwrite(file, np.ascontiguousarray(image[::-1, ::-1]))
+    options = ImportOptions(row_0="bottom", column_0="right", rotates="sample")
+    assert_same(import_scan(path, options), truth, grid=False)
+
+
+def test_every_format_has_its_test() -> None:
+    tested = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    names = {"r2": "r2_gaussian"}
+    apart = {"phyradgs-real"}  # test_phyradgs_real.py
+    for form in set(FORMATS) - apart:
+        assert names.get(form, form.replace("-", "_")) in tested

@@ -1,0 +1,284 @@
+"""Foreign files written as their own programs write them, from a Truth; nothing of the importers is used here."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pint
+import SimpleITK as sitk
+import tifffile
+from nxtomo.application import nxtomo
+
+AIR, DARK = 50000.0, 300.0
+
+
+# --- R2-Gaussian, PhyRadGS: images and volumes as TIGRE's users store them -------------------------------------
+
+
+def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
+    """meta_data.json's scanner; lengths in scene units."""
+    g, grid = truth.scan.geometry, truth.scan.grid
+    return {
+        "mode": "cone",
+        "DSD": g.source_to_detector_mm / unit_mm,
+        "DSO": g.source_to_axis_mm / unit_mm,
+        "nDetector": list(g.detector_shape),
+        "sDetector": [n * d / unit_mm for n, d in zip(g.detector_shape, g.pixel_size_mm, strict=True)],
+        "nVoxel": list(grid.shape[::-1]),
+        "sVoxel": [s / unit_mm for s in grid.size_mm[::-1]],
+        "offOrigin": [o / unit_mm for o in grid.offset_mm[::-1]],
+        "offDetector": [g.detector_offset_mm[1] / unit_mm, g.detector_offset_mm[0] / unit_mm],
+        "accuracy": 0.5,
+    }
+
+
+def write_r2(folder: Path, truth: Any, unit_mm: float = 1.0, test: int = 2) -> Path:
+    """An R2-Gaussian folder: the last ``test`` frames are held out."""
+    folder.mkdir()
+    meta: dict[str, Any] = {
+        "scanner": scanner_table(truth, unit_mm),
+        "vol": "vol_gt.npy",
+        "bbox": [[-1] * 3, [1] * 3],
+    }
+    np.save(folder / "vol_gt.npy", np.transpose(truth.scan.reference, (2, 1, 0)) * unit_mm)
+    count = truth.scan.frames - test
+    for part, frames in (("train", range(count)), ("test", range(count, truth.scan.frames))):
+        (folder / f"proj_{part}").mkdir()
+        meta[f"proj_{part}"] = []
+        for i in frames:
+            name = f"proj_{part}/{i:04d}.npy"
+            np.save(folder / name, truth.scan.projections[i][::-1])
+            meta[f"proj_{part}"].append({"file_path": name, "angle": float(truth.angle_rad[i])})
+    (folder / "meta_data.json").write_text(json.dumps(meta))
+    return folder
+
+
+def write_phyradgs(folder: Path, truth: Any) -> Path:
+    """A synthetic PhyRadGS folder: the same, with where first and last lines began and ended."""
+    write_r2(folder, truth, test=0)
+    shutter, sweeps = truth.scan.shutter, truth.scan.trajectory.kinematics
+    arc = sweeps.angle_end_rad - sweeps.angle_start_rad
+    meta = json.loads((folder / "meta_data.json").read_text())
+    meta["simulate_train"] = [
+        {
+            "file_path": entry["file_path"],
+            "angle": entry["angle"],
+            "first_line_start": entry["angle"],
+            "first_line_end": entry["angle"] + a,
+            "last_line_end": entry["angle"] + a * (1 + shutter.readout_s / shutter.exposure_s),
+        }
+        for entry, a in zip(meta["proj_train"], arc, strict=True)
+    ]
+    meta["simulate_test"] = meta["simulate_train"][:1]
+    (folder / "meta_data_motion_blur_rolling_shutter_fps18.json").write_text(json.dumps(meta))
+    return folder
+
+
+def naf_dict(truth: Any, dtype: type = np.float32) -> dict[str, object]:
+    """A NAF dictionary: mm, densities per metre, the last two frames for validation."""
+    g, grid, frames = truth.scan.geometry, truth.scan.grid, truth.scan.projections[:, ::-1].astype(dtype)
+    count = len(frames) - 2
+    return {
+        "numTrain": count,
+        "numVal": 2,
+        "DSD": g.source_to_detector_mm,
+        "DSO": g.source_to_axis_mm,
+        "nDetector": list(g.detector_shape),
+        "dDetector": list(g.pixel_size_mm),
+        "nVoxel": list(grid.shape[::-1]),
+        "dVoxel": list(grid.voxel_size_mm[::-1]),
+        "offOrigin": list(grid.offset_mm[::-1]),
+        "offDetector": [g.detector_offset_mm[1], g.detector_offset_mm[0]],
+        "image": np.transpose(truth.scan.reference, (2, 1, 0)) * 1e3,
+        "train": {"angles": truth.angle_rad[:count], "projections": frames[:count]},
+        "val": {"angles": truth.angle_rad[count:], "projections": frames[count:]},
+    }
+
+
+def write_naf(path: Path, truth: Any, protocol: int = 4, dtype: type = np.float32) -> Path:
+    path.write_bytes(pickle.dumps(naf_dict(truth, dtype), protocol))
+    return path
+
+
+# --- PhyRadGS's real scans ------------------------------------------------------------------------------------
+
+
+def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """Views with 4×4 detector matrices (image x, image y downwards, away from the source) and 16-bit counts.
+
+    The circles may be centred off the axis; matrices are given where the panel stands in the middle of the exposure.
+    """
+    scan, g = truth.scan, truth.scan.geometry
+    sweeps, ratio = scan.trajectory.kinematics, scan.shutter.readout_s / scan.shutter.exposure_s
+    (folder / "projections").mkdir(parents=True)
+    centre = np.array([*centre_mm, 0.0])
+    off_v, off_u = g.detector_offset_mm
+    assert off_u == 0, "source and panel face each other in this writer"
+    views = []
+    for i in range(scan.frames):
+        a, b = sweeps.angle_start_rad[i], sweeps.angle_end_rad[i]
+        marks = np.rad2deg([a, b, a + ratio * (b - a), b + ratio * (b - a)])
+        names = ("first_row_start_angle", "first_row_end_angle", "last_row_start_angle", "last_row_end_angle")
+        half = (a + b) / 2
+        radial = np.array([np.cos(half), np.sin(half), 0])
+        x, y = np.array([-np.sin(half), np.cos(half), 0]), np.array([0, 0, -1.0])
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, y, np.cross(x, y)
+        matrix[:3, 3] = centre - (g.source_to_detector_mm - g.source_to_axis_mm) * radial + [0, 0, off_v]
+        views.append({
+            "source": (centre + g.source_to_axis_mm * radial).tolist(),
+            "detector": matrix.tolist(),
+            "rolling_shutter": {
+                "source": {"z": 0.0, **dict(zip(names, marks.tolist(), strict=True))},
+                "detector": {"z": off_v, **dict(zip(names, (marks + 180).tolist(), strict=True))},
+            },
+        })  # fmt: skip
+        counts = np.round(AIR * np.exp(-scan.projections[i].astype(np.float64)))[::-1].astype(np.uint16)
+        tifffile.imwrite(folder / "projections" / f"{i}.tif", counts)
+    behind = g.source_to_detector_mm - g.source_to_axis_mm
+    circles = {
+        "detector": {"center": [*centre_mm, off_v], "radius": behind},
+        "source": {"center": [*centre_mm, 0.0], "radius": g.source_to_axis_mm},
+    }
+    text = json.dumps({"views": views, "rolling_shutter_geometry": circles})
+    (folder / "geometric_motion_rs.json").write_text(text)
+    return folder
+
+
+# --- RTK ------------------------------------------------------------------------------------------------------
+
+
+def write_rtk(
+    folder: Path, truth: Any, flip: bool = False, compressed: bool = False, name: str = "projections.mha"
+) -> Path:
+    """RTK's XML with its constants at the top, and a stack by SimpleITK; ``flip`` stores rows from the top."""
+    folder.mkdir()
+    g = truth.scan.geometry
+    (nv, nu), (dv, du), (off_v, off_u) = g.detector_shape, g.pixel_size_mm, g.detector_offset_mm
+    angles = "".join(
+        f"  <Projection>\n    <GantryAngle>{np.rad2deg(a):.15g}</GantryAngle>\n  </Projection>\n"
+        for a in truth.angle_rad
+    )
+    # a part of the offset in the geometry, the rest in the stack's own origin
+    (folder / "geometry.xml").write_text(
+        '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n'
+        f"  <SourceToIsocenterDistance>{g.source_to_axis_mm}</SourceToIsocenterDistance>\n"
+        f"  <SourceToDetectorDistance>{g.source_to_detector_mm}</SourceToDetectorDistance>\n"
+        f"  <ProjectionOffsetX>{off_u}</ProjectionOffsetX>\n{angles}</RTKThreeDCircularGeometry>\n"
+    )
+    frames = truth.scan.projections
+    stack = sitk.GetImageFromArray(np.ascontiguousarray(frames[:, ::-1] if flip else frames))
+    stack.SetSpacing((du, dv, 1.0))
+    low, high = off_v - (nv - 1) / 2 * dv, off_v + (nv - 1) / 2 * dv
+    stack.SetOrigin((-(nu - 1) / 2 * du, high if flip else low, 0.0))
+    if flip:
+        stack.SetDirection((1, 0, 0, 0, -1, 0, 0, 0, 1))
+    sitk.WriteImage(stack, str(folder / name), useCompression=compressed)
+    return folder
+
+
+# --- HDF5 of beamlines ------------------------------------------------------------------------------------------
+
+
+def counts(truth: Any, dead: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Projections, flats and darks in counts, float32; the flat field is uneven, ``dead`` (row, column) sees nothing."""
+    shape = truth.scan.geometry.detector_shape
+    ramp = AIR * (1 + 0.1 * np.linspace(-1, 1, shape[0])[:, None] + 0.05 * np.linspace(-1, 1, shape[1]))
+    dark = DARK + np.arange(shape[1])
+    frames = dark + (ramp - dark) * np.exp(-truth.scan.projections.astype(np.float64))
+    flats, darks = np.stack([ramp, ramp]), np.broadcast_to(dark, (3, *shape)).copy()
+    if dead is not None:
+        frames[:, dead[0], dead[1]] = flats[:, dead[0], dead[1]] = DARK
+        darks[:, dead[0], dead[1]] = DARK
+    return frames, flats, darks
+
+
+def write_data_exchange(path: Path, truth: Any, dead: tuple[int, int] | None = None) -> Path:
+    """/exchange as beamlines write it: rows from the top, angles of the sample in degrees."""
+    frames, flats, darks = counts(truth, dead)
+    with h5py.File(path, "w") as file:
+        file["implements"] = "exchange:measurement"
+        for name, stack in (("data", frames), ("data_white", flats), ("data_dark", darks)):
+            file[f"exchange/{name}"] = stack[:, ::-1]
+        file["exchange/theta"] = -np.rad2deg(truth.angle_rad)
+        file["exchange/theta"].attrs["units"] = "deg"
+        detector = file.create_group("measurement/instrument/detector")
+        for axis, pitch in zip("yx", truth.scan.geometry.pixel_size_mm, strict=True):
+            detector[f"pixel_size_{axis}"] = pitch * 1e3
+            detector[f"pixel_size_{axis}"].attrs["units"] = "um"
+    return path
+
+
+def write_nxtomo(path: Path, truth: Any, flips: tuple[bool, bool] = (False, False)) -> Path:
+    """By the nxtomo package: flats and darks among the frames, no timing; flips (up-down, left-right) declared."""
+    units, g = pint.get_application_registry(), truth.scan.geometry
+    frames, flats, darks = counts(truth)
+    stack = np.concatenate([darks[:1], flats[:1], frames, flats[1:]])
+    if flips[0]:
+        stack = stack[:, ::-1]
+    if flips[1]:
+        stack = stack[:, :, ::-1]
+    tomo = nxtomo.NXtomo()
+    tomo.title = "theirs"
+    detector = tomo.instrument.detector
+    detector.data = np.ascontiguousarray(stack.astype(np.float32))
+    detector.image_key_control = [2, 1, *[0] * len(frames), 1]
+    detector.y_pixel_size, detector.x_pixel_size = (pitch * units.mm for pitch in g.pixel_size_mm)
+    detector.distance = (g.source_to_detector_mm - g.source_to_axis_mm) / 1000 * units.m
+    detector.count_time = np.full(len(stack), 0.4) * units.s
+    column = -g.detector_offset_mm[1] / g.pixel_size_mm[1]
+    detector.x_rotation_axis_pixel_position = -column if flips[1] else column
+    detector.set_transformation_from_ud_flipped(flips[0])
+    detector.set_transformation_from_lr_flipped(flips[1])
+    tomo.instrument.source.distance = -g.source_to_axis_mm / 1000 * units.m
+    angle_deg = -np.rad2deg(truth.angle_rad)
+    tomo.sample.rotation_angle = np.concatenate([[0, 0], angle_deg, [angle_deg[-1]]]) * units.degree
+    tomo.save(str(path), "entry0000")
+    return path
+
+
+# --- TIFF -------------------------------------------------------------------------------------------------------
+
+
+def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = None, **options: Any) -> Path:
+    """A folder of float TIFFs, flats and darks by tifffile, and scan.toml."""
+    folder.mkdir()
+    frames, flats, darks = counts(truth, options.get("dead"))
+    for name, stack in (("proj", frames), ("flat", flats), ("dark", darks)):
+        for i, image in enumerate(stack):
+            tifffile.imwrite(
+                folder / f"{name}_{i}.tif",
+                image[::-1].astype(np.float64),
+                compression=options.get("compression"),
+            )
+    g, grid = truth.scan.geometry, truth.scan.grid
+    angles = angles or f"values_deg = {np.rad2deg(truth.angle_rad).tolist()}"
+    (folder / "scan.toml").write_text(
+        f"""title = "tiff"
+[frames]
+projections = "proj_*.tif"
+flats = "flat_*.tif"
+darks = "dark_*.tif"
+[source]
+to_axis_mm = {g.source_to_axis_mm}
+to_detector_mm = {g.source_to_detector_mm}
+[detector]
+pixel_size_v_mm = {g.pixel_size_mm[0]}
+pixel_size_u_mm = {g.pixel_size_mm[1]}
+offset_v_mm = {g.detector_offset_mm[0]}
+offset_u_mm = {g.detector_offset_mm[1]}
+[volume]
+shape = {list(grid.shape)}
+size_mm = {list(grid.size_mm)}
+offset_mm = {list(grid.offset_mm)}
+[angles]
+{angles}
+{timing}
+"""
+    )
+    return folder

@@ -1,0 +1,95 @@
+"""One run an output: locks that end with their process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from phyradgs_cl.errors import OutputError
+from phyradgs_cl.io import only_run
+from phyradgs_cl.io.lock import lock_path
+
+HOLD = """
+import sys, time
+from phyradgs_cl.io import only_run
+with only_run(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that is at work on volume.h5."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "volume.h5")], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_a_second_run_is_refused_with_the_first_ones_number(tmp_path, holder) -> None:
+    with pytest.raises(OutputError, match=f"process {holder.pid}"), only_run(tmp_path / "volume.h5"):
+        pass
+
+
+def test_other_outputs_do_not_matter(tmp_path, holder) -> None:
+    with only_run(tmp_path / "other.h5"):
+        assert holder.poll() is None
+
+
+def test_a_dead_runs_lock_is_taken_over(tmp_path, holder) -> None:
+    holder.kill()
+    holder.wait()
+    assert lock_path(tmp_path / "volume.h5").exists()
+    with only_run(tmp_path / "volume.h5"):
+        assert lock_path(tmp_path / "volume.h5").read_text() == f"{os.getpid()}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_links_to_one_file_are_one_output(tmp_path, holder) -> None:
+    (tmp_path / "link.h5").symlink_to(tmp_path / "volume.h5")
+    with pytest.raises(OutputError, match="another run"), only_run(tmp_path / "link.h5"):
+        pass
+
+
+def test_a_failing_run_leaves_no_lock(tmp_path) -> None:
+    with pytest.raises(ZeroDivisionError), only_run(tmp_path / "volume.h5"):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    lock_path(tmp_path / "volume.h5").symlink_to(victim)
+    with pytest.raises(OutputError, match="lock"), only_run(tmp_path / "volume.h5"):
+        pass
+    assert victim.read_text() == "precious"
+
+
+def test_of_many_runs_at_once_one_wins(tmp_path) -> None:
+    count = 6
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(tmp_path / "volume.h5")],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        for _ in range(count)
+    ]
+    deadline = time.monotonic() + 60
+    while sum(p.poll() is not None for p in processes) < count - 1 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    alive = [p for p in processes if p.poll() is None]
+    for process in alive:
+        process.kill()
+        process.wait()
+    assert len(alive) == 1

@@ -1,0 +1,184 @@
+"""Runs every kernel, small and odd, on Oclgrind: `make test-oclgrind`. Not a test that pytest collects.
+
+    python tests/oclgrind/every_kernel.py               all cases, a process each
+    python tests/oclgrind/every_kernel.py BUILD CASE    one case; prints the kernels that it launched
+
+Oclgrind interprets kernels and reports accesses outside of buffers, data races and reads of memory that nobody wrote. Its
+log has to stay empty, and every kernel of cl/ has to have run. Each case has a process of its own because Oclgrind 21.10
+takes memory at an address that was freed for unwritten. Its min and max of a vector and a scalar are wrong beyond the first
+lane, so that builds with vectors cannot be run on it. Its check for unwritten memory knows neither float3 nor the compiler's
+"freeze", so that it is left out where kernels have them; bounds and races are checked in all.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Protocol, Scan, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import DeviceCells, SplatProjector, voxelise
+from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
+
+KERNELS = Path(__file__).resolve().parents[2] / "cl"
+SHAPE, GRID = (5, 7), Grid((5, 6, 7), (0.3, 0.28, 0.25), (0.1, 0.0, -0.1))
+GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
+SPLATTING = ("phyradgs", "r2")
+FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
+VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing")
+BUILDS = {
+    "lanes 1": {"lanes": 1},
+    "a GPU's": {"lanes": 1, "pixel_items": True},
+    "float pairs": {"lanes": 1, "fp64": False},
+}
+
+
+def filled_by_copy(self: Runtime, array: DeviceArray, value: float) -> None:
+    """Oclgrind does not note that filled memory has been written; copied memory it does."""
+    self.write(array, np.full(array.size, value, array.dtype))
+
+
+def cloud(count: int) -> np.ndarray:
+    rng = np.random.default_rng(count)
+    quaternion = rng.normal(size=(4, count))
+    parts = [
+        rng.uniform(-0.6, 0.6, (3, count)),
+        rng.uniform(0.05, 0.3, (3, count)),
+        quaternion / np.linalg.norm(quaternion, axis=0),
+        rng.uniform(0.5, 1.0, (1, count)),
+    ]
+    rows = np.concatenate(parts)
+    rows[:3, :1] = [[40.0], [0.0], [0.0]]  # one behind the source
+    return rows
+
+
+OPTIONS = {
+    "exact": {},
+    "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
+    "intensity, pixels": {"intensity_unit": 2.0, "pixel_footprint": True},
+}
+MODELS: dict[str, Callable[..., TimeCells]] = {
+    "still": static_cells,
+    "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
+    "moving": lambda *where: exact_cells(*where, 2),
+}
+
+
+def splats(rt: Runtime, model: str, options: str) -> None:
+    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
+    table = MODELS[model](orbit, shutter, 0, 0.0, SHAPE[1])
+    projector = SplatProjector(rt, SHAPE[1], SHAPE[0], **OPTIONS[options])  # type: ignore[arg-type]
+    projector.project_adjoint(cloud(3), DeviceCells.upload(rt, table), np.ones(SHAPE[::-1], np.float32))
+
+
+def nothing(rt: Runtime) -> None:
+    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "rows", 1)
+    cells = DeviceCells.upload(rt, exact_cells(orbit, shutter, 0, 0.0, SHAPE[0], 2))
+    SplatProjector(rt, *SHAPE).project(np.zeros((11, 0)), cells)
+    voxelise(rt, cloud(3), GRID)
+    rt.launch(rt.kernel("rates", "multiply_add"), 4, np.int32(3), np.float32(0.5), rt.zeros(4))
+
+
+def tiny_scan(rt: Runtime, model: str) -> Scan:
+    volume = np.random.default_rng(0).uniform(0, 1, GRID.shape).astype(np.float32)
+    source = VolumeSource(rt, volume, GRID, GEOMETRY, "rows")
+    options = SimulationOptions(Protocol(views=3, exposure_deg=20.0), detector_model=model, time_samples=2)
+    return simulate(source, GEOMETRY, GRID, options)
+
+
+def method(rt: Runtime, name: str, motion: str) -> None:
+    """A method on a scan of three frames, in the intensity model where it follows the motion."""
+    scan = tiny_scan(rt, "log" if motion == "static" else "intensity")
+    changes: dict[str, object] = {"motion": motion}
+    if name in SPLATTING:
+        control = {"every": 2, "start_iteration": 0, "threshold": 1e-9}
+        changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0, "shape_weight": 0.1}
+        changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
+    elif name != "fdk":
+        changes["iterations"] = 1
+    reconstruct(scan, name, rt, method_options(name, None, changes))
+
+
+def cases() -> dict[str, Callable[[Runtime], None]]:
+    found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing}
+    for model in MODELS:
+        for options in OPTIONS:
+            found[f"splats {model} {options}"] = partial(splats, model=model, options=options)
+    for name in METHODS:
+        for motion in ("static", "exact" if name in SPLATTING else "per-row"):
+            found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
+    return found
+
+
+def kernel_names() -> set[str]:
+    sources = (path.read_text(encoding="utf-8") for path in KERNELS.glob("*.cl"))
+    return {name for text in sources for name in re.findall(r"__kernel\s+void\s+(\w+)", text)}
+
+
+def run_one(build: str, case: str) -> int:
+    """One case in this process; the names of its kernels on stdout."""
+    launched: set[str] = set()
+    launch = Runtime.launch
+
+    def noted(self: Runtime, kernel: object, *args: object, **options: object) -> None:
+        launched.add(kernel.function_name)  # type: ignore[attr-defined]
+        launch(self, kernel, *args, **options)  # type: ignore[arg-type]
+
+    Runtime.launch, Runtime.fill = noted, filled_by_copy  # type: ignore[method-assign,assignment]
+    cases()[case](Runtime("oclgrind", **BUILDS[build]))  # type: ignore[arg-type]
+    print(" ".join(sorted(launched)))
+    return 0
+
+
+def checked(build: str, case: str, log: Path) -> tuple[set[str], str]:
+    """The kernels of a case in a process of its own, and what is wrong with them ("" if nothing)."""
+    log.unlink(missing_ok=True)
+    unwritten = build not in FREEZES and not case.startswith(VECTORS_OR_FREEZES)
+    checks = {"OCLGRIND_DATA_RACES": "1", **({"OCLGRIND_UNINITIALIZED": "1"} if unwritten else {})}
+    done = subprocess.run(
+        [sys.executable, __file__, build, case],
+        env={**os.environ, **checks, "OCLGRIND_LOG": str(log)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    reports = log.read_text(encoding="utf-8") if log.exists() else ""
+    if done.returncode:
+        reports += f"ended with {done.returncode}: {done.stderr[-1500:]}"
+    return set(done.stdout.split()), reports
+
+
+def main() -> int:
+    if len(sys.argv) == 3:
+        return run_one(*sys.argv[1:])
+    launched: set[str] = set()
+    bad = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for build in BUILDS:
+            for case in cases():
+                kernels, reports = checked(build, case, Path(folder) / "log")
+                launched |= kernels
+                if reports:
+                    bad += 1
+                    print(f"{build}, {case}:\n{reports[:3000]}", flush=True)
+            print(f"{build}: {len(cases())} cases", flush=True)
+    missing = kernel_names() - launched
+    if missing:
+        print(f"not run: {', '.join(sorted(missing))}")
+    print(f"{len(launched)} kernels, {bad} cases with reports")
+    return int(bool(missing or bad))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""The page in a real browser: not a part of the test suite, because it needs one.
+
+    pip install playwright; apt-get install chromium
+    pytest tests/report/browser_page.py [--basetemp FOLDER]
+
+PHYRADGS_CHROMIUM names the browser's program if it is not on the path.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from phyradgs_cl.report import write_report
+
+WIDTHS = (1280, 390)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    program = os.environ.get("PHYRADGS_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def address(rt, files, tmp_path_factory) -> str:
+    page = tmp_path_factory.mktemp("browser") / "page.html"
+    write_report(files[1], page, lambda: rt)
+    return page.as_uri()
+
+
+@pytest.fixture(params=WIDTHS)
+def page(request, browser, address) -> Iterator[Page]:
+    """The page at a desktop's and a phone's width; anything that it complains of or asks for fails the test."""
+    page = browser.new_page(viewport={"width": request.param, "height": 800})
+    trouble: list[str] = []
+    page.on("console", lambda message: trouble.append(message.text))
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.on("request", lambda asked: asked.url.startswith(("data:", address)) or trouble.append(asked.url))
+    page.goto(address)
+    yield page
+    page.close()
+    assert not trouble
+
+
+def place(page: Page, plane: str) -> str:
+    return page.locator(f"#place-{plane}").inner_text()
+
+
+def picture(page: Page, plane: str) -> str:
+    return page.locator(f"#plane-{plane} img").get_attribute("src") or ""
+
+
+def test_nothing_is_wider_than_the_window(page) -> None:
+    assert page.evaluate("document.documentElement.scrollWidth") == page.viewport_size["width"]
+    assert page.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+
+
+def test_a_slider_moves_by_keys(page) -> None:
+    slider = page.locator("#slider-axial")
+    before = picture(page, "axial")
+    slider.focus()
+    page.keyboard.press("ArrowRight")
+    assert "8 of 12" in place(page, "axial") and picture(page, "axial") != before
+    assert slider.get_attribute("aria-valuetext") == place(page, "axial")
+    page.keyboard.press("Home")
+    assert " 1 of 12" in place(page, "axial")
+    page.keyboard.press("End")
+    assert "12 of 12" in place(page, "axial")
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+
+
+def test_a_slider_moves_by_mouse(page) -> None:
+    slider = page.locator("#slider-coronal")
+    slider.scroll_into_view_if_needed()
+    box = slider.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] - 2, box["y"] + box["height"] / 2, steps=4)
+    page.mouse.up()
+    assert "12 of 12" in place(page, "coronal")
+
+
+def test_a_click_in_a_picture_moves_the_other_two(page) -> None:
+    images = page.locator("#plane-axial .picture")
+    images.scroll_into_view_if_needed()
+    box = images.bounding_box()
+    images.click(position={"x": box["width"] * 0.1, "y": box["height"] * 0.9})
+    assert " 2 of 12" in place(page, "sagittal") and " 2 of 12" in place(page, "coronal")
+    assert "7 of 12" in place(page, "axial")
+    assert page.locator("#plane-axial .upwards").evaluate("e => parseFloat(e.style.left)") == pytest.approx(
+        12.5
+    )
+    assert page.locator("#plane-axial .across").evaluate("e => parseFloat(e.style.top)") == pytest.approx(
+        87.5
+    )
+
+
+def test_layers_change_all_pictures(page) -> None:
+    before = [picture(page, plane) for plane in ("axial", "coronal", "sagittal")]
+    page.locator("#layer-truth").check()
+    after = [picture(page, plane) for plane in ("axial", "coronal", "sagittal")]
+    assert all(a != b for a, b in zip(after, before, strict=True))
+    page.keyboard.press("ArrowRight")
+    assert page.locator("#layer-difference").is_checked()
+    assert picture(page, "axial") not in (before[0], after[0])
+
+
+def test_tab_reaches_every_control(page) -> None:
+    reached = []
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("document.activeElement.id || document.activeElement.tagName"))
+    assert {"slider-axial", "slider-coronal", "slider-sagittal", "layer-result", "SUMMARY"} <= set(reached)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_both_schemes_have_their_colours(browser, address, scheme) -> None:
+    page = browser.new_page(color_scheme=scheme)
+    page.goto(address)
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert ground == {"light": "rgb(246, 247, 249)", "dark": "rgb(18, 22, 28)"}[scheme]
+    page.close()
+
+
+def test_without_script_the_middle_slices_stay(browser, address) -> None:
+    page = browser.new_context(java_script_enabled=False).new_page()
+    page.goto(address)
+    assert page.locator("#plane-axial img").is_visible()
+    assert not page.locator("#slider-axial").is_visible() and not page.locator(".choice").is_visible()
+    page.close()
+
+
+def test_pictures_for_the_documentation(browser, address, tmp_path: Path) -> None:
+    """The first screens, at both widths, for a look."""
+    for width, height in ((1280, 800), (390, 844)):
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.goto(address)
+        page.screenshot(path=tmp_path / f"page_{width}.png")
+        assert (tmp_path / f"page_{width}.png").stat().st_size > 10_000
+        page.close()

@@ -1,0 +1,104 @@
+"""A small fly-scan with its truth, and a reconstruction of it, as files."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import write_scan
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
+
+VOID = {"br", "img", "input", "link", "meta"}
+
+
+class Page(HTMLParser):
+    """A page as elements (tag, attributes), texts by tag, and what was opened and never closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.texts: dict[str, list[str]] = {}
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {key: value or "" for key, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        if self.open:
+            self.texts.setdefault(self.open[-1], []).append(data)
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    @property
+    def ids(self) -> list[str]:
+        return [attributes["id"] for _, attributes in self.elements if "id" in attributes]
+
+    @property
+    def words(self) -> str:
+        shown = (
+            text for tag, texts in self.texts.items() if tag not in ("style", "script") for text in texts
+        )
+        return " ".join(" ".join(shown).split())
+
+
+def make_scan(rt, **changes: object) -> Scan:
+    """12³ voxels, 8 frames of 16 × 14 pixels; ``changes`` are those of the simulation."""
+    geometry = ConeGeometry(5.0, 7.0, (16, 14), (0.25, 0.25))
+    axis = str(changes.get("readout_axis", "rows"))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, axis, 0)
+    protocol = changes.pop("protocol", make_protocol("rapid", views=8, exposure_deg=20.0))
+    options = SimulationOptions(protocol=protocol, **changes)
+    return simulate(
+        scene.source, geometry, scene.grid, options, reference=scene.reference, title="a <b>small</b> scan"
+    )
+
+
+@pytest.fixture(scope="session")
+def scan_maker(rt):
+    return lambda **changes: make_scan(rt, **changes)
+
+
+@pytest.fixture(scope="session")
+def small_scan(rt) -> Scan:
+    return make_scan(rt)
+
+
+@pytest.fixture(scope="session")
+def files(rt, small_scan, tmp_path_factory) -> tuple[Path, Path]:
+    """Scan and volume files in one folder."""
+    folder = tmp_path_factory.mktemp("run")
+    scan, volume = folder / "scan.h5", folder / "volume.h5"
+    write_scan(scan, small_scan)
+    job = ReconstructionJob(
+        scan, volume, method="sart", changes={"motion": "micro-views", "strips": 3, "iterations": 3}
+    )
+    run_reconstruction(job, lambda: rt, lambda progress: None)
+    return scan, volume
+
+
+@pytest.fixture(scope="session")
+def any_volume() -> tuple[np.ndarray, Grid]:
+    """A volume whose three sides and voxel sizes differ, brighter upwards, away and to the right."""
+    grid = Grid((5, 6, 8), (0.3, 0.2, 0.1), (0.0, 0.1, 0.0))
+    z, y, x = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
+    return (100 * z + 10 * y + x).astype(np.float32), grid
+
+
+@pytest.fixture(scope="session")
+def parse() -> type[Page]:
+    return Page

@@ -1,0 +1,66 @@
+"""Elements, pictures and words that a page is made of."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from skimage import io
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.report.facts import flattened, label, number, shown, unit
+from phyradgs_cl.report.markup import Markup, element, joined, json_block, raw_text
+from phyradgs_cl.report.png import bytes_of, diverging, png_bytes
+from phyradgs_cl.report.slices import BUDGET_PIXELS, planes_of, windows_of
+
+
+def test_text_is_escaped_and_elements_are_not() -> None:
+    inner = element("b", "<&\"'")
+    assert inner == "<b>&lt;&amp;&quot;&#x27;</b>"
+    assert element("p", inner, title='"><script>') == f'<p title="&quot;&gt;&lt;script&gt;">{inner}</p>'
+    assert joined("<", Markup("<br>"), None, 3) == "&lt;<br>3"
+    assert element("input", checked=True, disabled=False, class_="a") == '<input checked class="a">'
+
+
+def test_data_cannot_end_their_block() -> None:
+    text = json_block("data", {"a": "</script><!--&"})
+    assert text.count("<") == 2
+    assert json.loads(text[text.index(">") + 1 : text.rindex("<")]) == {"a": "</script><!--&"}
+    with pytest.raises(ValueError):
+        raw_text("script", "'</SCRIPT>'")
+
+
+def test_a_png_holds_its_values(tmp_path) -> None:
+    image = np.arange(35, dtype=np.uint8).reshape(5, 7) * 7
+    (tmp_path / "grey.png").write_bytes(png_bytes(image))
+    assert np.array_equal(io.imread(tmp_path / "grey.png"), image)
+    (tmp_path / "colour.png").write_bytes(png_bytes(image, diverging()))
+    assert np.array_equal(io.imread(tmp_path / "colour.png")[..., :3], diverging()[image])
+
+
+def test_grey_values_are_clipped_to_their_window() -> None:
+    assert bytes_of(np.array([-1.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0).tolist() == [0, 0, 128, 255, 255]
+    assert bytes_of(np.array([3.0, 4.0]), 3.0, 3.0).tolist() == [0, 255]
+
+
+def test_facts_have_words_and_units() -> None:
+    facts = dict(flattened({"a": {"b_mm": 1.0}, "psnr_db": 3}))
+    assert facts == {"a.b_mm": 1.0, "psnr_db": 3}
+    assert (label("psnr_db"), unit("psnr_db")) == ("PSNR", "dB")
+    assert (label("unit_density_per_mm"), unit("unit_density_per_mm")) == ("unit density", "1/mm")
+    assert shown((1, 2.5), "mm").startswith("1 × 2.5")
+    assert [number(v) for v in (0.012345, -2.0, 1e-7, float("inf"))] == ["0.01235", "−2", "1·10⁻⁷", "∞"]
+
+
+def test_large_volumes_are_thinned_out_and_small_ones_are_whole() -> None:
+    volume = np.zeros((300, 4, 500), np.float32)
+    volume[:, :, :] = np.linspace(0, 1, 500, dtype=np.float32)
+    grid = Grid(volume.shape, (1.0, 2.0, 1.0))
+    planes = {plane.axis: plane for plane in planes_of(volume, None, grid, windows_of(volume, None))}
+    assert planes["y"].indices == [0, 1, 2, 3] and planes["y"].size_mm == (500.0, 300.0)
+    kept = planes["x"].indices
+    assert kept[0] == 0 and kept[-1] == 499 and len(kept) < 500 and np.ptp(np.diff(kept)) <= 1
+    assert planes["x"].positions_mm[0] == -249.5
+    edges = {"x": (192, 4), "y": (192, 192), "z": (4, 192)}
+    assert sum(len(planes[a].indices) * np.prod(edges[a]) for a in "xyz") <= BUDGET_PIXELS

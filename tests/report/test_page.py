@@ -1,0 +1,208 @@
+"""The page of a run: whole, on its own, with the right numbers, and safe from what files say."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from skimage import io
+from typer.testing import CliRunner
+
+from phyradgs_cl.commands.report import report_command
+from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.io import read_volume, write_scan, write_volume
+from phyradgs_cl.report import load_run, report_page, write_report
+from phyradgs_cl.report.projections import chosen_frames, computed_views
+
+ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
+HOSTILE = "</title></script><script>alert(1)</script><img src=x onerror='alert(2)'>\"'&amp;"
+
+
+@pytest.fixture(scope="module")
+def page_text(rt, files, tmp_path_factory) -> str:
+    page = tmp_path_factory.mktemp("page") / "page.html"
+    write_report(files[1], page, lambda: rt)
+    return page.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def page(page_text, parse):
+    return parse(page_text)
+
+
+def no_runtime() -> None:
+    raise AssertionError("no device is needed here")
+
+
+def decoded(source: str) -> np.ndarray:
+    """A picture of the page as pixels."""
+    kind, _, content = source.partition(",")
+    assert kind == "data:image/png;base64"
+    return io.imread(BytesIO(base64.b64decode(content, validate=True)))
+
+
+def test_a_page_has_every_section_once_and_every_link_leads_somewhere(page) -> None:
+    assert not page.open
+    assert len(page.ids) == len(set(page.ids))
+    assert set(page.ids) >= ALL
+    for link in page.all("a"):
+        assert link["href"].startswith("#") and link["href"][1:] in page.ids
+    for _, attributes in page.elements:
+        for key in ("aria-labelledby", "aria-describedby"):
+            assert attributes.get(key, page.ids[0]) in page.ids
+
+
+def test_a_page_asks_nothing_of_the_world(page, page_text) -> None:
+    assert not page.all("link")
+    assert all(image["src"].startswith("data:image/png;base64,") for image in page.all("img"))
+    outside = re.findall(r"https?://[^\s\"'<]*|@import|url\(", page_text)
+    assert not outside
+
+
+def test_the_policy_lets_only_the_page_own_script_run(page) -> None:
+    policy = next(m["content"] for m in page.all("meta") if "http-equiv" in m)
+    own = page.texts["script"][-1]
+    digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy
+    assert [s.get("type", "") for s in page.all("script")] == ["application/json", ""]
+
+
+def test_every_control_and_picture_has_a_name(page) -> None:
+    labelled = {label.get("for") for label in page.all("label")}
+    for control in page.all("input"):
+        assert control["id"] in labelled or control["type"] == "radio"  # radio buttons lie in their labels
+    assert all(image["alt"] for image in page.all("img"))
+    assert all(svg["role"] == "img" and svg["aria-label"] for svg in page.all("svg"))
+
+
+def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
+    stored = read_volume(files[1])
+    assert f"{stored.metrics['psnr_db']:.2f} dB" in page.words
+    assert f"{stored.metrics['ssim']:.4f}" in page.words
+    record = stored.provenance["record"]
+    assert (
+        f"Residual: from {record[0]['residual']:.4g} to {record[-1]['residual']:.4g} at iteration 3"
+        in page.words
+    )
+    curve = next(p for p in page.all("polyline") if p.get("class") == "curve")
+    heights = [float(point.split(",")[1]) for point in curve["points"].split()]
+    residuals = [line["residual"] for line in record]
+    drops = np.diff(heights[:3]) / -np.diff(residuals)
+    assert np.allclose(drops, drops[0], rtol=0.02)  # one scale for all points
+
+
+def test_pictures_decode_to_the_volume_slices(page, files) -> None:
+    stored = read_volume(files[1])
+    data = json.loads(page.texts["script"][0])
+    truth_high = max(float(v) for v in re.findall(r"white ([\d.]+) 1/mm", page.words))
+    for name, axis in (("axial", 0), ("coronal", 1), ("sagittal", 2)):
+        plane = data[name]
+        assert plane["indices"] == list(range(12)) and len(plane["places"]) == plane["count"] == 12
+        assert set(plane["layers"]) == {"result", "truth", "difference"}
+        for k in (0, 5, 11):
+            image = decoded("data:image/png;base64," + plane["layers"]["result"][k])
+            expected = np.clip(stored.volume.take(k, axis=axis)[::-1] / truth_high, 0, 1) * 255
+            assert np.abs(image - expected).max() <= 1
+
+
+def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> None:
+    run = load_run(files[1])
+    views = computed_views(run, rt, 3)
+    assert [view.frame for view in views] == [0, 2, 5] == chosen_frames(8, 3)
+    assert all(view.relative < 0.2 for view in views)
+    images = [image for image in page.all("img") if image["alt"].startswith("frame ")]
+    assert len(images) == 9
+    assert decoded(images[0]["src"]).shape == (16, 14)
+    assert f"residual, RMS {views[0].rms:.4g}" in page.words
+
+
+def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_path, parse) -> None:
+    stored = read_volume(files[1])
+    scan_path, volume_path = tmp_path / "s.h5", tmp_path / "<i>v.h5"
+    write_scan(scan_path, replace(small_scan, title=HOSTILE))
+    nested = {
+        "options": {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]},
+        "method": HOSTILE,
+        HOSTILE: HOSTILE,
+    }
+    record = [{"iteration": 1, HOSTILE: 2.0, "loss": HOSTILE}, {"iteration": 2, HOSTILE: 3.0}, HOSTILE]
+    facts = {**nested, "record": record, "scan": HOSTILE, "input": {"median_filter": HOSTILE}}
+    write_volume(volume_path, stored.volume, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
+    write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
+    text = (tmp_path / "p.html").read_text(encoding="utf-8")
+    page = parse(text)
+    assert not page.open
+    assert len(page.all("script")) == 2 and len(page.all("title")) == 1
+    assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
+    assert not [image for image in page.all("img") if image["src"] == "x"]
+    assert "alert(1)" in page.words  # it is shown, as text
+
+
+def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
+    volume = shutil.copy(files[1], tmp_path / "alone.h5")
+    stored = read_volume(volume)
+    write_volume(
+        volume, stored.volume, stored.grid, {**stored.provenance, "scan": "gone.h5"}, None, stored.metrics
+    )
+    run = write_report(Path(volume), tmp_path / "p.html", no_runtime)
+    assert run.scan is None and "--scan" in run.notes[0] and "gone.h5" in caplog.text
+    page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
+    assert set(page.ids) & ALL == {"slices", "metrics", "convergence", "provenance"}
+    assert not [i for i in page.ids if i.startswith("layer-")]
+
+
+def test_a_scan_that_has_changed_is_not_taken_for_the_run_scan(files, small_scan, tmp_path, parse) -> None:
+    volume = Path(shutil.copy(files[1], tmp_path / "volume.h5"))
+    stored = read_volume(volume)
+    facts = {**stored.provenance, "scan": str(tmp_path / "other.h5")}
+    write_volume(volume, stored.volume, stored.grid, facts)
+    write_scan(tmp_path / "other.h5", replace(small_scan, reference=None))
+    assert load_run(volume).scan is None
+    run = load_run(volume, tmp_path / "other.h5")
+    assert run.scan is not None and "hash differs" in run.notes[0]
+    page = parse(report_page(run))
+    assert set(page.ids) & ALL == ALL - {"projections", "metrics"}
+
+
+def test_a_bare_result_is_a_picture_of_the_volume(any_volume, tmp_path, parse) -> None:
+    volume, grid = any_volume
+    write_volume(tmp_path / "v.h5", volume, grid, {})
+    page = parse(report_page(load_run(tmp_path / "v.h5")))
+    assert set(page.ids) & ALL == {"slices", "provenance"}
+    sizes = {image["style"] for image in page.all("img")}
+    assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
+
+
+@pytest.mark.parametrize("name", ["volume", "scan"])
+def test_a_page_never_replaces_its_inputs(rt, files, name) -> None:
+    target = files[1] if name == "volume" else files[0]
+    with pytest.raises(InputError, match="itself"):
+        write_report(files[1], target, lambda: rt)
+
+
+def test_files_of_another_kind_are_named(files, tmp_path) -> None:
+    with pytest.raises(InputError, match="found a scan"):
+        write_report(files[0], tmp_path / "p.html", no_runtime)
+    with pytest.raises(InputError, match="--scan.*found a volume"):
+        write_report(files[1], tmp_path / "p.html", no_runtime, scan=files[1])
+    with pytest.raises(OutputError):
+        write_report(files[1], tmp_path / "nowhere" / "p.html", no_runtime)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_writes_a_page_and_says_so(files, tmp_path) -> None:
+    app = typer.Typer()
+    app.command()(report_command)
+    page = tmp_path / "p.html"
+    done = CliRunner().invoke(app, [str(files[1]), "-o", str(page), "--views", "1"])
+    assert done.exit_code == 0 and done.output.startswith(f"{page}: ")
+    assert page.read_text(encoding="utf-8").count('class="view"') == 1

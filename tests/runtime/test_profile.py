@@ -1,0 +1,74 @@
+"""Where device time goes: what is counted, and the table that says so."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.runtime import KernelUse, Rates, Runtime, profile_text
+
+
+@pytest.fixture(scope="module")
+def profiled() -> Runtime:
+    return Runtime(profile=True)
+
+
+def test_launches_time_and_bytes_are_counted_by_kernel(profiled) -> None:
+    source = profiled.upload(np.ones(1000, np.float32))
+    target = profiled.zeros(1000)
+    profiled.kernel_uses()
+    for _ in range(3):
+        profiled.copy(source, target)
+    profiled.fill(target, 2.0)
+    uses = profiled.kernel_uses()
+    assert (uses["copy"].launches, uses["copy"].bytes) == (3, 3 * 2 * 4000)
+    assert (uses["fill"].launches, uses["fill"].bytes) == (1, 4000)
+    assert all(use.seconds > 0 for use in uses.values())
+    assert list(uses) == sorted(uses, key=lambda name: -uses[name].seconds)
+    assert profiled.kernel_uses() == {}
+
+
+def test_long_runs_do_not_keep_every_event(profiled, monkeypatch) -> None:
+    monkeypatch.setattr("phyradgs_cl.runtime.profile._FOLD_AT", 4)
+    array = profiled.zeros(10)
+    profiled.kernel_uses()
+    for _ in range(11):
+        profiled.fill(array, 1.0)
+        assert len(profiled._profile._events) < 4
+    assert profiled.kernel_uses()["fill"].launches == 11
+
+
+def test_without_profile_nothing_is_kept() -> None:
+    rt = Runtime()
+    rt.zeros(10)
+    assert rt.kernel_uses() == {}
+
+
+def test_memory_held_at_one_time() -> None:
+    rt = Runtime()
+    first = rt.zeros(1000)
+    second = rt.empty((10, 10))
+    assert rt.peak_bytes == 4000 + 400
+    del first
+    gc.collect()
+    third = rt.zeros(100)
+    assert rt.peak_bytes == 4400
+    rt.reset_peak()
+    assert rt.peak_bytes == second.nbytes + third.nbytes
+
+
+def test_best_rates_are_those_of_a_computer(profiled) -> None:
+    rates = profiled.best_rates()
+    assert 1e8 < rates.copy_bytes_per_s < 1e14
+    assert 1e8 < rates.flops_per_s < 1e16
+
+
+def test_the_table_says_shares_and_rates() -> None:
+    uses = {"draw": KernelUse(4, 2.0, 8_000_000_000), "add": KernelUse(1, 0.5, 1_000_000_000)}
+    text = profile_text(uses, 5.0, Rates(8e9, 3e11), {"draw": 1_000_000_000})
+    draw, add, last = text.splitlines()[1:]
+    assert draw.split() == ["draw", "4", "2.000", "80.0%", "500.000", "4.0", "50%", "2.00", "0.500"]
+    assert add.split() == ["add", "1", "0.500", "20.0%", "500.000", "2.0", "25%"]
+    assert "kernels 2.50 s of 5.00 s (50%)" in last and "300 Gflop/s" in last
