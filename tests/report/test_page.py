@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 
 from phyradgs_cl.commands.report import report_command
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.io import read_volume, write_scan, write_volume
-from phyradgs_cl.report import load_run, report_page, write_report
+from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
+from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report.projections import chosen_frames, computed_views
 
 ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
@@ -123,6 +123,25 @@ def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> Non
     assert len(images) == 9
     assert decoded(images[0]["src"]).shape == (16, 14)
     assert f"residual, RMS {views[0].rms:.4g}" in page.words
+
+
+def test_frames_of_an_intensity_panel_are_compared_with_intensities(rt, scan_maker) -> None:
+    scan = scan_maker(detector_model="intensity", peak=8.0)
+    truth = StoredVolume(scan.reference, scan.grid, {})
+    as_it_is = computed_views(Run(Path("v.h5"), truth, scan), rt, 8)
+    as_log = computed_views(Run(Path("v.h5"), truth, replace(scan, detector_model="log")), rt, 8)
+    means = [np.mean([view.residual.mean() for view in views]) for views in (as_it_is, as_log)]
+    assert abs(means[0]) < 0.7 * abs(means[1])  # the rest is what 12³ voxels leave of the finer phantom
+    assert sum(view.rms for view in as_it_is) < sum(view.rms for view in as_log)
+
+
+def test_masked_pixels_do_not_count(rt, files, small_scan) -> None:
+    stored = read_volume(files[1])
+    mask, frames = np.zeros((16, 14), bool), small_scan.projections.copy()
+    mask[3, 4], frames[:, 3, 4] = True, 1e6
+    scan = replace(small_scan, projections=frames, pixel_mask=mask)
+    (view,) = computed_views(Run(files[1], stored, scan), rt, 1)
+    assert view.residual[3, 4] == 0 and not view.valid[3, 4] and view.relative < 0.2
 
 
 def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_path, parse) -> None:
