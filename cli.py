@@ -19,6 +19,7 @@ from phyradgs_cl.commands import (
     reconstruct,
     report,
     simulate,
+    view,
 )
 from phyradgs_cl.commands.console import complain, give_up_stdout, say
 from phyradgs_cl.errors import PhyradgsError
@@ -58,6 +59,7 @@ app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct_c
 app.command("estimate", epilog=estimate.EXAMPLE)(estimate.estimate_command)
 app.command("evaluate", epilog=evaluate.EXAMPLE)(evaluate.evaluate_command)
 app.command("report", epilog=report.EXAMPLE)(report.report_command)
+app.command("view", epilog=view.EXAMPLE)(view.view_command)
 app.command("export", epilog=export_volume.EXAMPLE)(export_volume.export_command)
 app.command("bench", epilog=bench.EXAMPLE)(bench.bench_command)
 app.command("info", epilog=info.EXAMPLE)(info.info_command)

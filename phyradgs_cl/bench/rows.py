@@ -88,6 +88,7 @@ _SPLATTING = (
     _micro_views("R2-Gaussian w/ ST", "r2", 8, 5, "R2-Gaussian"),
     Row("PhyRadGS w/o ST", "phyradgs"),
     _micro_views("PhyRadGS", "phyradgs", 8, 5, "PhyRadGS w/o ST"),
+    Row("PhyRadGS exact in time", "phyradgs", "exact", still="PhyRadGS w/o ST"),
 )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from phyradgs_cl.errors import InputError
@@ -59,6 +60,24 @@ class Gaussians:
     def scaled(self, length: float, density: float) -> Gaussians:
         """The same cloud with lengths multiplied by ``length`` and densities by ``density``."""
         return Gaussians(self.mean * length, self.scale * length, self.quaternion, self.density * density)
+
+    def averaged(self, box: tuple[float, float, float]) -> Gaussians:
+        """The cloud blurred by a box with sides x y z: its variance is added to every Gaussian's, mass kept.
+
+        Sampled at the centres of voxels of that size this is, to the Gaussians' second moments, the mean over a voxel.
+        """
+        turn = (
+            Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]).as_matrix()
+            if self.count
+            else np.zeros((0, 3, 3))
+        )
+        covariance = np.einsum("gij,gj,gkj->gik", turn, self.scale.astype(np.float64) ** 2, turn)
+        variance, axes = np.linalg.eigh(covariance + np.diag(np.square(box)) / 12)
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a turn, not a mirror
+        scale = np.sqrt(variance)
+        x, y, z, w = Rotation.from_matrix(axes).as_quat().T if self.count else np.zeros((4, 0))
+        density = self.density * np.prod(self.scale, axis=1) / np.prod(scale, axis=1)
+        return Gaussians(self.mean, scale, np.stack([w, x, y, z], -1), density)
 
 
 @dataclass(frozen=True)

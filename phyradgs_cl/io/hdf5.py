@@ -41,7 +41,7 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
     try:
         with file:
             yield Hdf5Source(file, path)
-    except (OSError, RuntimeError) as error:  # damage that HDF5 meets between datasets
+    except (OSError, RuntimeError, KeyError, TypeError, UnicodeError) as error:  # damage between datasets
         raise InputError(
             str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
         ) from error

@@ -13,6 +13,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.layout import GUARD, pad_rows, pitch_of, projection_matrices, unpad_rows
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -246,11 +247,19 @@ class RayProjector:
         """A volume (z, y, x) in the padded layout."""
         return self.rt.upload(self._layout.pad_volume(volume))
 
+    def _check(self, table: TimeCells) -> None:
+        """Cells of another panel would be read past their ends."""
+        expected = (self.axis, self._layout.lines)
+        if (table.axis, table.lines) != expected:
+            found = f"{table.lines} lines along {table.axis}"
+            raise InputError("time cells", found, f"{expected[1]} lines along {expected[0]}, the projector's")
+
     def forward(self, volume: DeviceArray, table: TimeCells, detector_model: str = "log") -> np.ndarray:
         """The merged frame (rows, columns) float32 of a padded volume in 1/mm.
 
         ``log`` averages line integrals over the cells; ``intensity`` takes −ln of the mean transmission.
         """
+        self._check(table)
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
         image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]
@@ -258,6 +267,7 @@ class RayProjector:
 
     def adjoint(self, frame: np.ndarray, table: TimeCells, volume: DeviceArray, *, add: bool = False) -> None:
         """Aᵀ of ``forward`` with the log model: a frame (rows, columns) onto a padded volume."""
+        self._check(table)
         image = self.rt.upload(pad_rows(frame if self.axis == "rows" else frame.T))
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_adjoint(self.rt, self._layout, cells, self._only, image, volume, add=add)

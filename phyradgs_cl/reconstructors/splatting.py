@@ -73,7 +73,9 @@ def reconstruct_splats(
         run.restore(resume)
     record = run.optimise(report, started)
     cloud = Gaussians.from_rows(run.parameters())
-    volume = voxelise(rt, cloud.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(
+    # who lets pixels average over their area has a field as sharp as it is: voxels average, too
+    shown = cloud.averaged(grid.voxel_size_mm[::-1]) if options.pixel_footprint else cloud
+    volume = voxelise(rt, shown.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(
         scale.density_per_mm
     )
     facts = {

@@ -18,6 +18,7 @@ from tolerances import (
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector, voxelise
 from phyradgs_cl.operators.twins.rays import joseph_adjoint, joseph_image, ray_frame
@@ -183,3 +184,17 @@ def test_phantoms_project_like_their_closed_form(rt, one_cell, make_geometry, ph
         errors.append(np.linalg.norm(image - exact) / np.linalg.norm(exact))
     assert errors[1] <= tolerance
     assert errors[1] <= 0.65 * errors[0]
+
+
+def test_cells_of_another_panel_are_refused(rt) -> None:
+    """They would be read past their ends."""
+    grid, shape = Grid.cube(4, 2.0), (3, 9)
+    orbit = CircularOrbit(ConeGeometry(5.0, 7.5, shape, (1.0, 0.5)), ConstantSpeed(0.1, 0.2))
+    projector = RayProjector(rt, grid, shape, "rows")
+    volume = projector.upload_volume(np.ones(grid.shape, np.float32))
+    for shutter in (Shutter(0.5, 0.1, "columns", 1),):
+        table = per_line_cells(orbit, shutter, 0, 0.0, shutter.lines(shape), 2)
+        with pytest.raises(InputError, match="9 lines along columns"):
+            projector.forward(volume, table)
+        with pytest.raises(InputError, match="time cells"):
+            projector.adjoint(np.ones(shape, np.float32), table, volume)
