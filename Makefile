@@ -1,5 +1,6 @@
 # make demo    simulate a fly-scan, reconstruct it three ways, print a table (minutes on two cores)
 # make test    style, tests on a CPU device; a skipped kernel test is a failure
+# make docs     the documentation as a site, in site/
 # make stress     runs killed fifty times each, resumed to the same bits (half an hour)
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB)
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
@@ -15,7 +16,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test stress test-intel test-oclgrind clean
+.PHONY: demo test docs stress test-intel test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -55,6 +56,10 @@ test: $(VENV)/.installed-test
 	$(BIN)/python -m pytest --junit-xml=$(VENV)/junit.xml
 	@$(BIN)/python .ci/no_skips.py $(VENV)/junit.xml
 
+docs: $(VENV)/.installed-test
+	$(BIN)/python docs/make_reference.py
+	$(BIN)/mkdocs build --strict --site-dir site
+
 stress: $(VENV)/.installed-test
 	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py
 
@@ -82,4 +87,4 @@ test-oclgrind: $(VENV)-oclgrind/.installed
 	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-intel $(VENV)-oclgrind $(OUT) build dist
+	rm -rf $(VENV) $(VENV)-intel $(VENV)-oclgrind $(OUT) build dist site

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
@@ -12,7 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
+from phyradgs_cl import api
+from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
@@ -80,3 +84,33 @@ def test_the_worked_example_of_a_method_works(rt, small_scan, monkeypatch) -> No
     assert np.linalg.norm(fly.volume - small_scan.reference) < np.linalg.norm(
         static.volume - small_scan.reference
     )
+
+
+def test_the_reference_names_every_command_option_and_public_name() -> None:
+    """Made by docs/make_reference.py; how a help text is broken into lines is Typer's business."""
+    cli = (DOCS / "reference" / "cli.md").read_text(encoding="utf-8")
+    group = typer.main.get_command(load_cli().app)
+    for name, command in group.commands.items():
+        section = cli.split(f"## phyradgs {name}\n")[1].split("\n## ")[0]
+        for parameter in command.params:
+            for option in parameter.opts:
+                assert option in section, f"phyradgs {name}: {option}: run docs/make_reference.py"
+    text = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
+    for name in api.__all__:
+        assert f"## {name}\n" in text, f"{name}: run docs/make_reference.py"
+
+
+def test_the_site_builds_without_a_broken_link(tmp_path) -> None:
+    """Strictly: a link, an anchor or a page that is nowhere ends the build."""
+    root = DOCS.parent
+    arguments = ["build", "--strict", "--quiet", "--config-file", str(root / "mkdocs.yml")]
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *arguments, "--site-dir", str(tmp_path / "site")],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=root,
+    )
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "site" / "mathematics" / "index.html").read_text(encoding="utf-8")
+    assert page.count("<math") > 150 and "$$" not in page

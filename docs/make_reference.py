@@ -1,0 +1,72 @@
+"""Writes docs/reference/cli.md and docs/reference/api.md from the code: python docs/make_reference.py
+
+tests/test_docs.py fails when what is committed is not what this writes.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import typer
+
+from phyradgs_cl import api
+from phyradgs_cl.__main__ import load_cli
+
+FOLDER = Path(__file__).resolve().parent / "reference"
+NOTE = "<!-- made from the code by docs/make_reference.py; do not edit -->\n"
+
+
+def cli_page() -> str:
+    """Every command's help, as the terminal shows it at 100 columns."""
+    group = typer.main.get_command(load_cli().app)
+    text = [
+        NOTE,
+        "# Command line reference\n",
+        "What `--help` says. With explanations: [command line](../cli.md).\n",
+    ]
+    text += [f"```text\n{_help(group, 'phyradgs')}```\n"]
+    for name, command in group.commands.items():  # type: ignore[attr-defined]
+        text += [f"## phyradgs {name}\n", f"```text\n{_help(command, f'phyradgs {name}')}```\n"]
+    return "\n".join(text)
+
+
+def _help(command: click.Command, name: str) -> str:
+    context = click.Context(command, info_name=name, terminal_width=100, max_content_width=100)
+    return "\n".join(line.rstrip() for line in command.get_help(context).splitlines()) + "\n"
+
+
+def api_page() -> str:
+    """Every public name with its signature and docstring."""
+    text = [
+        NOTE,
+        "# Python reference\n",
+        "`from phyradgs_cl.api import ...`; examples: [Python](../api.md).\n",
+    ]
+    for name in sorted(api.__all__, key=str.casefold):
+        text += _entry(name, getattr(api, name), "## ")
+    return "\n".join(text)
+
+
+def _entry(name: str, thing: object, heading: str) -> Iterator[str]:
+    yield f"{heading}{name}\n"
+    signature = str(inspect.signature(thing)).replace("'", "")  # type: ignore[arg-type]
+    yield f"```python\n{name}{signature}\n```\n"
+    yield f"```text\n{inspect.getdoc(thing) or ''}\n```\n"
+    if inspect.isclass(thing):
+        for member, value in vars(thing).items():
+            function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
+            if not member.startswith("_") and inspect.isfunction(function):
+                yield from _entry(f"{name}.{member}", function, "### ")
+
+
+def main() -> None:
+    FOLDER.mkdir(exist_ok=True)
+    for name, page in (("cli.md", cli_page()), ("api.md", api_page())):
+        (FOLDER / name).write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
