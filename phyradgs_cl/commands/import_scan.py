@@ -14,7 +14,8 @@ from phyradgs_cl.commands.options import Axis, DetectorModel, file_argument, fil
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
-from phyradgs_cl.io import check_writable, write_scan
+from phyradgs_cl.io import check_writable, only_run, write_scan
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.settings import offset_pair
 
 EXAMPLE = (
@@ -144,8 +145,10 @@ def import_command(
     _refuse_overwriting(source, output)
     check_writable(output)
     chosen = _value(form) or recognise(source)
-    scan = import_scan(source, options, chosen)
-    write_scan(output, scan)
+    with only_run(output):
+        scan = import_scan(source, options, chosen)
+        with finish_despite_interrupt():
+            write_scan(output, scan)
     frames, rows, columns = scan.projections.shape
     masked = 0 if scan.pixel_mask is None else int(np.count_nonzero(scan.pixel_mask))
     kind = "fly-scan" if scan.is_fly else "at rest"

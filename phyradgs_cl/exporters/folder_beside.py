@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
 
 
@@ -24,6 +25,7 @@ def folder_written_beside(path: Path) -> Iterator[Path]:
             str(path), "something that is there already", "a new or an empty folder", "choose another name"
         )
     temporary = target.with_name(f".{target.name[:60]}.{secrets.token_hex(4)}.part")
+    signals.unfinished.add(str(temporary))  # Ctrl-C may end the process at any line
     try:
         temporary.mkdir()
         yield temporary
@@ -34,3 +36,5 @@ def folder_written_beside(path: Path) -> Iterator[Path]:
             found = error.strerror or str(error)
             raise OutputError(str(path), found, "a folder that can be written", "choose another") from error
         raise
+    finally:
+        signals.unfinished.discard(str(temporary))
