@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, ROWS, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, RayOperator, SplatProjector
-from phyradgs_cl.reconstructors.splatting import scaled_cells
+from phyradgs_cl.reconstructors.splat_frames import scaled_cells
 
 
 def ray_operator(

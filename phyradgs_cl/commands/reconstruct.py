@@ -13,6 +13,7 @@ from phyradgs_cl.commands.console import complain, say
 from phyradgs_cl.commands.options import DetectorModel, Device, Output, file_argument, file_option
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import METHODS
+from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import run_settings
 from phyradgs_cl.workflow import ReconstructionJob, profile_report, run_reconstruction
@@ -134,6 +135,12 @@ def reconstruct_command(
             help="Keep a checkpoint beside the output so often, for --resume after a kill; 0: on Ctrl-C only.",
         ),
     ] = 600.0,
+    preview: Annotated[
+        Path | None,
+        file_option(
+            "--preview", help="PNG of the three middle slices, made anew every five seconds of the run."
+        ),
+    ] = None,
     profile: Annotated[
         bool,
         typer.Option(
@@ -173,6 +180,8 @@ def reconstruct_command(
         checkpoint_every_s=checkpoint_every,
     )
 
+    if preview is not None:
+        check_preview(preview, scan, output)
     runtimes: list[Runtime] = []
 
     def runtime() -> Runtime:
@@ -181,7 +190,8 @@ def reconstruct_command(
         return runtimes[-1]
 
     with Ticker("iteration") as ticker:
-        result, metrics = run_reconstruction(job, runtime, ticker.progress)
+        report = Preview(preview, ticker.progress) if preview else ticker.progress
+        result, metrics = run_reconstruction(job, runtime, report)
     interrupted = result.facts.get("interrupted_at")
     say(f"{output}: {job.method}, {result.facts['seconds']:.1f} s" + _metrics_text(metrics))
     if profile:

@@ -17,6 +17,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError, NumericalError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
 from phyradgs_cl.reconstructors.system import System, norm
@@ -94,7 +95,7 @@ def run_iterations(
     if resume is not None:
         iteration = int(state_arrays(resume, ["iteration"])[0])
         algorithm.restore(resume)
-    loop = _Loop(algorithm, options, norm(system.measured) or 1.0, report, started)
+    loop = _Loop(algorithm, options, scan.grid, norm(system.measured) or 1.0, report, started)
     loop.run(iteration)
     facts: dict[str, object] = {
         "method": method,
@@ -118,11 +119,12 @@ class _Loop:
         self,
         algorithm: Algorithm,
         options: IterativeOptions,
+        grid: Grid,
         measured_norm: float,
         report: ProgressReport,
         started: float,
     ) -> None:
-        self.algorithm, self.options, self.report = algorithm, options, report
+        self.algorithm, self.options, self.grid, self.report = algorithm, options, grid, report
         self.measured_norm, self.started = measured_norm, started
         self.record: list[dict[str, float]] = []
         self.iteration = 0
@@ -165,7 +167,12 @@ class _Loop:
         total = self.options.iterations
         try:
             self.report(
-                Progress(self.iteration, total, residual, 0, seconds, quantity="residual", state=self.state)
+                Progress(
+                    *(self.iteration, total, residual, 0, seconds),
+                    quantity="residual",
+                    state=self.state,
+                    volume=lambda: (self.algorithm.volume, self.grid),
+                )
             )
         except KeyboardInterrupt:
             self.stopped_by = "interrupt" if self.iteration < total else self.stopped_by

@@ -35,7 +35,8 @@ class Reconstruction:
 class Progress:
     """One report of a running method: ``loss`` is what ``quantity`` names; 0 Gaussians where there are none.
 
-    ``state`` makes what a run needs to go on from here; it is for the time of the report only.
+    ``state`` makes what a run needs to go on from here, ``volume`` the present volume (nz, ny, nx) in 1/mm with its grid;
+    both are for the time of the report only.
     """
 
     iteration: int
@@ -45,6 +46,7 @@ class Progress:
     seconds: float
     quantity: str = "loss"
     state: Callable[[], State] | None = None
+    volume: Callable[[], tuple[np.ndarray, Grid]] | None = None
 
 
 ProgressReport = Callable[[Progress], None]

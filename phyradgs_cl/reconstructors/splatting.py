@@ -10,42 +10,27 @@ from __future__ import annotations
 import json
 import logging
 import time
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
-from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser, voxelise
-from phyradgs_cl.operators.layout import pad_columns, pad_rows, stride_of
+from phyradgs_cl.operators import DeviceGaussians, SplatProjector, Voxeliser, voxelise
+from phyradgs_cl.operators.layout import pad_columns, stride_of
 from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
+from phyradgs_cl.reconstructors.splat_frames import DeviceFrames, Scale
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50
 log = logging.getLogger(__name__)
 _REFERENCE_PERCENTILE = 99.9
-_PEAK_PERCENTILE = 99.9  # noise has peaks of its own
-
-
-@dataclass(frozen=True)
-class Scale:
-    """What one internal unit is: of length in mm, of density in 1/mm."""
-
-    length_mm: float
-    density_per_mm: float
-
-    @property
-    def line_integral(self) -> float:
-        return self.length_mm * self.density_per_mm
 
 
 def reconstruct_splats(
@@ -73,11 +58,7 @@ def reconstruct_splats(
         run.restore(resume)
     record = run.optimise(report, started)
     cloud = Gaussians.from_rows(run.parameters())
-    # who lets pixels average over their area has a field as sharp as it is: voxels average, too
-    shown = cloud.averaged(grid.voxel_size_mm[::-1]) if options.pixel_footprint else cloud
-    volume = voxelise(rt, shown.rows(), grid, cutoff_sigma=options.cutoff_sigma) * np.float32(
-        scale.density_per_mm
-    )
+    volume = run.present_volume()[0]
     facts = {
         "method": method,
         "options": options.as_dict(),
@@ -120,7 +101,7 @@ class SplatRun:
         population: Population,
         rng: np.random.Generator,
     ) -> None:
-        self.rt, self.options, self.rng = rt, options, rng
+        self.rt, self.options, self.scale, self.rng = rt, options, scale, rng
         self.grid = scan.grid.scaled(1 / scale.length_mm)
         self.activation = options.activation(self.grid)
         self.frames = DeviceFrames(rt, scan, options, scale)
@@ -171,7 +152,11 @@ class SplatRun:
         loss, seconds, count = self._checked_loss(), time.perf_counter() - started, self.gaussians.count
         try:
             total = self.options.iterations
-            report(Progress(self.iteration, total, loss, count, seconds, state=self.state))
+            report(
+                Progress(
+                    self.iteration, total, loss, count, seconds, state=self.state, volume=self.present_volume
+                )
+            )
         except KeyboardInterrupt:
             self.interrupted_at = self.iteration
         return {"iteration": self.iteration, "loss": loss, "gaussians": count, "seconds": seconds}
@@ -280,6 +265,16 @@ class SplatRun:
         """Parameter rows (11, G) float64 in internal units."""
         return self.activation.apply(self._population().raw.astype(np.float64))
 
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        """The cloud as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
+        cloud = Gaussians.from_rows(self.parameters())
+        if (
+            self.options.pixel_footprint
+        ):  # its field is as sharp as it is: voxels average over their volume, too
+            cloud = cloud.averaged(self.grid.voxel_size_mm[::-1])
+        volume = voxelise(self.rt, cloud.rows(), self.grid, cutoff_sigma=self.options.cutoff_sigma)
+        return volume * np.float32(self.scale.density_per_mm), self.grid.scaled(self.scale.length_mm)
+
     def _population(self) -> Population:
         count = self.gaussians.count
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
@@ -304,63 +299,6 @@ class SplatRun:
         self.gradients = self.rt.zeros((13, stride))
         self.statistics = self.rt.zeros((2, stride))
         self.gaussians = DeviceGaussians(self.rt.zeros((11, stride)), count, stride)
-
-
-class DeviceFrames:
-    """The scan on the device: time cells, measurement in internal units and mask of every frame."""
-
-    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
-        self.count = scan.frames
-        by_column = scan.shutter.axis == "columns"
-        rows, columns = scan.geometry.detector_shape
-        self.lines, self.width = (columns, rows) if by_column else (rows, columns)
-        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
-        tables = [
-            scaled_cells(options.motion.cells(scan, f, peak), 1 / scale.length_mm) for f in range(scan.frames)
-        ]
-        self._cells = [DeviceCells.upload(rt, table) for table in tables]
-        # of one value both models are the mean
-        averages = model == "intensity" and max(cells.layers for cells in self._cells) > 1
-        self.intensity_unit = scale.line_integral if averages else None
-        frames = scan.projections / np.float32(scale.line_integral)
-        self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
-        self._mask, self._pixels = _upload_masks(rt, scan, by_column)
-        self._transmission: list[DeviceArray] = []
-        if options.poisson_weight > 0:
-            valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
-            trust = transmission_weights(scan.projections, valid)
-            self._transmission = [rt.upload(pad_rows(t.T if by_column else t)) for t in trust]
-
-    def transmission(self, frame: int) -> DeviceArray | None:
-        """Weights of the Poisson term, where it counts."""
-        return self._transmission[frame] if self._transmission else None
-
-    @property
-    def most_cells(self) -> int:
-        """The largest number of time cells of a frame."""
-        return max(cells.count for cells in self._cells)
-
-    def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
-        shared = frame if len(self._mask) > 1 else 0
-        return self._cells[frame], self._measured[frame], self._mask[shared], self._pixels[shared]
-
-
-def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:
-    """Masks that are 1 where a pixel counts: one for all frames, or one a frame."""
-    if scan.pixel_mask is None:
-        masks = [np.ones(scan.geometry.detector_shape, np.float32)]
-    else:
-        stack = scan.pixel_mask if scan.pixel_mask.ndim == 3 else scan.pixel_mask[None]
-        masks = [(m == 0).astype(np.float32) for m in stack]
-    arrays = [rt.upload(pad_rows(m.T if by_column else m)) for m in masks]
-    return arrays, [float(m.sum()) for m in masks]
-
-
-def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
-    """The same cells with all lengths multiplied by ``factor``."""
-    ends = None if table.end_poses is None else table.end_poses * factor
-    return replace(table, pose=table.pose * factor, end_poses=ends)
 
 
 def first_population(

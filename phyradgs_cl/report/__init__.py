@@ -1,8 +1,17 @@
 """A reconstruction as a page, a picture or a window for people."""
 
 from phyradgs_cl.report.page import report_page, write_report
-from phyradgs_cl.report.preview import write_preview
+from phyradgs_cl.report.preview import Preview, check_preview, write_preview
 from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.report.volume_viewer import view_volume
 
-__all__ = ["Run", "load_run", "report_page", "view_volume", "write_preview", "write_report"]
+__all__ = [
+    "Preview",
+    "Run",
+    "check_preview",
+    "load_run",
+    "report_page",
+    "view_volume",
+    "write_preview",
+    "write_report",
+]

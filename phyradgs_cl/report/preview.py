@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+import math
+import time
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import written_beside
+from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.reconstructors import Progress, ProgressReport
 from phyradgs_cl.report.png import bytes_of, png_bytes, upright
 
 _GAP = 4  # pixels between slices
 _SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
 _PERCENTILE = 99.9  # a few hot voxels would make the rest dark
+log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
@@ -34,6 +40,39 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
     picture = png_bytes(preview_image(volume, grid))
     with written_beside(path) as temporary:
         temporary.write_bytes(picture)
+
+
+def check_preview(path: Path, *others: Path) -> None:
+    """Raises InputError or OutputError now if the picture could not be written, or would replace one of ``others``."""
+    if path.suffix.lower() != ".png":
+        raise InputError("--preview", str(path), "a file name that ends in .png")
+    if any(path.resolve() == other.resolve() for other in others):
+        raise InputError("--preview", f"{path}, which the run needs", "another file to write")
+    check_writable(path)
+
+
+class Preview:
+    """A report of a running method that keeps a picture of the present volume, at most one every ``every_s`` seconds.
+
+    A picture that cannot be written ends no run: it is a warning, once.
+    """
+
+    def __init__(self, path: Path, report: ProgressReport, every_s: float = 5.0) -> None:
+        self.path, self.report, self.every_s = path, report, every_s
+        self._last_s = -math.inf
+        self._failed = False
+
+    def __call__(self, progress: Progress) -> None:
+        self.report(progress)
+        if progress.volume is None or time.monotonic() - self._last_s < self.every_s:
+            return
+        try:
+            write_preview(*progress.volume(), self.path)
+        except PhyradgsError as error:
+            if not self._failed:
+                log.warning("no preview: %s", error)
+            self._failed = True
+        self._last_s = time.monotonic()
 
 
 def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:

@@ -1,0 +1,86 @@
+"""A scan's frames on the device as the splatting engine sees them: time cells, measurements and masks, internal units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.detector import transmission_weights
+from phyradgs_cl.operators import DeviceCells
+from phyradgs_cl.operators.layout import pad_rows
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+_PEAK_PERCENTILE = 99.9  # noise has peaks of its own
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What one internal unit is: of length in mm, of density in 1/mm."""
+
+    length_mm: float
+    density_per_mm: float
+
+    @property
+    def line_integral(self) -> float:
+        return self.length_mm * self.density_per_mm
+
+
+class DeviceFrames:
+    """The scan on the device: time cells, measurement in internal units and mask of every frame."""
+
+    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
+        self.count = scan.frames
+        by_column = scan.shutter.axis == "columns"
+        rows, columns = scan.geometry.detector_shape
+        self.lines, self.width = (columns, rows) if by_column else (rows, columns)
+        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
+        tables = [
+            scaled_cells(options.motion.cells(scan, f, peak), 1 / scale.length_mm) for f in range(scan.frames)
+        ]
+        self._cells = [DeviceCells.upload(rt, table) for table in tables]
+        # of one value both models are the mean
+        averages = model == "intensity" and max(cells.layers for cells in self._cells) > 1
+        self.intensity_unit = scale.line_integral if averages else None
+        frames = scan.projections / np.float32(scale.line_integral)
+        self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
+        self._mask, self._pixels = _upload_masks(rt, scan, by_column)
+        self._transmission: list[DeviceArray] = []
+        if options.poisson_weight > 0:
+            valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
+            trust = transmission_weights(scan.projections, valid)
+            self._transmission = [rt.upload(pad_rows(t.T if by_column else t)) for t in trust]
+
+    def transmission(self, frame: int) -> DeviceArray | None:
+        """Weights of the Poisson term, where it counts."""
+        return self._transmission[frame] if self._transmission else None
+
+    @property
+    def most_cells(self) -> int:
+        """The largest number of time cells of a frame."""
+        return max(cells.count for cells in self._cells)
+
+    def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
+        shared = frame if len(self._mask) > 1 else 0
+        return self._cells[frame], self._measured[frame], self._mask[shared], self._pixels[shared]
+
+
+def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:
+    """Masks that are 1 where a pixel counts: one for all frames, or one a frame."""
+    if scan.pixel_mask is None:
+        masks = [np.ones(scan.geometry.detector_shape, np.float32)]
+    else:
+        stack = scan.pixel_mask if scan.pixel_mask.ndim == 3 else scan.pixel_mask[None]
+        masks = [(m == 0).astype(np.float32) for m in stack]
+    arrays = [rt.upload(pad_rows(m.T if by_column else m)) for m in masks]
+    return arrays, [float(m.sum()) for m in masks]
+
+
+def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
+    """The same cells with all lengths multiplied by ``factor``."""
+    ends = None if table.end_poses is None else table.end_poses * factor
+    return replace(table, pose=table.pose * factor, end_poses=ends)
