@@ -22,6 +22,7 @@ _RANGES = {
     "split_scale": (0, 1e3),
     "split_factor": (1, 1e3),
     "prune_density": (0, 1e6),
+    "prune_aspect": (0, 1e9),
     "max_gaussians": (1, 100_000_000),
 }
 
@@ -30,7 +31,9 @@ _RANGES = {
 class DensityControl:
     """When and what to clone, split and prune; lengths in half-sides of the volume, fractions of the run.
 
-    ``every`` counts iterations from round to round; 0 leaves the population as it starts.
+    ``every`` counts iterations from round to round; 0 leaves the population as it starts. Gaussians whose longest scale is
+    more than ``prune_aspect`` times their shortest are removed (0: never): sheets and needles that thin slip between the
+    rays, where no measurement holds them back, and stand in the volume all the same.
     """
 
     every: int = 100
@@ -40,10 +43,17 @@ class DensityControl:
     split_scale: float = 0.2
     split_factor: float = 1.6
     prune_density: float = 1e-5
+    prune_aspect: float = 50.0
     max_gaussians: int = 500_000
 
     def __post_init__(self) -> None:
         checks.fields_within("control.", self, _RANGES)
+
+    def allows(self, scale: np.ndarray) -> np.ndarray:
+        """Which of the scales (3, G) are no thinner than may be."""
+        if self.prune_aspect <= 0:
+            return np.ones(scale.shape[1], bool)
+        return scale.max(0) <= self.prune_aspect * scale.min(0)
 
     def is_due(self, iteration: int, iterations: int) -> bool:
         """Whether to act after ``iteration`` (counted from 1)."""
@@ -100,10 +110,10 @@ def control_density(
 def prune(
     population: Population, activation: Activation, control: DensityControl, box: np.ndarray
 ) -> Population:
-    """Without what has faded or left the box, sorted by height so that neighbours in memory share detector lines."""
+    """Without what has faded, left the box or become too thin, sorted by height so that neighbours in memory share detector lines."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
-    kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density))
+    kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))
     return population.take(kept[np.argsort(population.raw[2, kept], kind="stable")])
 
 

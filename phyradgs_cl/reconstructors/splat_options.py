@@ -101,7 +101,7 @@ class SplatOptions:
         return asdict(self)
 
 
-PUBLISHED_CONTROL = DensityControl(threshold=5e-5)
+PUBLISHED_CONTROL = DensityControl(threshold=5e-5, prune_aspect=0.0)
 _PAPER = SplatOptions(
     motion=Motion("micro-views", 8, 5),
     gaussians=50_000,

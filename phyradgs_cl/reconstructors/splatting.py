@@ -16,6 +16,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import DeviceGaussians, SplatProjector, Voxeliser, voxelise
 from phyradgs_cl.operators.layout import pad_columns, stride_of
@@ -57,7 +58,7 @@ def reconstruct_splats(
     if resume is not None:
         run.restore(resume)
     record = run.optimise(report, started)
-    cloud = Gaussians.from_rows(run.parameters())
+    cloud = run.present_cloud()
     volume = run.present_volume()[0]
     facts = {
         "method": method,
@@ -264,6 +265,11 @@ class SplatRun:
     def parameters(self) -> np.ndarray:
         """Parameter rows (11, G) float64 in internal units."""
         return self.activation.apply(self._population().raw.astype(np.float64))
+
+    def present_cloud(self) -> Gaussians:
+        """The cloud in internal units, without what density control would remove for its shape."""
+        rows = self.parameters()
+        return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         """The cloud as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""

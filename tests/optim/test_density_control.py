@@ -158,3 +158,14 @@ def test_when_it_acts() -> None:
     due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
     assert due == list(range(600, 1500, 100))
     assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))
+
+
+def test_sheets_and_needles_are_removed_unless_they_are_wanted() -> None:
+    rows = np.tile([[0.0], [0.0], [0.0], [0.1], [0.1], [0.1], [1.0], [0.0], [0.0], [0.0], [1.0]], 4)
+    rows[3:6] = np.array([[0.1, 0.1, 0.1], [0.5, 0.5, 0.005], [0.6, 0.01, 0.01], [0.49, 0.01, 0.02]]).T
+    activation, box = Activation(0.001, 1.0), np.array([[-1.0] * 3, [1.0] * 3])
+    population = Population(activation.invert(rows), np.zeros((2, 11, 4)))
+    for aspect, kept in ((50.0, [0, 3]), (80.0, [0, 2, 3]), (0.0, [0, 1, 2, 3])):
+        found = prune(population, activation, DensityControl(prune_aspect=aspect), box)
+        scales = np.sort(activation.apply(found.raw)[3:6].max(0))
+        np.testing.assert_allclose(scales, np.sort(rows[3:6].max(0)[kept]), rtol=1e-6)
