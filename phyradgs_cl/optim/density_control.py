@@ -110,7 +110,7 @@ def control_density(
 def prune(
     population: Population, activation: Activation, control: DensityControl, box: np.ndarray
 ) -> Population:
-    """Without what has faded, left the box or become too thin, sorted by height so that neighbours in memory share detector lines."""
+    """Without what has faded, left the box or become too thin; by height, so that neighbours share detector lines."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
     kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))
