@@ -38,7 +38,7 @@ class Estimate:
         """Two lines: time, and memory."""
         each = (
             f" ({self.iterations} iterations of {1e3 * self.seconds_an_iteration:.3g} ms)"
-            if self.iterations
+            if self.seconds_an_iteration > 0
             else ""
         )
         return (
@@ -80,8 +80,8 @@ def _trials(options: Any) -> tuple[int, int]:
 def _by_proportion(seconds: Callable[[int], float], total: int, few: int, more: int) -> tuple[float, float]:
     """(seconds of ``total`` iterations, seconds of one): kernels are built by the shorter trial, which is timed as it is."""
     first_s = seconds(min(few, total))
-    if total <= few:
-        return first_s, 0.0
+    if total <= few:  # the first has built the kernels, which the run will find built
+        return first_s, seconds(total) / max(total, 1)
     again_s, longer_s = seconds(few), seconds(more)
     each_s = max(longer_s - again_s, 0.0) / (more - few)
     return first_s + (total - few) * each_s, each_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,7 @@ from phyradgs_cl.commands.options import Axis, DetectorModel, file_argument, fil
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
-from phyradgs_cl.io import check_writable, only_run, write_scan
+from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.settings import offset_pair
 
@@ -163,7 +164,15 @@ def _value(word: Enum | None) -> str | None:
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:
-    """An output inside what is read could be, or become, part of it."""
+    """Raises InputError for an output that may be part of what is read: what lies beside it and is no scan of ours."""
     target, origin = output.resolve(), source.resolve()
+    folder = origin if origin.is_dir() else origin.parent
     if target == origin:
         raise InputError("--output", f"the input {source} itself", "another file to write")
+    if folder not in target.parents or not target.exists():
+        return
+    with suppress(InputError):
+        if file_kind(output) == "scan":
+            return
+    found = f"{output}, which lies with the input and is no scan of ours"
+    raise InputError("--output", found, "another file to write")

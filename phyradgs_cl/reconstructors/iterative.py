@@ -19,7 +19,15 @@ from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
+from phyradgs_cl.reconstructors.result import (
+    Progress,
+    ProgressReport,
+    Reconstruction,
+    State,
+    history,
+    history_arrays,
+    state_arrays,
+)
 from phyradgs_cl.reconstructors.system import System, norm
 from phyradgs_cl.runtime import Runtime
 
@@ -91,11 +99,14 @@ def run_iterations(
     if options.transmission_weights:
         system = system.trusting_light()
     algorithm = make(system)
-    iteration = 0
+    iteration, record = 0, []
     if resume is not None:
         iteration = int(state_arrays(resume, ["iteration"])[0])
         algorithm.restore(resume)
+        record, before_s = history(resume)
+        started -= before_s
     loop = _Loop(algorithm, options, scan.grid, norm(system.measured) or 1.0, report, started)
+    loop.record = record
     loop.run(iteration)
     facts: dict[str, object] = {
         "method": method,
@@ -144,7 +155,8 @@ class _Loop:
 
     def state(self) -> dict[str, np.ndarray]:
         """What ``restore`` and a loop need to go on from here."""
-        return {**self.algorithm.state(), "iteration": np.array(self.iteration)}
+        so_far = history_arrays(self.record, time.perf_counter() - self.started)
+        return {**self.algorithm.state(), "iteration": np.array(self.iteration), **so_far}
 
     def _iterate(self) -> None:
         before = self.algorithm.volume

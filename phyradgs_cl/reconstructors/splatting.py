@@ -24,7 +24,15 @@ from phyradgs_cl.optim import DeviceAdam, Population, control_density, prune
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, state_arrays
+from phyradgs_cl.reconstructors.result import (
+    Progress,
+    ProgressReport,
+    Reconstruction,
+    State,
+    history,
+    history_arrays,
+    state_arrays,
+)
 from phyradgs_cl.reconstructors.splat_frames import DeviceFrames, Scale
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import Runtime
@@ -57,7 +65,7 @@ def reconstruct_splats(
     run = SplatRun(rt, scan, options, scale, population, rng)
     if resume is not None:
         run.restore(resume)
-    record = run.optimise(report, started)
+    run.optimise(report, started)
     cloud = run.present_cloud()
     volume = run.present_volume()[0]
     facts = {
@@ -69,7 +77,7 @@ def reconstruct_splats(
         "gaussians_asked": options.gaussians_for(grid),
         "gaussians_first": first_count,
         "gaussians": cloud.count,
-        "seconds": time.perf_counter() - started,
+        "seconds": time.perf_counter() - started + run.seconds_before,
         "interrupted_at": run.interrupted_at,
         "detector_model": "log" if run.frames.intensity_unit is None else "intensity",
     }
@@ -79,7 +87,7 @@ def reconstruct_splats(
         facts["evaluated_pairs"] = run.evaluated_pairs()
     state = run.state() if run.interrupted_at is not None else None
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
-    return Reconstruction(volume, scan.grid, cloud, record, facts, state)
+    return Reconstruction(volume, scan.grid, cloud, run.record, facts, state)
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
@@ -131,36 +139,37 @@ class SplatRun:
         self.adam = DeviceAdam(rt, self.activation)
         self.iteration = 0
         self.interrupted_at: int | None = None
+        self.record: list[dict[str, float]] = []
+        self.seconds_before = 0.0
+        self._started = time.perf_counter()
         self._queue: list[int] = []
         self._load(population)
 
     # --- the loop ---------------------------------------------------------------------------------------
 
-    def optimise(self, report: ProgressReport, started: float) -> list[dict[str, float]]:
+    def optimise(self, report: ProgressReport, started: float) -> None:
         """All iterations; Ctrl-C (or a report that raises KeyboardInterrupt) ends the run after the one under way."""
-        record: list[dict[str, float]] = []
+        self._started = started - self.seconds_before
         total = self.options.iterations
         with stop_on_interrupt() as request:
             while self.iteration < total and self.interrupted_at is None:
                 self.step()
                 if self.iteration % REPORT_EVERY == 0 or self.iteration == total:
-                    record.append(self._report(report, started))
+                    self._report(report)
                 if request.is_set and self.iteration < total:
                     self.interrupted_at = self.iteration
-        return record
 
-    def _report(self, report: ProgressReport, started: float) -> dict[str, float]:
-        loss, seconds, count = self._checked_loss(), time.perf_counter() - started, self.gaussians.count
+    def _report(self, report: ProgressReport) -> None:
+        seconds = time.perf_counter() - self._started
+        facts = {"loss": self._checked_loss(), "gaussians": self.gaussians.count, "seconds": seconds}
+        self.record.append({"iteration": self.iteration, **facts})
+        now = Progress(
+            self.iteration, self.options.iterations, **facts, state=self.state, volume=self.present_volume
+        )
         try:
-            total = self.options.iterations
-            report(
-                Progress(
-                    self.iteration, total, loss, count, seconds, state=self.state, volume=self.present_volume
-                )
-            )
+            report(now)
         except KeyboardInterrupt:
             self.interrupted_at = self.iteration
-        return {"iteration": self.iteration, "loss": loss, "gaussians": count, "seconds": seconds}
 
     def step(self) -> None:
         """One frame: render, compare, go back, regularise, move, and now and then control the density."""
@@ -238,7 +247,7 @@ class SplatRun:
     # --- stop and go on ---------------------------------------------------------------------------------
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that the next iteration depends on."""
+        """Everything that the next iteration depends on, and what there is to tell of those before."""
         population = self._population()
         return {
             "raw": population.raw,
@@ -247,6 +256,7 @@ class SplatRun:
             "iteration": np.array(self.iteration),
             "queue": np.array(self._queue, np.int64),
             "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+            **history_arrays(self.record, time.perf_counter() - self._started),
         }
 
     def restore(self, state: State) -> None:
@@ -259,6 +269,7 @@ class SplatRun:
         self.rt.write(self.statistics, padded)
         self.iteration, self._queue = int(iteration), [int(f) for f in queue]
         self.rng.bit_generator.state = json.loads(str(rng))
+        self.record, self.seconds_before = history(state)
 
     # --- the population -----------------------------------------------------------------------------------
 

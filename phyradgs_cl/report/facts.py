@@ -67,5 +67,5 @@ def _text(value: object) -> str:
     if isinstance(value, float):
         return number(value)
     if isinstance(value, list | tuple):
-        return " × ".join(_text(part) for part in value) if len(value) <= 12 else f"{len(value)} values"
+        return ", ".join(_text(part) for part in value) if len(value) <= 12 else f"{len(value)} values"
     return str(value)

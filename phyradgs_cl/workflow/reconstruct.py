@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import platform
 import time
 from collections.abc import Callable, Mapping
@@ -125,6 +126,8 @@ def _reconstructed(
     extra: dict[str, Any] = {"before": job.before}
     if job.resume:
         extra["resume"] = _resumed(job, fingerprint)
+    else:
+        _set_aside(checkpoint_path(job.output))
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
     result: Reconstruction | None = None
     try:
@@ -218,6 +221,15 @@ def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
             "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(resumable)}"
         )
     return read_checkpoint(checkpoint_path(job.output), fingerprint)
+
+
+def _set_aside(checkpoint: Path) -> None:
+    """Whoever repeats a command without --resume may have meant it: the hours in a checkpoint are not thrown away."""
+    if checkpoint.is_file():
+        kept = checkpoint.with_name(f"{checkpoint.name}.bak")
+        os.replace(checkpoint, kept)
+        remedy = "to go on from it, stop, rename it back and add --resume"
+        log.warning("%s is of an earlier run and is kept as %s: %s", checkpoint, kept.name, remedy)
 
 
 def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:

@@ -76,6 +76,10 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name)
     resume = ["--resume"] if checkpoint_path(killed).exists() else []
     subprocess.run([*run, *resume], check=True, capture_output=True)
     np.testing.assert_array_equal(volume(killed), volume(whole))
+    told, expected = (
+        [line["iteration"] for line in read_volume(path).provenance["record"]] for path in (killed, whole)
+    )
+    assert told == expected
     assert not checkpoint_path(killed).exists() and not lock_path(killed).exists()
 
 
@@ -111,3 +115,14 @@ def test_a_checkpoint_that_cannot_be_written_is_a_warning(scan, tmp_path) -> Non
     )
     assert done.returncode == 0 and done.stderr.count("no checkpoint") == 1
     assert output.exists()
+
+
+def test_a_checkpoint_is_not_lost_to_a_run_that_forgets_it(scan, tmp_path) -> None:
+    output = tmp_path / "volume.h5"
+    long = ["--method", "sirt", "--iterations", "100000"]
+    kill_in_the_middle(command(scan, output, long), output, 0.01)
+    kept = checkpoint_path(output).read_bytes()
+    short = command(scan, output, ["--method", "sirt", "--iterations", "3"])
+    done = subprocess.run(short, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "kept as volume.h5.checkpoint.npz.bak" in done.stderr
+    assert checkpoint_path(output).with_name("volume.h5.checkpoint.npz.bak").read_bytes() == kept

@@ -96,3 +96,24 @@ def test_the_documentation_s_example_runs(tmp_path, make_truth, monkeypatch) -> 
     monkeypatch.chdir(tmp_path)
     exec(compile(python, str(DOCS), "exec"), {})
     assert read_scan(tmp_path / "scan.h5", counts_to_attenuation).is_fly
+
+
+def test_nothing_that_is_read_is_overwritten(run, tmp_path, make_truth) -> None:
+    """Whatever lies with the input and is no scan of ours may be part of it."""
+    folder = tmp_path / "rtk"
+    source = w.write_rtk(folder, make_truth())
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert len(before) >= 2
+    for victim in before:
+        for given in {source, folder if source.is_dir() else source}:
+            done = run(given, "-o", victim)
+            assert isinstance(done.exception, InputError) and done.exception.culprit == "--output"
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_scan_beside_the_input_is_made_anew(run, tmp_path, make_truth) -> None:
+    source = w.write_rtk(tmp_path / "rtk", make_truth())
+    out = (source if source.is_dir() else source.parent) / "scan.h5"
+    for _ in range(2):
+        done = run(source, "-o", out)
+        assert done.exit_code == 0, done.exception

@@ -357,7 +357,9 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(rt, fly_scan, method) -> 
     assert part.facts["interrupted_at"] == 3
     rest = reconstruct(fly_scan, method, rt, options, seed=3, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
-    assert rest.record[0]["iteration"] == 4
+    assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record]
+    assert rest.record[:3] == part.record
+    assert rest.facts["seconds"] > part.facts["seconds"]
     with pytest.raises(InputError, match="checkpoint"):
         reconstruct(fly_scan, method, rt, options, resume={"iteration": np.array(3)})
 
