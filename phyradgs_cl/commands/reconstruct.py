@@ -98,7 +98,7 @@ def reconstruct_command(
         Path | None,
         file_option(
             "--config",
-            help="TOML file with any of these options (underscores for dashes) and the preset's constants; "
+            help="TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
             "the command line wins.",
         ),
     ] = None,
