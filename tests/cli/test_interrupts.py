@@ -33,14 +33,6 @@ def scan(cli, tmp_path_factory):
     return path
 
 
-@pytest.fixture(autouse=True)
-def ctrl_c_raises():
-    """A test run started in the background would ignore the signal, and hand that on to its children."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def interrupted_before(function):
     """``function``, with Ctrl-C pressed as it begins."""
 
