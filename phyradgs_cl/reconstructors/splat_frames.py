@@ -12,6 +12,7 @@ from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators import DeviceCells
 from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.system import averages
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _PEAK_PERCENTILE = 99.9  # noise has peaks of its own
@@ -44,8 +45,8 @@ class DeviceFrames:
         ]
         self._cells = [DeviceCells.upload(rt, table) for table in tables]
         # of one value both models are the mean
-        averages = model == "intensity" and max(cells.layers for cells in self._cells) > 1
-        self.intensity_unit = scale.line_integral if averages else None
+        merges = model == "intensity" and any(averages(table) for table in tables)
+        self.intensity_unit = scale.line_integral if merges else None
         frames = scan.projections / np.float32(scale.line_integral)
         self._measured = [rt.upload(pad_rows(f.T if by_column else f)) for f in frames]
         self._mask, self._pixels = _upload_masks(rt, scan, by_column)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators.intensity import IntensityOperator
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
@@ -114,7 +114,7 @@ class System:
 
 def averages(table: TimeCells) -> bool:
     """Whether a line of the frame has more than one cell."""
-    return table.count > len(np.unique(table.line_start))
+    return bool(layer_numbers(table).any())
 
 
 def norm(values: np.ndarray) -> float:

@@ -94,33 +94,25 @@ def run_simulation(
         refuse_overwriting("-o", job.output, Path(job.scanner))
     check_writable(job.output)
     with only_run(job.output):
-        return _simulated(job, scanner, options, rt, report)
-
-
-def _simulated(
-    job: SimulationJob,
-    scanner: Scanner,
-    options: SimulationOptions,
-    rt: Runtime,
-    report: Callable[[int, int], None],
-) -> Scan:
-    scene = _scene(job, scanner, options, rt)
-    scene.warn_of_inverse_crime()
-    scan = simulate(
-        scene.source,
-        scanner.geometry,
-        scene.grid,
-        options,
-        reference=scene.reference,
-        title=f"simulated scan of {scene.title}",
-        report=report,
-    )
-    scan.provenance.update(program=f"phyradgs-cl {__version__}", simulated=scene.title, seed=options.seed)
-    scan.provenance.update(pixel_samples=job.pixel_samples)
-    scan.provenance.update(noise=options.noise, dose=options.dose, electronic_noise=options.electronic_noise)
-    with finish_despite_interrupt():
-        write_scan(job.output, scan)
-    return scan
+        scene = _scene(job, scanner, options, rt)
+        scene.warn_of_inverse_crime()
+        scan = simulate(
+            scene.source,
+            scanner.geometry,
+            scene.grid,
+            options,
+            reference=scene.reference,
+            title=f"simulated scan of {scene.title}",
+            report=report,
+        )
+        scan.provenance.update(program=f"phyradgs-cl {__version__}", simulated=scene.title, seed=options.seed)
+        scan.provenance.update(pixel_samples=job.pixel_samples)
+        scan.provenance.update(
+            noise=options.noise, dose=options.dose, electronic_noise=options.electronic_noise
+        )
+        with finish_despite_interrupt():
+            write_scan(job.output, scan)
+        return scan
 
 
 def _scene(job: SimulationJob, scanner: Scanner, options: SimulationOptions, rt: Runtime) -> Scene:

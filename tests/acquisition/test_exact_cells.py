@@ -7,7 +7,7 @@ import pytest
 from tolerances import FLOAT64
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, EncoderTable, Motion, Shutter
-from phyradgs_cl.acquisition.cells import exact_cells, segments_for, static_cells
+from phyradgs_cl.acquisition.cells import exact_cells, layer_numbers, segments_for, static_cells
 from phyradgs_cl.errors import InputError
 
 LINES = 9
@@ -99,3 +99,11 @@ def test_averaged_intensities_take_more_segments_where_contrast_is_high() -> Non
     where = (ORBIT, Shutter(0.8, 0.6), 0, START_S, 0.0005)
     counts = [segments_for(*where, peak) for peak in (0.0, 4.0, 8.0, 16.0)]
     assert counts[0] == counts[1] < counts[2] < counts[3] <= 2 * counts[0]
+
+
+def test_segments_that_begin_at_different_lines_still_meet_in_one_line() -> None:
+    """What decides whether a detector's averaging matters: not where cells begin, but whether a line has two."""
+    meeting = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 4)
+    assert layer_numbers(meeting).max() > 0
+    alone = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 1)
+    assert layer_numbers(alone).max() == 0
