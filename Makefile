@@ -1,8 +1,9 @@
 # make demo    simulate a fly-scan, reconstruct it three ways, print a table (minutes on two cores)
 # make test    style, tests on a CPU device; a skipped kernel test is a failure
 # make docs     the documentation as a site, in site/
-# make stress     runs killed fifty times each, resumed to the same bits (half an hour)
+# make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB)
+# make test-neural    the tests of naf and sax-nerf, with PyTorch in an environment of its own
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
 # make clean   remove what the two have made
 #
@@ -16,7 +17,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test docs stress test-intel test-oclgrind clean
+.PHONY: demo test docs stress test-intel test-neural test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -61,7 +62,7 @@ docs: $(VENV)/.installed-test
 	$(BIN)/mkdocs build --strict --site-dir site
 
 stress: $(VENV)/.installed-test
-	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py
+	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/faults tests/corpus tests/laws
 
 # Wheels do not register with the OpenCL loader: a file that names the library does.
 $(VENV)-intel/.installed: pyproject.toml
@@ -77,6 +78,16 @@ test-intel: $(VENV)-intel/.installed
 		PHYRADGS_DEVICE="Intel(R) OpenCL" $(VENV)-intel/bin/python -m pytest --junit-xml=$(VENV)-intel/junit.xml
 	@$(VENV)-intel/bin/python .ci/no_skips.py $(VENV)-intel/junit.xml
 
+$(VENV)-neural/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)-neural
+	$(VENV)-neural/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-neural/bin/python -m pip install --quiet --editable ".[cpu,test,neural]"
+	@touch $@
+
+test-neural: $(VENV)-neural/.installed
+	$(VENV)-neural/bin/python -m pytest tests/neural --junit-xml=$(VENV)-neural/junit.xml
+	@$(VENV)-neural/bin/python .ci/no_skips.py $(VENV)-neural/junit.xml
+
 $(VENV)-oclgrind/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-oclgrind
 	$(VENV)-oclgrind/bin/python -m pip install --quiet --upgrade pip
@@ -87,4 +98,4 @@ test-oclgrind: $(VENV)-oclgrind/.installed
 	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-intel $(VENV)-oclgrind $(OUT) build dist site
+	rm -rf $(VENV) $(VENV)-intel $(VENV)-neural $(VENV)-oclgrind $(OUT) build dist site

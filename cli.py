@@ -1,4 +1,4 @@
-"""The command line: the commands put together. Every error is one line on stderr and exit status 2."""
+"""The command line: the commands put together. Every error is one line on stderr and an exit status of its kind."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 from phyradgs_cl import __version__, signals
 from phyradgs_cl.commands import (
     bench,
+    check,
     devices,
     estimate,
     evaluate,
@@ -19,10 +20,14 @@ from phyradgs_cl.commands import (
     reconstruct,
     report,
     simulate,
+    sweep,
     view,
+    watch,
 )
 from phyradgs_cl.commands.console import complain, give_up_stdout, say
-from phyradgs_cl.errors import PhyradgsError
+from phyradgs_cl.commands.ranks import takes_part
+from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
+from phyradgs_cl.io.atomic import NO_SPACE
 from phyradgs_cl.reconstructors.interrupt import InterruptedAfterwards
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -51,10 +56,12 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result.\n\n"
-    "Exit status: 0 done, 2 wrong input or no device, 3 numbers that overflowed, 130 interrupted, 143 terminated.",
+    "Exit status: 0 done, 2 wrong input, 3 numbers that overflowed, 4 output not written, 5 no device or one that fails, "
+    "6 out of memory, 10 suspicious (check), 130 interrupted, 143 terminated.",
 )
 app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate_command)
 app.command("import", epilog=import_scan.EXAMPLE)(import_scan.import_command)
+app.command("check", epilog=check.EXAMPLE)(check.check_command)
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct_command)
 app.command("estimate", epilog=estimate.EXAMPLE)(estimate.estimate_command)
 app.command("evaluate", epilog=evaluate.EXAMPLE)(evaluate.evaluate_command)
@@ -62,6 +69,8 @@ app.command("report", epilog=report.EXAMPLE)(report.report_command)
 app.command("view", epilog=view.EXAMPLE)(view.view_command)
 app.command("export", epilog=export_volume.EXAMPLE)(export_volume.export_command)
 app.command("bench", epilog=bench.EXAMPLE)(bench.bench_command)
+app.command("sweep", epilog=sweep.EXAMPLE)(sweep.sweep_command)
+app.command("watch", epilog=watch.EXAMPLE)(watch.watch_command)
 app.command("info", epilog=info.EXAMPLE)(info.info_command)
 app.command("devices", epilog=devices.EXAMPLE)(devices.devices_command)
 
@@ -80,17 +89,19 @@ def root(
 def run(arguments: list[str]) -> int:
     """Runs one command; the exit status."""
     signals.start_afresh()
+    if not takes_part(arguments):
+        return 0
     try:
-        status = app(arguments, standalone_mode=False)
+        with naming_host_memory():
+            status = app(arguments, standalone_mode=False)
         return status if isinstance(status, int) else 0
     except PhyradgsError as error:
         return complain(str(error), error.exit_code)
-    except MemoryError as error:
-        return complain(f"not enough memory: {error}; use a smaller problem")
     except _CLICK_ERROR as error:
         return complain(str(error.format_message()))  # type: ignore[attr-defined]
     except OSError as error:  # one that no reader or writer has named
-        return complain(f"{error.filename or 'operating system'}: {error.strerror or error}")
+        text = f"{error.filename or 'operating system'}: {error.strerror or error}"
+        return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
     except SystemExit:  # Typer's answer to a reader of its help that has gone away, as in `| head`
         give_up_stdout()
         return 0

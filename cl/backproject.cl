@@ -1,5 +1,6 @@
 /* Voxel-driven backprojection with FDK's distance weight: bilinear in the filtered projections, zero outside them.
-   All kernels add to the volume. Twins: operators/twins/backproject.py.
+   All kernels add to the volume, view after view, so that the bits do not tell how many launches there were. The volume may
+   be a brick of the grid, with its first voxel at `origin`. Twins: operators/twins/backproject.py.
      backproject          any pose; a work-item takes LANES voxels along x and walks the views
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
      backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes one voxel */
@@ -25,15 +26,18 @@ __kernel void backproject(
     __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */
     __global const float *weights,     /* (views,) */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
-    const int4 shape, const int volume_pitch,
+    const int4 shape, const int4 origin, const int volume_pitch,
     __global float *volume)
 {
-    const int first = (int)get_global_id(0) * LANES, y = (int)get_global_id(1), z = (int)get_global_id(2);
+    const int first = (int)get_global_id(0) * LANES;
     if (first >= shape.x)
         return;
-    const vf x = (vf)(first) + V_IOTA;
+    const int y = (int)get_global_id(1) + origin.y, z = (int)get_global_id(2) + origin.z;
+    const vf x = (vf)(first + origin.x) + V_IOTA;
+    __global float *target = volume + IMAGE_GUARD
+                             + (get_global_id(2) * shape.y + get_global_id(1)) * volume_pitch + first;
     const int next_row = rows > 1 ? image_pitch : 0, next = width > 1 ? 1 : 0;
-    vf sum = (vf)(0.0f);
+    vf sum = V_LOAD(target);
     for (int f = 0; f < views; ++f) {
         __global const float *m = matrices + (size_t)f * 12;
         __global const float *image = projections + f * image_step + IMAGE_GUARD;
@@ -53,9 +57,8 @@ __kernel void backproject(
         const vf upper = below + wu * (above - below);
         sum += V_PICK(0.0f, weights[f] * inv * inv * (lower + wv * (upper - lower)), inside);
     }
-    __global float *target = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * volume_pitch + first;
     /* the last vector may reach into the guard, where it must leave zeros */
-    V_STORE(V_LOAD(target) + V_PICK(0.0f, sum, x < (float)shape.x), target);
+    V_STORE(V_PICK(0.0f, sum, V_IOTA < (float)(shape.x - first)), target);
 }
 
 #ifdef COLUMN_ROWS
@@ -65,16 +68,18 @@ __kernel void backproject(
 __kernel void backproject_upright(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
-    const int4 shape, const int volume_pitch, const int block, /* voxels along z a work-item, <= BLOCK_VOXELS */
+    const int4 shape, const int4 origin, const int volume_pitch, const int block, /* voxels along z a work-item, <= BLOCK_VOXELS */
     __global float *volume)
 {
-    const int x = (int)get_global_id(0), y = (int)get_global_id(1), first = (int)get_global_id(2) * block;
-    if (x >= shape.x)
+    if (get_global_id(0) >= shape.x)
         return;
-    const int count = min(block, shape.z - first);
+    const int x = (int)get_global_id(0) + origin.x, y = (int)get_global_id(1) + origin.y;
+    const int below = (int)get_global_id(2) * block, first = below + origin.z, count = min(block, shape.z - below);
+    const size_t slice = (size_t)shape.y * volume_pitch;
+    __global float *target = volume + IMAGE_GUARD + below * slice + get_global_id(1) * volume_pitch + get_global_id(0);
     float sum[BLOCK_VOXELS], blended[COLUMN_ROWS + 2 * LANES];
     for (int z = 0; z < count; ++z)
-        sum[z] = 0.0f;
+        sum[z] = target[z * slice];
     for (int f = 0; f < views; ++f) {
         __global const float *m = matrices + (size_t)f * 12;
         const float depth = m[8] * x + (m[9] * y + m[11]);
@@ -105,9 +110,8 @@ __kernel void backproject_upright(
             sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
         }
     }
-    __global float *target = volume + IMAGE_GUARD + (size_t)y * volume_pitch + x;
     for (int z = 0; z < count; ++z)
-        target[(size_t)(first + z) * shape.y * volume_pitch] += sum[z];
+        target[z * slice] = sum[z];
 }
 #endif
 
@@ -135,16 +139,18 @@ __kernel void backproject_lines(
     __global const float *matrices,    /* (views, lines, 12) */
     __global const float *weights,     /* (views,) */
     const int views, const int lines, const int width, const int image_pitch, const long image_step,
-    const int4 shape, const int volume_pitch,
+    const int4 shape, const int4 origin, const int volume_pitch,
     const int filtered_across, /* 1 where the ramp filter ran across lines: readout along columns */
     __global float *volume)
 {
-    const int xi = (int)get_global_id(0);
-    if (xi >= shape.x)
+    if (get_global_id(0) >= shape.x)
         return;
-    const float x = (float)xi, y = (float)get_global_id(1), z = (float)get_global_id(2);
+    const float x = (float)((int)get_global_id(0) + origin.x), y = (float)((int)get_global_id(1) + origin.y);
+    const float z = (float)((int)get_global_id(2) + origin.z);
+    __global float *target = volume + IMAGE_GUARD
+                             + (get_global_id(2) * shape.y + get_global_id(1)) * volume_pitch + get_global_id(0);
     const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0;
-    float sum = 0.0f;
+    float sum = *target;
     for (int f = 0; f < views; ++f) {
         __global const float *table = matrices + (size_t)f * lines * 12;
         __global const float *m = table;
@@ -175,5 +181,5 @@ __kernel void backproject_lines(
         const float scale = filtered_across ? speed * speed : speed;
         sum += weights[f] / (middle * middle * scale) * (here + t * (there - here));
     }
-    volume[IMAGE_GUARD + ((size_t)get_global_id(2) * shape.y + get_global_id(1)) * volume_pitch + xi] += sum;
+    *target = sum;
 }

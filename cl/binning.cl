@@ -44,15 +44,16 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
     starts[t + 1] = sum;
 }
 
+/* stays at the largest int where there are more entries than it counts: the host looks */
 __kernel void bin_starts(const int total, __global int *starts)
 {
     if (get_global_id(0) > 0)
         return;
     starts[0] = 0;
-    int sum = 0;
+    long sum = 0;
     for (int t = 0; t < total; ++t) {
-        sum += starts[t + 1];
-        starts[t + 1] = sum;
+        sum = min(sum + starts[t + 1], (long)INT_MAX);
+        starts[t + 1] = (int)sum;
     }
 }
 

@@ -14,9 +14,11 @@ __kernel void rays_forward(
     __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last */
     __global const int *line_cells,   /* (F, lines, 2): first cell and cell after the last that may serve a line */
     __global const int *frame_list,   /* which frames */
-    const int4 shape, const int volume_pitch, const float4 pitch_mm,
+    const int4 shape, const int4 origin, /* voxels of the volume, and the first of them in the grid, x y z */
+    const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int average,                /* of a line's cells: AVERAGE_... */
+    const int add,                    /* onto the image: the log average of one more brick */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);
@@ -37,15 +39,15 @@ __kernel void rays_forward(
         vf p = (vf)(0.0f);
         for (int axis = 0; axis < 3; ++axis) {
             walk_t w;
-            if (!rays_enter(r, cell, axis, real, (int4)(0), shape, &w))
+            if (!rays_enter(r, cell, axis, real, origin, shape, &w))
                 continue;
             const index_t sa = axis == 0 ? 1 : (axis == 1 ? sy : sz), sb = axis == 0 ? sy : 1, sc = axis == 2 ? sy : sz;
             for (int i = w.lo; i <= w.hi; ++i) {
                 vf wb, wc, v00, v10, v01, v11;
                 const vi j = sample_at(w.gb, w.sb, (float)i - w.sa, w.b_first, w.b_last, &wb);
                 const vi k = sample_at(w.gc, w.sc, (float)i - w.sa, w.c_first, w.c_last, &wc);
-                vindex at = V_INDEX(j) * sb + V_INDEX(k) * sc;
-                __global const float *plane = body + i * sa;
+                vindex at = V_INDEX(j - w.b_first) * sb + V_INDEX(k - w.c_first) * sc;
+                __global const float *plane = body + (i - w.a_first) * sa;
                 #pragma unroll
                 for (int lane = 0; lane < LANES; ++lane) {
                     __global const float *corner = plane + LANE(index_t, at, lane);
@@ -72,7 +74,10 @@ __kernel void rays_forward(
         const vf brighter = log1p(max(light, -0.9999999f));
         total = average == AVERAGE_GAP ? total + brighter : first - brighter;
     }
-    V_STORE(V_PICK(0.0f, total, real), image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u);
+    __global float *pixels = image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u;
+    if (add)
+        total += V_LOAD(pixels);
+    V_STORE(V_PICK(0.0f, total, real), pixels);
 }
 
 #if !RAY_VOXEL_ITEMS
@@ -129,19 +134,26 @@ __kernel void rays_adjoint(
     const int matrix_stride,
     __global const int *frame_cells,  /* (F + 1,): where a frame's cells begin */
     __global const int *frame_list, const int frame_count,
-    const int4 shape, const int volume_pitch, const float4 pitch_mm,
+    const int4 shape, const int4 origin, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
     __global float *volume)
 {
     __local float tile[TILE_X * TILE_Y * TILE_Z]; /* of the one work-item in the group */
-    const int4 corner = (int4)((int)get_group_id(0) * BRICK_X, (int)get_group_id(1) * BRICK_Y,
-                               (int)get_group_id(2) * BRICK_Z, 0);
-    const int4 size = min((int4)(BRICK_X, BRICK_Y, BRICK_Z, 0), shape - corner);
+    const int4 own = (int4)((int)get_group_id(0) * BRICK_X, (int)get_group_id(1) * BRICK_Y,
+                            (int)get_group_id(2) * BRICK_Z, 0); /* first voxel, in this volume; corner: in the grid */
+    const int4 corner = origin + own, size = min((int4)(BRICK_X, BRICK_Y, BRICK_Z, 0), shape - own);
+    const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
+    __global float *voxels = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
     const float4 half_size = convert_float4(size + 1) * 0.5f; /* with the border */
     const float4 middle = convert_float4(corner) + convert_float4(size - 1) * 0.5f;
     for (int k = 0; k < TILE_X * TILE_Y * TILE_Z; ++k)
         tile[k] = 0.0f;
+    if (add) /* first, so that frames sum up in one order however many launches they take */
+        for (int z = 0; z < size.z; ++z)
+            for (int y = 0; y < size.y; ++y)
+                for (int x = 0; x < size.x; ++x)
+                    tile[((z + 1) * TILE_Y + y + 1) * TILE_X + x + 1] = voxels[z * sz + y * sy + x];
     for (int n = 0; n < frame_count; ++n) {
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
         const int stop = frame_cells[frame_list[n] + 1];
@@ -160,15 +172,10 @@ __kernel void rays_adjoint(
             }
         }
     }
-    const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     for (int z = 0; z < size.z; ++z)
-        for (int y = 0; y < size.y; ++y) {
-            __local const float *from = tile + ((z + 1) * TILE_Y + y + 1) * TILE_X + 1;
-            __global float *to = volume + IMAGE_GUARD + (corner.z + z + BORDER) * sz + (corner.y + y + BORDER) * sy
-                                 + corner.x;
+        for (int y = 0; y < size.y; ++y)
             for (int x = 0; x < size.x; ++x)
-                to[x] = add ? to[x] + from[x] : from[x];
-        }
+                voxels[z * sz + y * sy + x] = tile[((z + 1) * TILE_Y + y + 1) * TILE_X + x + 1];
 }
 
 #else
@@ -197,18 +204,21 @@ __kernel void rays_adjoint(
     __global const float *image, __global const float *cells, __global const int *cell_lines,
     __global const float *matrices, const int matrix_stride,
     __global const int *frame_cells, __global const int *frame_list, const int frame_count,
-    const int4 shape, const int volume_pitch, const float4 pitch_mm,
+    const int4 shape, const int4 origin, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
     __global float *volume)
 {
     __local int range[2]; /* cells outside of which none sees the block */
     const int item = (int)get_local_id(0), items = (int)get_local_size(0);
-    const int4 corner = (int4)((int)get_group_id(0), (int)get_group_id(1), (int)get_group_id(2), 0) * BLOCK;
-    const int4 voxel = corner + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
-    const int inside = voxel.x < shape.x && voxel.y < shape.y && voxel.z < shape.z;
+    const int4 block = (int4)((int)get_group_id(0), (int)get_group_id(1), (int)get_group_id(2), 0) * BLOCK;
+    const int4 own = block + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
+    const int4 corner = origin + block, voxel = origin + own; /* in the grid; own, block: in this volume */
+    const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;
+    const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
+    __global float *to = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
     const float4 around = (float4)(0.5f * (BLOCK + 1)), middle = convert_float4(corner) + 0.5f * (BLOCK - 1);
-    float sum = 0.0f;
+    float sum = inside && add ? *to : 0.0f;
     for (int n = 0; n < frame_count; ++n) {
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
         int first = frame_cells[frame_list[n]], stop = frame_cells[frame_list[n] + 1];
@@ -241,10 +251,7 @@ __kernel void rays_adjoint(
             sum += cell[RAY_WEIGHT] * from_cell;
         }
     }
-    if (inside) {
-        const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
-        __global float *to = volume + IMAGE_GUARD + (voxel.z + BORDER) * sz + (voxel.y + BORDER) * sy + voxel.x;
-        *to = add ? *to + sum : sum;
-    }
+    if (inside)
+        *to = sum;
 }
 #endif

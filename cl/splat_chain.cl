@@ -53,7 +53,7 @@ __kernel void splat_chain(
     vf by_log_density = zero, by_u0 = zero, by_v0 = zero;
 
     for (int c = 0; c < cell_count; ++c) {
-        float fields[(SUM_COUNT + TURNED) * LANES];
+        float fields[(SUM_COUNT + TURNED) * LANES], seen[LANES];
         int drawn = 0;
         for (int lane = 0; lane < LANES; ++lane) {
             const size_t at = (size_t)(first + lane) * cell_count + c;
@@ -61,6 +61,7 @@ __kernel void splat_chain(
             __global const int *whole = (__global const int *)rec;
             const int here = first + lane < count && whole[REC_V_HI] >= whole[REC_V_LO];
             drawn |= here;
+            seen[lane] = here;
             for (int f = 0; f < SUM_COUNT; ++f)
                 fields[f * LANES + lane] = here ? sums[at * SUMS + f] : 0.0f;
 #if MOVING
@@ -94,12 +95,17 @@ __kernel void splat_chain(
 
         __global const float *cell = cells + c * CELL;
         __global const coefficient *m = matrices + c * POSES * 12;
-        const vf z = wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z));
+        /* lanes that are not drawn have sums of 0, and may be at the source: any other place keeps them from 0/0 */
+        const vi is_seen = V_LOAD(seen) > 0.0f;
+        const vf z = V_PICK((vf)(1.0f), wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z)), is_seen);
         const vf inv_z = 1.0f / z;
         const vf u0 = wide_value(wide_dot(m, mean.x, mean.y, mean.z)) * inv_z;
         const vf v0 = wide_value(wide_dot(m + 4, mean.x, mean.y, mean.z)) * inv_z;
-        const v3 ray = to_local(axes, v3_make(mean.x - cell[CELL_SOURCE], mean.y - cell[CELL_SOURCE + 1],
-                                              mean.z - cell[CELL_SOURCE + 2]));
+        const v3 from_source = v3_make(mean.x - cell[CELL_SOURCE], mean.y - cell[CELL_SOURCE + 1],
+                                       mean.z - cell[CELL_SOURCE + 2]);
+        const v3 ray = to_local(axes, v3_make(V_PICK((vf)(1.0f), from_source.x, is_seen),
+                                              V_PICK((vf)(0.0f), from_source.y, is_seen),
+                                              V_PICK((vf)(0.0f), from_source.z, is_seen)));
         const v3 eu = to_local(axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
         const v3 ev = to_local(axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
         const v3 white = v3_mul(ray, inv_scale);
@@ -182,7 +188,7 @@ __kernel void splat_chain(
         for (int end = 0; end < 2; ++end) {
             __global const coefficient *n = m + 12 * (end + 1);
             const float sign = end ? 1.0f : -1.0f;
-            const vf inv = 1.0f / wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z));
+            const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_seen);
             add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,
                           wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv,
                           0.16666666667f * g_u0 + sign * g_path_u, 0.16666666667f * g_v0 + sign * g_path_v, zero);

@@ -86,6 +86,10 @@ SPLAT_INLINE void times_of_lines(__global const float *times, const int pitch, c
 #define FIELDS 9
 #endif
 
+/* Depth of a centre, 1 on the detector, below which nothing is drawn: float32 cannot tell such a place from the source's
+   own plane, and derivatives grow with its inverse. */
+#define NEAREST 1e-6f
+
 __kernel void splat_prepare(
     __global const float *gaussians,      /* (11, stride) */
     __global const float *cells,          /* (C, CELL) */
@@ -164,7 +168,7 @@ __kernel void splat_prepare(
 #endif
 
         /* the ellipse q <= cutoff2 is D'TD - 2 c b.D - c <= 0 with T = S (1 - c/kappa) - c b b' */
-        vi drawn = exists & (z > 0.0f) & (kappa > 0.0f);
+        vi drawn = exists & (z > NEAREST) & (kappa > 0.0f);
 #if MOVING
         drawn &= ends.in_front;
         const vf pu = ends.path_u, pv = ends.path_v;

@@ -1,9 +1,13 @@
 """The package's exceptions: each names the culprit, what was found, what was expected and what to do.
 
-One line of text comes out of ``str()``, so that the command line can print it as it is.
+One line of text comes out of ``str()``, so that the command line can print it as it is. The exit statuses are told apart by
+scripts and listed in docs/trouble.md; 1 is Python's own, for a defect of this program.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class PhyradgsError(Exception):
@@ -40,15 +44,42 @@ class InputError(PhyradgsError):
     """A file, a dataset or an option is wrong."""
 
 
-class OutputError(PhyradgsError):
-    """A result cannot be written."""
-
-
-class DeviceError(PhyradgsError):
-    """There is no such OpenCL device, or it fails."""
-
-
 class NumericalError(PhyradgsError):
     """NaN or infinity arose in a computation."""
 
     exit_code = 3
+
+
+class OutputError(PhyradgsError):
+    """A result cannot be written: no room, no permission, or another run is at work on it."""
+
+    exit_code = 4
+
+
+class DeviceError(PhyradgsError):
+    """There is no OpenCL device, it fails, or a kernel does not build on it."""
+
+    exit_code = 5
+
+
+class NoSuchDeviceError(DeviceError):
+    """The device that was asked for is not there: as wrong an option as any other."""
+
+    exit_code = 2
+
+
+class OutOfMemoryError(DeviceError):
+    """The memory of the device or of the machine is exhausted."""
+
+    exit_code = 6
+
+
+@contextmanager
+def naming_host_memory() -> Iterator[None]:
+    """Python's and NumPy's MemoryError in the body comes out as OutOfMemoryError."""
+    try:
+        yield
+    except MemoryError as error:
+        found = f"too little ({error})" if str(error) else "too little"
+        remedy = "use a smaller problem, or a machine with more"
+        raise OutOfMemoryError("memory of this machine", found, "enough", remedy) from error

@@ -1,27 +1,43 @@
-"""What a reconstruction will take: a few iterations of the real thing, timed, and the rest by proportion."""
+"""What a reconstruction will take: short runs of the real thing, timed, and the rest by proportion.
+
+A cloud of Gaussians grows under density control, and its footprints with it: an iteration late in a run costs half as much
+again as the first ones. The trial therefore goes through the whole schedule in few iterations.
+"""
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.reconstructors import METHODS, InputOptions, reconstruct
+from phyradgs_cl.io import sha256_of, write_volume
+from phyradgs_cl.metrics import compare
+from phyradgs_cl.reconstructors import METHODS, InputOptions, Reconstruction, reconstruct
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
-_SPLAT_TRIALS = (20, 100)  # iterations
+_SPLAT_TRIALS = (20, 200)  # iterations
 _ITERATIVE_TRIALS = (1, 3)
+_LEAST_DIFFERENCE_S = 0.3  # between the trials of methods whose iterations are alike
+_MOST_ALIKE = 200
+_FEWEST_BETWEEN = 5  # iterations from one round of density control to the next, in a trial
 
 
 @dataclass(frozen=True)
 class Estimate:
     """seconds, host_bytes and device_bytes of a whole run; the trial's own iterations and seconds.
 
+    around_s: what ``seconds`` has beside the method: reading, comparing with a reference, writing.
     host_bytes: the process's largest resident memory, which on a CPU device holds the device's buffers too;
     device_bytes: the most that is held in buffers at one time.
     """
@@ -33,14 +49,16 @@ class Estimate:
     seconds_an_iteration: float
     trial_iterations: int
     trial_seconds: float
+    around_s: float = 0.0
 
     def text(self) -> str:
         """Two lines: time, and memory."""
-        each = (
-            f" ({self.iterations} iterations of {1e3 * self.seconds_an_iteration:.3g} ms)"
-            if self.seconds_an_iteration > 0
-            else ""
-        )
+        parts = []
+        if self.seconds_an_iteration > 0:
+            parts.append(f"{self.iterations} iterations of {1e3 * self.seconds_an_iteration:.3g} ms")
+        if self.around_s > 0:
+            parts.append(f"{duration(self.around_s)} to read, compare and write")
+        each = f" ({', '.join(parts)})" if parts else ""
         return (
             f"time    {duration(self.seconds)}{each}\n"
             f"memory  {self.host_bytes / 2**20:.0f} MiB of the host, {self.device_bytes / 2**20:.0f} MiB in buffers"
@@ -48,47 +66,118 @@ class Estimate:
 
 
 def estimate(
-    scan: Scan, method: str, options: Any, rt: Runtime, before: InputOptions | None = None
+    scan: Scan,
+    method: str,
+    options: Any,
+    rt: Runtime,
+    before: InputOptions | None = None,
+    around: Callable[[Reconstruction], float] | None = None,
 ) -> Estimate:
     """Runs ``method`` for a few iterations (FDK as a whole) and says what ``options`` would take.
 
-    Splats are timed on their first cloud: where density control lets it grow, time grows with it.
+    ``around``: seconds of what a run does beside the method, from a result of it. The first trial builds kernels, or
+    reads them from the driver's cache, as the run will.
     """
     started = time.perf_counter()
+    last: list[Reconstruction] = []
 
     def seconds(iterations: int | None) -> float:
-        short = options if iterations is None else replace(options, iterations=iterations)
+        short = options if iterations is None else shortened(options, iterations)
         begun = time.perf_counter()
-        reconstruct(scan, method, rt, short, before=before)
+        last[:] = [reconstruct(scan, method, rt, short, before=before)]
         return time.perf_counter() - begun
 
     total = getattr(options, "iterations", None)
     if total is None or not METHODS[method].is_resumable:
         whole_s, each_s, trial, total = seconds(None), 0.0, 0, 0
+    elif isinstance(options, SplatOptions):
+        whole_s, each_s, trial = _of_schedule(seconds, total, *_SPLAT_TRIALS)
     else:
-        few, more = _trials(options)
-        trial = few + more
-        whole_s, each_s = _by_proportion(seconds, total, few, more)
-    held = _host_bytes()
-    return Estimate(whole_s, held, rt.peak_bytes, total, each_s, trial, time.perf_counter() - started)
+        whole_s, each_s, trial = _of_alike(seconds, total, *_ITERATIVE_TRIALS)
+    around_s = around(last[0]) if around else 0.0
+    spent_s, held = time.perf_counter() - started, peak_host_bytes()
+    return Estimate(whole_s + around_s, held, rt.peak_bytes, total, each_s, trial, spent_s, around_s)
 
 
-def _trials(options: Any) -> tuple[int, int]:
-    return _SPLAT_TRIALS if isinstance(options, SplatOptions) else _ITERATIVE_TRIALS
+def shortened(options: Any, iterations: int) -> Any:
+    """The same run in fewer iterations: of splats, with everything that has a time of its own at the same share."""
+    if not isinstance(options, SplatOptions) or iterations >= options.iterations:
+        return replace(options, iterations=min(iterations, options.iterations))
+    share, control = iterations / options.iterations, options.control
+    every = max(round(share * control.every), _FEWEST_BETWEEN) if control.every else 0
+    control = replace(control, every=every, start_iteration=round(share * control.start_iteration))
+    late = round(share * options.parameter_terms_from)
+    return replace(options, iterations=iterations, control=control, parameter_terms_from=late)
 
 
-def _by_proportion(seconds: Callable[[int], float], total: int, few: int, more: int) -> tuple[float, float]:
-    """(seconds of ``total`` iterations, seconds of one): kernels are built by the shorter trial, which is timed as it is."""
+def _of_schedule(
+    seconds: Callable[[int], float], total: int, few: int, more: int
+) -> tuple[float, float, int]:
+    """(seconds of ``total`` iterations, seconds of one, iterations that were run) of a run that changes on its way.
+
+    ``few`` iterations, twice, tell what a run takes beside its iterations; ``more`` go through all of its schedule.
+    """
+    first_s = seconds(min(few, total))
+    if total <= few:
+        return first_s, first_s / max(total, 1), total
+    if total <= more:
+        warm_s = seconds(total)  # the first has built the kernels, for this one too
+        return first_s + (1 - few / total) * warm_s, warm_s / total, few + total
+    again_s, through_s = seconds(few), seconds(more)
+    each_s = max(through_s - again_s, 0.0) / (more - few)
+    return first_s + (total - few) * each_s, each_s, 2 * few + more
+
+
+def _of_alike(seconds: Callable[[int], float], total: int, few: int, more: int) -> tuple[float, float, int]:
+    """The same of a run whose iterations are alike; so many that the difference of two trials can be told from noise."""
     first_s = seconds(min(few, total))
     if total <= few:  # the first has built the kernels, which the run will find built
-        return first_s, seconds(total) / max(total, 1)
-    again_s, longer_s = seconds(few), seconds(more)
-    each_s = max(longer_s - again_s, 0.0) / (more - few)
-    return first_s + (total - few) * each_s, each_s
+        whole_s = seconds(total)
+        return first_s, whole_s / max(total, 1), 2 * total
+    again_s, trial = seconds(few), 2 * few
+    while True:
+        more = min(more, total)
+        more_s, trial = seconds(more), trial + more
+        if more_s - again_s >= _LEAST_DIFFERENCE_S or more == total or more >= _MOST_ALIKE:
+            break
+        more *= 4
+    each_s = max(more_s - again_s, 0.0) / (more - few)
+    return first_s + (total - few) * each_s, each_s, trial
 
 
-def _host_bytes() -> int:
-    """The largest resident memory of this process so far."""
+def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
+    """What ``reconstruct`` does after the method: the scan's hash, a comparison where there is a truth, the file."""
+    begun = time.perf_counter()
+    sha256_of(path)
+    if scan.reference is not None and result.volume.shape == scan.reference.shape:
+        compare(result.volume, scan.reference)
+    cloud = None
+    if result.gaussians is not None:
+        cloud = {name: np.asarray(values, np.float32) for name, values in asdict(result.gaussians).items()}
+    with tempfile.TemporaryDirectory() as folder:
+        write_volume(Path(folder) / "volume.h5", result.volume, result.grid, {}, cloud)
+    return time.perf_counter() - begun
+
+
+def seconds_since_start() -> float:
+    """How long this process has been there, its start and imports too; its processor time where the system does not tell."""
+    with suppress(OSError, ValueError, IndexError):
+        ticks = float(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        lived_s = float(Path("/proc/uptime").read_text().split()[0]) - ticks / os.sysconf("SC_CLK_TCK")
+        if lived_s > 0:  # in some containers the two clocks are not of one system
+            return lived_s
+    return time.process_time()
+
+
+def peak_host_bytes() -> int:
+    """The largest resident memory of this process so far.
+
+    In Linux the system's call would also tell that of the process which started this one.
+    """
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return largest if sys.platform == "darwin" else 1024 * largest
 

@@ -15,6 +15,7 @@ from typing import Any
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.reconstructors import InputOptions, input_options, method_options
+from phyradgs_cl.runtime import bytes_of
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -30,7 +31,7 @@ class RunSettings:
     """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked.
 
     ``before``: what is done to the scan's frames first, whatever the method. ``origins``: where the values that are not
-    named options come from, as errors are to name it.
+    named options come from, as errors are to name it. ``memory``: a limit of the device's, bytes or text as 2GiB.
     """
 
     method: str
@@ -39,6 +40,7 @@ class RunSettings:
     device: str | None
     changes: Mapping[str, Any]
     before: InputOptions = InputOptions()
+    memory: str | int | None = None
     origins: Mapping[str, str] = field(default_factory=dict)
 
     @contextmanager
@@ -87,10 +89,13 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
         device = str(device)  # in TOML an index is a number
     seed = _seed(settings.pop("seed", 0), origins.get("seed", "--seed"))
     wish = device_wish(device, origins.get("device", "--device"))
+    memory = settings.pop("memory", None)
+    if memory is not None:
+        memory = bytes_of(memory, origins.get("memory", "--memory"))
     names = [f.name for f in fields(InputOptions)]
     changes = {name: settings.pop(name) for name in names if name in settings}
     chosen = RunSettings(
-        "phyradgs" if method is None else method, preset, seed, wish, settings, origins=origins
+        "phyradgs" if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
     )
     with chosen.naming_origins():
         return replace(chosen, before=input_options(changes))
@@ -107,19 +112,19 @@ def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
     return ".".join([origin, *rest])
 
 
-def read_config(path: Path | None) -> dict[str, Any]:
+def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
     if path is None:
         return {}
     if path.exists() and not path.is_file():  # a device or a pipe may never end
-        raise InputError(f"--config {path}", "not a regular file", "a TOML file")
+        raise InputError(f"{option} {path}", "not a regular file", "a TOML file")
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)
     except OSError as error:
-        raise InputError(f"--config {path}", error.strerror or str(error), "a TOML file") from error
+        raise InputError(f"{option} {path}", error.strerror or str(error), "a TOML file") from error
     except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
-        raise InputError(f"--config {path}", f"not TOML ({error})", "a TOML file") from error
+        raise InputError(f"{option} {path}", f"not TOML ({error})", "a TOML file") from error
 
 
 def assignment(text: str) -> dict[str, Any]:

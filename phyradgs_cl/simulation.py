@@ -17,8 +17,9 @@ from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import load_volume
 from phyradgs_cl.operators import RayProjector
-from phyradgs_cl.phantoms import EllipsoidPhantom, load_volume, make_phantom
+from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from phyradgs_cl import checks
-from phyradgs_cl.errors import DeviceError, InputError, NumericalError, OutputError, PhyradgsError
+from phyradgs_cl.errors import (
+    DeviceError,
+    InputError,
+    NoSuchDeviceError,
+    NumericalError,
+    OutOfMemoryError,
+    OutputError,
+    PhyradgsError,
+)
 
 
 def test_message_names_culprit_found_expected_and_remedy_on_one_line() -> None:
@@ -29,10 +37,20 @@ def test_missing_parts_leave_no_trace(arguments: tuple[str, ...], text: str) -> 
     assert str(PhyradgsError(*arguments)) == text
 
 
-@pytest.mark.parametrize("kind", [InputError, OutputError, DeviceError, NumericalError])
+@pytest.mark.parametrize(
+    "kind", [InputError, OutputError, DeviceError, NumericalError, OutOfMemoryError, NoSuchDeviceError]
+)
 def test_every_error_is_a_phyradgs_error_with_its_exit_code(kind: type[PhyradgsError]) -> None:
     assert issubclass(kind, PhyradgsError)
-    assert kind.exit_code == (3 if kind is NumericalError else 2)
+    codes = {
+        InputError: 2,
+        NumericalError: 3,
+        OutputError: 4,
+        DeviceError: 5,
+        OutOfMemoryError: 6,
+        NoSuchDeviceError: 2,
+    }
+    assert kind.exit_code == codes[kind]
 
 
 def test_errors_survive_pickling_as_worker_processes_need() -> None:

@@ -20,9 +20,9 @@ FLOORS: tuple[frozenset[str], ...] = (
     frozenset({"fields"}),
     frozenset({"acquisition"}),
     frozenset({"phantoms", "detector", "metrics", "io", "runtime"}),
-    frozenset({"operators", "objective", "optim"}),
+    frozenset({"operators", "objective", "optim", "neural"}),
     frozenset({"simulation", "reconstructors", "importers", "exporters"}),
-    frozenset({"estimate", "workflow", "bench", "settings", "progress", "api", "report"}),
+    frozenset({"check", "estimate", "workflow", "bench", "settings", "progress", "api", "report"}),
     frozenset({"commands"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
@@ -111,6 +111,14 @@ def test_pyopencl_lives_in_the_runtime(path: Path) -> None:
     if room_of(path) != "runtime":
         found = [line for line, module in imported_modules(path) if module.split(".")[0] == "pyopencl"]
         assert not found, f"{path}:{found[0]}: only phyradgs_cl/runtime imports pyopencl"
+
+
+@pytest.mark.parametrize("path", module_files(), ids=lambda p: str(p.relative_to(PACKAGE.parent)))
+def test_pytorch_lives_in_the_neural_room(path: Path) -> None:
+    if room_of(path) == "neural" or path == PACKAGE / "api" / "bridges.py":  # operators for PyTorch's users
+        return
+    found = [line for line, module in imported_modules(path) if module.split(".")[0] == "torch"]
+    assert not found, f"{path}:{found[0]}: only phyradgs_cl/neural imports torch"
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: str(p.relative_to(PACKAGE)))

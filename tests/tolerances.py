@@ -58,12 +58,17 @@ VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
 # of the peak: a voxel has few samples, whose positions (1e-5 of a voxel, 200 away from the source) do not average out
 RAYS_BACK = 3e-5  # measured 1.2e-5
+BRICKS = 2e-6  # of the largest: a ray's samples are summed brick by brick, in another order (4e-7)
 ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders
 # Joseph's bilinear samples smooth: second order in voxel over σ. 48 voxels over 4, σ ≥ 0.12 are σ ≥ 1.4 voxels.
 DISCRETISATION_GAUSSIANS = 0.05
 DISCRETISATION_ORDER = 3.0  # of 4 that second order gives for half the voxel
 DISCRETISATION_ELLIPSOID = 0.05  # relative L2 at 48³: the edge of one ellipsoid (0.037; 0.062 at 24³)
 DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.084; 0.14 at 24³)
+
+# --- rays through a neural field ---------------------------------------------------------------------------------
+RAY_SAMPLES = 1e-3  # goal; of the peak (smooth fields, one draw) or of the norm (sharp edge, mean of draws)
+RAY_SAMPLES_SHARP = 0.02  # a step inside an interval is counted or not: 0.4 intervals RMS a chord of about 50
 
 # --- FDK -----------------------------------------------------------------------------------------------------
 BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1
@@ -104,6 +109,7 @@ VOXEL_SOURCE = 0.08
 WHOLE_VALUE = 1e-5  # the image terms in float32
 # goal 1e-3, through everything (9e-7); other devices may sign tiny TV differences otherwise
 WHOLE_GRADIENT = 1e-4
+LAUNCH_SHAPE = 1e-3  # a few iterations in another order of sums; Adam enlarges what is near 0 (3e-5)
 SCALE_LAW = 1e-2  # 30 steps: rounding decides signs of L1 near its kink (1.1e-3); powers of two are exact
 # counts are divided in float64 but come out float32 (0 here); one last place would act as above
 GAIN_LAW = 1e-2
@@ -115,3 +121,8 @@ ITERATIVE_TWIN = (
 )
 KRYLOV = 1e-3  # relative, of CGLS against LSQR: float32 directions lose orthogonality
 CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum
+
+# Ranks: parts of a float32 sum are rounded before they are added, a few times 2^-24; measured 1e-7 to 4e-7.
+RANK_GRADIENT = 1e-6
+# Voxel methods on several ranks, which add up their own frames first; measured up to 7e-7 after 8 iterations.
+RANK_VOLUME = 1e-5

@@ -1,5 +1,6 @@
 """Benchmarks: volumes × methods × protocols to a results file, tables and figures; resumable at any run."""
 
+from phyradgs_cl.bench.at_workers import run_bench_at_workers
 from phyradgs_cl.bench.job import BenchJob, BenchProgress, plan_runs
 from phyradgs_cl.bench.rows import KINDS, Row, choose_rows, rows_of
 from phyradgs_cl.bench.run import RESULTS, remake_tables, run_bench
@@ -22,4 +23,5 @@ __all__ = [
     "result_text",
     "rows_of",
     "run_bench",
+    "run_bench_at_workers",
 ]

@@ -18,6 +18,7 @@ from phyradgs_cl.bench.sizes import BenchSize, bench_size
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 
 SYNTHETIC, PHANTOM = "synthetic", "phantom"
@@ -105,7 +106,7 @@ class BenchJob:
         runs = {line.get("run") for line in lines if line.get("acquisition") == FLY}
         always = {row.run for row in (*rows_of(self.kind), *self.chosen_rows)}
         labels = {row.label for row in (*rows_of(self.kind), *self.chosen_rows)}
-        more = [r for r in candidate_rows(self.kind) if r.method and r.run in runs and r.run not in always]
+        more = [r for r in candidate_rows(self.kind) if r.run in runs and r.run not in always]
         rows = [*labels, *(row.label for row in more)]
         return replace(self, rows=rows, names=None, protocols=_FLY_PROTOCOLS)
 
@@ -163,9 +164,10 @@ def plan_runs(job: BenchJob) -> list[PlannedRun]:
     """
     shared = _with_options(job)
     if not shared:
-        asked = ", ".join(row.label for row in job.chosen_rows)
-        others = "; ".join(row.label for row in candidate_rows(job.kind) if row.method is not None)
-        raise InputError("--rows", f"{asked}, which this program does not have yet", f"one of {others}")
+        voxels = job.bench_size.voxels
+        asked = ", ".join(f"{row.label} ({row.lacks(voxels)})" for row in job.chosen_rows)
+        others = "; ".join(row.label for row in candidate_rows(job.kind) if not row.lacks(voxels))
+        raise InputError("--rows", asked, f"one of {others}", INSTALL)
     plan = []
     for seed in dict.fromkeys(job.seeds):
         for volume, source in job.sources().items():
@@ -178,7 +180,7 @@ def plan_runs(job: BenchJob) -> list[PlannedRun]:
 
 def _with_options(job: BenchJob) -> list[tuple[str, Row, Any]]:
     """(acquisition, row, options) of every case: options are checked here, before any work."""
-    rows = [row for row in job.chosen_rows if row.method is not None]
+    rows = [row for row in job.chosen_rows if not row.lacks(job.bench_size.voxels)]
     wanted = [(FLY, row) for row in rows] + [(STILL, row.standing()) for row in rows]
     unique = {(acquisition, row.run): row for acquisition, row in reversed(wanted)}
     size = job.bench_size

@@ -1,21 +1,15 @@
-"""The results file: JSON lines, one a run, only ever appended to.
-
-A run that is killed while it writes leaves a damaged last line, which reading skips and the next append closes off.
-"""
+"""The results file: which runs it holds."""
 
 from __future__ import annotations
 
-import json
-import logging
-import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.io.json_lines import Line, append_line, read_lines, refuse_irregular
 
-Line = dict[str, Any]
+__all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]
+
 # What makes a run the same run; its options are compared besides.
 KEY = (
     "study",
@@ -30,63 +24,11 @@ KEY = (
     "seed",
     "iterations",
 )
-log = logging.getLogger(__name__)
 
 
 def key_of(line: Mapping[str, Any]) -> tuple[Any, ...]:
     """The identity of a run."""
     return tuple(line.get(name) for name in KEY)
-
-
-def read_lines(path: Path) -> list[Line]:
-    """All whole lines of a results file; none where there is no file.
-
-    Raises:
-        InputError: a file that cannot be read, or that has content but no result.
-    """
-    refuse_irregular(path)
-    try:
-        text = path.read_bytes().decode(errors="replace") if path.exists() else ""
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a results file (JSON lines)") from error
-    lines: list[Line] = []
-    damaged = []
-    for number, row in enumerate(text.split("\n"), 1):
-        line = _parsed(row)
-        if line is not None:
-            lines.append(line)
-        elif row.strip():
-            damaged.append(number)
-    if damaged and not lines and len(damaged) > 1:
-        raise InputError(
-            str(path), "no result in any line", "a results file (JSON lines)", "choose another -o"
-        )
-    if damaged:
-        log.warning("%s: line %s is damaged and left out", path, ", ".join(map(str, damaged)))
-    return lines
-
-
-def refuse_irregular(path: Path) -> None:
-    """Raise InputError for what is there and no regular file: a device or a pipe may never end."""
-    if path.exists() and not path.is_file():
-        expected = "a results file (JSON lines)"
-        raise InputError(str(path), "something that is not a regular file", expected, "choose another -o")
-
-
-def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Add one line in a single write that is on the disk when this returns."""
-    text = json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n"
-    try:
-        with open(path, "ab+") as file:
-            if _is_open_ended(file):
-                text = "\n" + text
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise OutputError(
-            str(path), error.strerror or str(error), "a file that can be appended to"
-        ) from error
 
 
 class Present:
@@ -116,19 +58,3 @@ def _agree(a: Any, b: Any) -> bool:
     if isinstance(a, dict) and isinstance(b, dict):
         return all(_agree(a[name], b[name]) for name in a.keys() & b.keys())
     return bool(a == b)
-
-
-def _parsed(row: str) -> Line | None:
-    try:
-        line = json.loads(row)
-    except ValueError:
-        return None
-    return line if isinstance(line, dict) and "run" in line else None
-
-
-def _is_open_ended(file: Any) -> bool:
-    """Whether the file ends in the middle of a line."""
-    if file.seek(0, os.SEEK_END) == 0:
-        return False
-    file.seek(-1, os.SEEK_END)
-    return bool(file.read(1) != b"\n")

@@ -8,15 +8,17 @@ from difflib import get_close_matches
 from typing import Any
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.neural import NeuralOptions, has_accelerator, has_torch
 from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 
+_MOST_NEURAL_VOXELS = 128  # a side, on a CPU: beyond it a run takes hours
 KINDS = ("table1", "table2", "phantom", "quick")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row: ``method`` None is a system that the paper compares with and that is not here yet.
+    """One row: a method with a motion model.
 
     strips and sub_intervals matter to micro-views; ``still`` is the label of the same method with a static
     model, which is what a stop-and-shoot scan is reconstructed with; ``changes`` are further options, told apart
@@ -24,7 +26,7 @@ class Row:
     """
 
     label: str
-    method: str | None
+    method: str
     motion: str = "static"
     strips: int | None = None
     sub_intervals: int | None = None
@@ -36,7 +38,7 @@ class Row:
     def run(self) -> str:
         """What is computed, whatever it is called: rows of two tables with one run share its result."""
         counts = f"{self.strips}x{self.sub_intervals}" if self.motion == "micro-views" else ""
-        return " ".join(part for part in (self.method or "", self.motion, counts, self.variant) if part)
+        return " ".join(part for part in (self.method, self.motion, counts, self.variant) if part)
 
     def standing(self) -> Row:
         """The row of the same method for a gantry that stands still."""
@@ -57,7 +59,7 @@ class Row:
         if self.is_splatting:
             changes |= {"gaussians": gaussians, "iterations": iterations}
         try:
-            return method_options(str(self.method), None, changes)
+            return method_options(self.method, None, changes)
         except InputError as error:
             culprit = f"row {self.label!r}: {error.culprit}"
             raise InputError(culprit, error.found, error.expected, "choose other rows with --rows") from error
@@ -65,8 +67,19 @@ class Row:
     @property
     def is_splatting(self) -> bool:
         """Whether the method places Gaussians, and so shares their number and the iterations."""
-        method = METHODS.get(self.method or "")
-        return method is not None and isinstance(next(iter(method.presets.values())), SplatOptions)
+        return self._has(SplatOptions)
+
+    def lacks(self, voxels: int) -> str:
+        """What this machine lacks to run the row at so many voxels a side, as PyTorch or a GPU for it; else nothing."""
+        if not self._has(NeuralOptions):
+            return ""
+        if not has_torch():
+            return "needs PyTorch"
+        return "needs a GPU" if voxels > _MOST_NEURAL_VOXELS and not has_accelerator() else ""
+
+    def _has(self, options: type) -> bool:
+        method = METHODS.get(self.method)
+        return method is not None and isinstance(next(iter(method.presets.values())), options)
 
 
 def _micro_views(label: str, method: str, strips: int, sub_intervals: int, still: str) -> Row:
@@ -82,7 +95,12 @@ _ITERATIVE = {
     "FISTA-TV": "fista-tv",
 }
 _FDK = (Row("FDK", "fdk"), Row("FDK per-row", "fdk", "per-row", still="FDK"))
-_NOT_YET = (Row("NAF", None), Row("SAX-NeRF", None))
+_NEURAL = (
+    Row("NAF", "naf"),
+    Row("NAF per-row", "naf", "per-row", still="NAF"),
+    Row("SAX-NeRF", "sax-nerf"),
+    Row("SAX-NeRF per-row", "sax-nerf", "per-row", still="SAX-NeRF"),
+)
 _SPLATTING = (
     Row("R2-Gaussian", "r2"),
     _micro_views("R2-Gaussian w/ ST", "r2", 8, 5, "R2-Gaussian"),
@@ -103,7 +121,7 @@ def _table1() -> tuple[Row, ...]:
     exact = tuple(
         Row(f"{label} per-row", method, "per-row", still=label) for label, method in _ITERATIVE.items()
     )
-    return (*_FDK, *static, *exact, *_NOT_YET, *_SPLATTING)
+    return (*_FDK, *static, *exact, *_NEURAL, *_SPLATTING)
 
 
 def _extras() -> tuple[Row, ...]:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import platform
 import time
-from collections.abc import Callable, Sequence
-from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
 from phyradgs_cl.bench.case import Case, SyntheticCase
 from phyradgs_cl.bench.figures import truth_of, write_figures, write_slices
@@ -29,9 +24,11 @@ from phyradgs_cl.bench.tables import write_tables
 from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind
+from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, reconstruct
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.environment import environment
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
 
 RESULTS = "results.jsonl"
@@ -58,17 +55,26 @@ def run_bench(
         InputError: rows, volumes, names or options that do not exist.
         OutputError: the folder cannot be written.
     """
+
+    def here(work: Work) -> None:
+        batch = _Here(job, work, report, make_runtime())
+        for _, group in groupby(work.missing, key=lambda run: run.case):
+            batch.run_case(list(group))
+
+    return complete_bench(job, here)
+
+
+def complete_bench(job: BenchJob, make: Callable[[Work], None]) -> list[Path]:
+    """Checks the job, has ``make`` make what its results file lacks, if anything, and writes tables and figures."""
     plan = plan_runs(job)
-    _name_rows_to_come(job)
+    _name_rows_left_out(job)
     results = _results_file(job.output)
     lines = read_lines(results)
     present = Present(lines)
     missing = [run for run in plan if not present.has(run.facts)]
     _check_volumes(missing)
     if missing:
-        batch = _Batch(job, make_runtime(), results, lines, missing, len(plan), report)
-        for _, group in groupby(missing, key=lambda run: run.case):
-            batch.run_case(list(group))
+        make(Work(results, lines, missing, len(plan)))
     return _write_tables_and_figures(job, lines)
 
 
@@ -84,66 +90,47 @@ def _write_tables_and_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path
         return [*write_tables(job, lines), *write_figures(job, lines)]
 
 
-def _name_rows_to_come(job: BenchJob) -> None:
-    """Rows that are asked for by name and cannot be run yet are said to be left out."""
-    to_come = [row.label for row in job.chosen_rows if row.method is None]
-    if job.rows and to_come:
-        log.warning("--rows: %s: not in this program yet, left out", ", ".join(to_come))
+def _name_rows_left_out(job: BenchJob) -> None:
+    """Rows that this machine cannot run are said to be left out."""
+    lacking = {row.label: row.lacks(job.bench_size.voxels) for row in job.chosen_rows}
+    left_out = [f"{label} {lacks}" for label, lacks in lacking.items() if lacks]
+    if left_out:
+        log.warning("left out: %s (%s)", ", ".join(left_out), INSTALL)
 
 
-class _Batch:
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What is to be made: the runs that a results file lacks, of ``total``; ``lines`` are the file's, and grow."""
+
+    results: Path
+    lines: list[Line]
+    missing: Sequence[PlannedRun]
+    total: int
+
+
+class Batch:
     """The runs that are made now, and what is known about the time that they take."""
 
-    def __init__(
-        self,
-        job: BenchJob,
-        rt: Runtime,
-        results: Path,
-        lines: list[Line],
-        missing: Sequence[PlannedRun],
-        total: int,
-        report: Report,
-    ) -> None:
-        self.job, self.rt, self.results, self.report = job, rt, results, report
-        self.lines, self.present = lines, Present(lines)  # the file's; runs add to both
-        self.left, self.total = list(missing), total
+    def __init__(self, job: BenchJob, work: Work, report: Report) -> None:
+        self.job, self.results, self.report = job, work.results, report
+        self.lines, self.present = work.lines, Present(work.lines)
+        self.left, self.total = list(work.missing), work.total
         self.warned: set[str] = set()
 
-    def run_case(self, runs: Sequence[PlannedRun]) -> None:
-        """All missing runs of one case."""
-        title = f"reference of seed {runs[0].seed}"
-        first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
-        case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
-        if runs[0].volume not in self.warned:
-            self.warned.add(runs[0].volume)
-            case.warn_of_inverse_crime()
-        write_slices(self.job.output, truth_of(runs[0].facts), case.slices(case.truth))
-        self._write_references(runs[0], case)
-        for run in runs:
-            number = self.total - len(self.left) + 1
-            started = BenchProgress(number, self.total, run.title)
-            self.report(started)
-            with keep_finished_work():  # a run that is done is measured and kept, then the benchmark stops
-                line = _one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
-                self._keep(line)
-            self.left.remove(run)
-            self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
-
-    def _keep(self, line: Line) -> None:
+    def keep(self, line: Line) -> None:
+        """One line more, in the file and here."""
         with finish_despite_interrupt():
             append_line(self.results, line)
         self.present.add(line)
         self.lines.append(line)
 
-    def _write_references(self, run: PlannedRun, case: Case) -> None:
-        """Lines about what results are compared with, where the case has any that the file lacks."""
-        iterations = self.job.bench_size.iterations
-        same = {"acquisition": REFERENCE, "method": None, "options": {}, "iterations": iterations}
-        for name, measure in case.references().items():
-            facts = {**run.facts, **same, "run": name, "label": name}
-            if not self.present.has(facts):
-                metrics = {key: _number(value) for key, value in measure().items()}
-                self._keep({**facts, "metrics": metrics, **environment(self.rt)})
+    def finish(self, run: PlannedRun, line: Line, at_once: int = 1) -> None:
+        """Says what a run gave, and how long the others will take where ``at_once`` are made at a time."""
+        number = self.total - len(self.left) + 1
+        self.left.remove(run)
+        left_s = self._left_s()
+        left_s = None if left_s is None else left_s / at_once
+        self.report(BenchProgress(number, self.total, run.title, line=line, left_s=left_s))
 
     def _left_s(self) -> float | None:
         """Seconds that the missing runs will take, by what the same runs took on other objects; None if unknown."""
@@ -156,7 +143,48 @@ class _Batch:
         return total
 
 
-def _one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
+class _Here(Batch):
+    """Runs made in this process, a case after the other."""
+
+    def __init__(self, job: BenchJob, work: Work, report: Report, rt: Runtime) -> None:
+        super().__init__(job, work, report)
+        self.rt = rt
+
+    def run_case(self, runs: Sequence[PlannedRun]) -> None:
+        """All missing runs of one case."""
+        title = f"reference of seed {runs[0].seed}"
+        first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
+        case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
+        if runs[0].volume not in self.warned:
+            self.warned.add(runs[0].volume)
+            case.warn_of_inverse_crime()
+        write_slices(self.job.output, truth_of(runs[0].facts), case.slices(case.truth))
+        for line in reference_lines(self.job, runs[0], case, self.rt, self.present):
+            self.keep(line)
+        for run in runs:
+            number = self.total - len(self.left) + 1
+            started = BenchProgress(number, self.total, run.title)
+            self.report(started)
+            with keep_finished_work():  # a run that is done is measured and kept, then the benchmark stops
+                line = one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
+                self.keep(line)
+            self.finish(run, line)
+
+
+def reference_lines(
+    job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, present: Present
+) -> Iterator[Line]:
+    """Lines about what results are compared with, where the case has any that are not present."""
+    same = {"acquisition": REFERENCE, "method": None, "options": {}, "iterations": job.bench_size.iterations}
+    for name, measure in case.references().items():
+        facts = {**run.facts, **same, "run": name, "label": name}
+        if not present.has(facts):
+            metrics = {key: _number(value) for key, value in measure().items()}
+            yield {**facts, "metrics": metrics, **environment(rt)}
+
+
+def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
+    """Makes a run and keeps its slices; the line has its error where numbers overflowed."""
     scan = case.scan(run.acquisition)
     started = time.perf_counter()
     try:
@@ -192,30 +220,6 @@ def _scene(job: BenchJob, rt: Runtime, run: PlannedRun, geometry: ConeGeometry) 
     if run.source is None:
         return phantom_scene(rt, run.volume, geometry, box, voxels, job.axis, 0)
     return volume_scene(rt, str(run.source), geometry, box, voxels, job.axis)
-
-
-def environment(rt: Runtime) -> dict[str, Any]:
-    """What a number depends on besides its options: program, interpreter, libraries, device."""
-    return {
-        "version": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "pyopencl": _installed("pyopencl"),
-        "pocl": _installed("pocl-binary-distribution"),
-        "platform": rt.device.platform,
-        "device": rt.device.name,
-        "device_version": rt.device.version,
-        "compute_units": rt.device.compute_units,
-        "host_cores": os.cpu_count(),
-        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }
-
-
-def _installed(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _number(value: float) -> float | None:

@@ -21,7 +21,6 @@ METRICS = (
     "centre_shift_mm", "edge_rise_mm", "bias_balls", "bias_holder", "seconds",
 )  # fmt: skip
 _FACTS = ("study", "size", "voxels", "pixels", "iterations", "axis", "protocol", "row", "acquisition")
-NOT_YET = "(not yet)"
 Cell = Callable[[Summary], str]
 
 
@@ -127,7 +126,7 @@ def _record(job: BenchJob, protocol: str, row: Row, acquisition: str, summary: S
 
 def _all_rows(job: BenchJob) -> list[Row]:
     """The rows of a table and the static ones behind their stop-and-shoot runs, each run once."""
-    rows = [row for row in job.chosen_rows if row.method is not None]
+    rows = job.chosen_rows
     return list({row.run: row for row in [*(row.standing() for row in rows), *rows]}.values())
 
 
@@ -189,19 +188,19 @@ def _means(job: BenchJob, protocol: str, lines: Sequence[Line]) -> list[str]:
         if summary is not None:
             text.append(_row_text([name, *(cell(summary) for cell in columns.values()), "", ""]))
     for row in job.chosen_rows:
-        cells = _row_cells(row, protocol, lines, columns, most)
+        cells = _row_cells(job, row, protocol, lines, columns, most)
         text.append(_row_text([*cells, _paper_cell(row.label, _paper_column(job, protocol))]))
     return text
 
 
 def _row_cells(
-    row: Row, protocol: str, lines: Sequence[Line], columns: dict[str, Cell], most: int
+    job: BenchJob, row: Row, protocol: str, lines: Sequence[Line], columns: dict[str, Cell], most: int
 ) -> list[str]:
-    if row.method is None:
-        return [f"{row.label} {NOT_YET}", *("" for _ in columns), ""]
     summary = summarise(_select(lines, protocol, row.run, FLY))
     still = summarise(_select(lines, protocol, row.standing().run, STILL))
     label = row.label
+    if summary is None and (lacks := row.lacks(job.bench_size.voxels)):
+        label += f" ({lacks})"
     if summary is not None and summary.volumes < most:
         label += f" ({summary.volumes} of {most} volumes)"
     cells = [cell(summary) if summary is not None else "–" for cell in columns.values()]
@@ -224,9 +223,7 @@ def _paper_column(job: BenchJob, protocol: str) -> str:
 def _by_volume(job: BenchJob, lines: Sequence[Line], volumes: Sequence[str]) -> list[str]:
     text = [_row_text(["PSNR (dB) / SSIM", *volumes]), "|---" * (len(volumes) + 1) + "|"]
     for row in job.chosen_rows:
-        found = [
-            x for x in lines if x["run"] == row.run and x["acquisition"] == FLY and row.method is not None
-        ]
+        found = [x for x in lines if x["run"] == row.run and x["acquisition"] == FLY]
         if found:
             each = [summarise([x for x in found if x["volume"] == volume]) for volume in volumes]
             text.append(_row_text([row.label, *(_both(s) if s is not None else "" for s in each)]))

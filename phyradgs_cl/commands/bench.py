@@ -20,9 +20,11 @@ from phyradgs_cl.bench import (
     remake_tables,
     result_text,
     run_bench,
+    run_bench_at_workers,
 )
-from phyradgs_cl.commands.console import complain, say
-from phyradgs_cl.commands.options import Axis, Device
+from phyradgs_cl.cluster import LOCAL, Workers
+from phyradgs_cl.commands.console import complain, remark, say
+from phyradgs_cl.commands.options import Axis, Device, Scheduler, WorkerCount
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, file_parser
@@ -100,6 +102,8 @@ def bench_command(
     table_only: Annotated[
         bool, typer.Option("--table-only", help="Make tables and figures from the results file, run nothing.")
     ] = False,
+    scheduler: Scheduler = None,
+    workers: WorkerCount = None,
     device: Device = None,
 ) -> None:
     """Compare methods on volumes: a resumable results file, tables in Markdown and CSV, figures of slices."""
@@ -116,15 +120,27 @@ def bench_command(
         readout.value,
     )
     wish = device_wish(device)
+    pool = None
+    if scheduler is not None or workers is not None:
+        pool = Workers(LOCAL if scheduler is None else scheduler, workers, wish)
     interrupted = f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to go on"
     signals.say_at_the_end(interrupted)
     try:
-        written = remake_tables(job) if table_only else run_bench(job, lambda: Runtime(wish), BenchTicker())
+        if table_only:
+            written = remake_tables(job)
+        elif pool is not None:
+            written = run_bench_at_workers(job, pool, BenchTicker(), _tell_dashboard)
+        else:
+            written = run_bench(job, lambda: Runtime(wish), BenchTicker())
     except KeyboardInterrupt:
         complain(interrupted)
         raise typer.Exit(signals.status()) from None
     for path in written:
         say(str(path))
+
+
+def _tell_dashboard(address: str) -> None:
+    remark(f"Dask's dashboard: {address}")
 
 
 class BenchTicker:

@@ -30,6 +30,12 @@ def complain(text: str, status: int = 2) -> int:
     return status
 
 
+def remark(text: str) -> None:
+    """One line on stderr that is neither a result nor trouble."""
+    with suppress(OSError):
+        typer.echo(text, err=True)
+
+
 def give_up_stdout() -> None:
     """What could not be written would be tried again at the interpreter's end, with a traceback."""
     with suppress(OSError, ValueError):

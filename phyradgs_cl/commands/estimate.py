@@ -5,13 +5,29 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Device, file_argument, file_option
-from phyradgs_cl.commands.reconstruct import MethodName, MotionName
-from phyradgs_cl.estimate import duration, estimate
-from phyradgs_cl.reconstructors import method_options
+from phyradgs_cl.commands.options import (
+    Assignments,
+    Config,
+    Device,
+    GaussianCount,
+    IgnoreLag,
+    Iterations,
+    LineModel,
+    MedianFilter,
+    Memory,
+    Method,
+    MotionModel,
+    Preset,
+    Segments,
+    Strips,
+    SubIntervals,
+    TimeError,
+    file_argument,
+    given_options,
+)
+from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
+from phyradgs_cl.reconstructors import Reconstruction, method_options
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import run_settings
 from phyradgs_cl.workflow import load_scan
@@ -21,46 +37,51 @@ EXAMPLE = "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row
 
 def estimate_command(
     scan: Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")],
-    method: Annotated[
-        MethodName | None,  # type: ignore[valid-type]
-        typer.Option(help="As for reconstruct.", show_default="phyradgs"),
-    ] = None,
-    motion: Annotated[
-        MotionName | None, typer.Option(help="As for reconstruct.", show_default="the method's")
-    ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(help="As for reconstruct.", show_default="preset's")
-    ] = None,
-    gaussians: Annotated[
-        int | None, typer.Option(help="Gaussians at the start.", show_default="preset's")
-    ] = None,
-    preset: Annotated[
-        str | None, typer.Option(help="As for reconstruct.", show_default="the method's first")
-    ] = None,
-    config: Annotated[
-        Path | None, file_option("--config", help="TOML file of options, as for reconstruct.")
-    ] = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any option by name, as for reconstruct."),
-    ] = None,
+    method: Method = None,
+    motion: MotionModel = None,
+    strips: Strips = None,
+    sub_intervals: SubIntervals = None,
+    segments: Segments = None,
+    time_error: TimeError = None,
+    iterations: Iterations = None,
+    gaussians: GaussianCount = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    detector_model: LineModel = None,
+    ignore_lag: IgnoreLag = False,
+    median_filter: MedianFilter = None,
     device: Device = None,
+    memory: Memory = None,
 ) -> None:
     """Say how long a reconstruction would take and how much memory, from a few iterations of it."""
-    given = {
-        "method": method.value if method else None,  # type: ignore[attr-defined]
-        "motion": motion.value if motion else None,
-        "iterations": iterations,
-        "gaussians": gaussians,
-        "preset": preset,
-        "device": device,
-    }
+    given = given_options(
+        method=method,
+        motion=motion,
+        strips=strips,
+        sub_intervals=sub_intervals,
+        segments=segments,
+        time_error=time_error,
+        iterations=iterations,
+        gaussians=gaussians,
+        preset=preset,
+        detector_model=detector_model,
+        ignore_lag=ignore_lag,
+        median_filter=median_filter,
+        device=device,
+        memory=memory,
+    )
     settings = run_settings(config, given, assignments or [])
     options = method_options(settings.method, settings.preset, settings.changes)
     loaded = load_scan(scan)
     loaded.check_timing()
     with settings.naming_origins():
-        rt = Runtime(settings.device)
-    found = estimate(loaded, settings.method, options, rt, settings.before)
+        rt = Runtime(settings.device, memory=settings.memory)
+    before_s = seconds_since_start()  # a run will have started, and read the scan, as this did
+
+    def around(result: Reconstruction) -> float:
+        return before_s + seconds_around(scan, loaded, result)
+
+    found = estimate(loaded, settings.method, options, rt, settings.before, around)
     say(f"{settings.method} on {rt.device.name}, from a trial of {duration(found.trial_seconds)}")
     say(found.text())

@@ -8,13 +8,29 @@ from typing import Annotated, Any
 
 import typer
 
-from phyradgs_cl.runtime import DEVICE_VARIABLE
+from phyradgs_cl.reconstructors import METHODS
+from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import file_parser
+
+MethodName = Enum("MethodName", {name: name for name in METHODS}, type=str)  # type: ignore[misc]
+
+
+class MotionName(str, Enum):
+    static = "static"
+    static_start = "static-start"
+    micro_views = "micro-views"
+    per_row = "per-row"
+    exact = "exact"
 
 
 class Axis(str, Enum):
     rows = "rows"
     columns = "columns"
+
+
+class SplitName(str, Enum):
+    frames = "frames"
+    domain = "domain"
 
 
 class DetectorModel(str, Enum):
@@ -36,7 +52,8 @@ def file_argument(name: str, help: str) -> Any:
 Device = Annotated[
     str | None,
     typer.Option(
-        help=f"OpenCL device: index, cpu, gpu or part of a name (see 'phyradgs devices'); also ${DEVICE_VARIABLE}.",
+        help=f"OpenCL device: index, cpu, gpu or part of a name (see 'phyradgs devices'), or a list with commas for ranks; "
+        f"also ${DEVICE_VARIABLE}.",
         show_default="best by capability",
     ),
 ]
@@ -44,3 +61,142 @@ Output = Annotated[
     Path,
     file_option("--output", "-o", help="File to write; an existing one is replaced whole."),
 ]
+Memory = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SIZE",
+        help="Most device memory to take, such as 2GiB or 500M; what can be cut then works in bricks "
+        f"(docs: large.md). Also ${MEMORY_VARIABLE}.",
+        show_default="what the device has",
+    ),
+]
+
+# where many runs are made
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS|local",
+        help="Dask scheduler to send the runs to: its address or its JSON file; local starts workers here.",
+    ),
+]
+WorkerCount = Annotated[
+    int | None, typer.Option(metavar="N", help="Local workers, each a process.", show_default="one a device")
+]
+
+# what a reconstruction is asked for; commands that speak of one share these words
+Method = Annotated[
+    MethodName | None,  # type: ignore[valid-type]
+    typer.Option(
+        help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
+        "the others are iterative on voxels.",
+        show_default="phyradgs",
+    ),
+]
+MotionModel = Annotated[
+    MotionName | None,
+    typer.Option(
+        help="How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
+        "every line at its own times (per-row), or splats that move while lines integrate (exact); "
+        "not every method has all of them.",
+        show_default="exact for phyradgs, else static",
+    ),
+]
+Strips = Annotated[
+    int | None,
+    typer.Option(help="Strips M of a frame (rolling shutter); means micro-views.", show_default="8"),
+]
+SubIntervals = Annotated[
+    int | None,
+    typer.Option(
+        help="Sub-intervals N of an exposure (motion blur); for phyradgs means micro-views.",
+        show_default="5",
+    ),
+]
+Segments = Annotated[
+    int | None,
+    typer.Option(help="Segments of a frame (motion exact); 0: by the time error.", show_default="0"),
+]
+TimeError = Annotated[
+    float | None,
+    typer.Option(
+        help="Relative error that averaging over time may leave (motion exact).", show_default="0.005"
+    ),
+]
+Iterations = Annotated[
+    int | None,
+    typer.Option(
+        help="Iterations: one frame each for splats, all frames for voxels.",
+        show_default="preset's: 3000 for splats",
+    ),
+]
+GaussianCount = Annotated[
+    int | None, typer.Option(help="Gaussians at the start.", show_default="preset's: from the grid")
+]
+Batch = Annotated[
+    int | None,
+    typer.Option(
+        metavar="B", help="Frames a step, for splats (docs: cluster.md).", show_default="as many as ranks"
+    ),
+]
+Split = Annotated[
+    SplitName | None,
+    typer.Option(
+        help="What ranks of mpiexec share out, for splats: the frames, or the domain where the Gaussians are too many.",
+        show_default="frames",
+    ),
+]
+Parts = Annotated[
+    int | None,
+    typer.Option(
+        metavar="P",
+        help="Parts of a frame's lines, or of the Gaussians, to share out; the same parts give the same bits.",
+        show_default="as many as ranks",
+    ),
+]
+Seed = Annotated[
+    int | None, typer.Option(help="Seed of cloud, frame order and sub-volumes.", show_default="0")
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        help="Constants: default, paper or released (phyradgs); published (r2); the window of fdk.",
+        show_default="the method's first",
+    ),
+]
+Config = Annotated[
+    Path | None,
+    file_option(
+        "--config",
+        help="TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
+        "the command line wins.",
+    ),
+]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Any option of the method by name, as in the file: --set tv_weight=0.002 --set order=random. "
+        "Docs: methods.md.",
+    ),
+]
+LineModel = Annotated[
+    DetectorModel | None,
+    typer.Option(
+        help="What is averaged over an exposure: line integrals (log) or intensity.",
+        show_default="the scan's",
+    ),
+]
+IgnoreLag = Annotated[
+    bool, typer.Option("--ignore-lag", help="Leave the lag that the scan file states in the frames.")
+]
+MedianFilter = Annotated[
+    int | None,
+    typer.Option(help="Median filter of the frames: 3 or 5 pixels a side, 0 none.", show_default="0"),
+]
+
+
+def given_options(**values: Any) -> dict[str, Any]:
+    """Options by name as settings take them: the words of choices, and None for flags that are not raised."""
+    plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
+    return {name: None if value is False else value for name, value in plain.items()}

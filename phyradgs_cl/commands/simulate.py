@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Output, file_option
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output, file_option
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, offset_pair, pulse_pair
@@ -144,6 +144,7 @@ def simulate_command(
     ] = 0,
     seed: Annotated[int, typer.Option(help="Seed of phantom, noise and jitter.")] = 0,
     device: Device = None,
+    memory: Memory = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
     readout_axis = readout.value if readout else None
@@ -183,6 +184,6 @@ def simulate_command(
         seed=seed,
     )
     with Ticker("frame") as ticker:
-        scan = run_simulation(job, described, options, Runtime(wish), ticker.show)
+        scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)
     frames, rows, columns = scan.projections.shape
     say(f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}")

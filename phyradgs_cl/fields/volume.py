@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
+
+MOST_VOXELS = 2**38
+"""A terabyte of float32: what asks for more is damage."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,8 @@ class Grid:
     def __post_init__(self) -> None:
         if len(self.shape) != 3 or any(int(n) < 1 for n in self.shape):
             raise InputError("grid shape", str(self.shape), "three counts of at least 1 (z, y, x)")
+        if math.prod(int(n) for n in self.shape) > MOST_VOXELS:
+            raise InputError("grid shape", str(self.shape), f"at most {MOST_VOXELS:.3g} voxels")
         if len(self.voxel_size_mm) != 3 or not all(np.isfinite(d) and d > 0 for d in self.voxel_size_mm):
             raise InputError(
                 "grid voxel_size", str(self.voxel_size_mm), "three positive lengths in mm (z, y, x)"

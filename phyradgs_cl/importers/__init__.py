@@ -21,6 +21,7 @@ from phyradgs_cl.importers.r2_gaussian import import_r2
 from phyradgs_cl.importers.recognise import recognise
 from phyradgs_cl.importers.rtk import import_rtk
 from phyradgs_cl.importers.tiff_folder import import_tiff
+from phyradgs_cl.io.held_warnings import held_warnings
 
 __all__ = ["FORMATS", "ImportOptions", "import_scan", "recognise"]
 
@@ -54,6 +55,12 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
         raise InputError(str(path), found, "a scan to import", "check the path")
     form = form or recognise(path)
     checks.one_of("format", form, FORMATS)
-    scan = FORMATS[form](path, options or ImportOptions())
-    scan.check_timing()
+    with held_warnings():
+        try:
+            scan = FORMATS[form](path, options or ImportOptions())
+        except InputError as error:
+            if not error.culprit.startswith("grid "):
+                raise
+            raise InputError(f"{path} {error.culprit}", error.found, error.expected, error.remedy) from error
+        scan.check_timing()
     return scan

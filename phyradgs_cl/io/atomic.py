@@ -14,7 +14,8 @@ from pathlib import Path
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
 
-_NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+"""What an operating system says where there is no room: the disk, the largest file, the user's share."""
 _SUFFIX = ".part"
 
 
@@ -116,7 +117,7 @@ def _flush_folder(folder: Path) -> None:
 
 def _output_error(target: Path, error: BaseException) -> OutputError:
     code = getattr(error, "errno", None)
-    full = code in _NO_SPACE or any(f"errno = {number}," in str(error) for number in _NO_SPACE)
+    full = code in NO_SPACE or any(f"errno = {number}," in str(error) for number in NO_SPACE)
     if full:
         found = f"no room left in folder {target.parent}"
         return OutputError(

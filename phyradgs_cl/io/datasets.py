@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import posixpath
 from collections.abc import Collection, Sequence
 
@@ -10,7 +11,7 @@ import h5py
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.units import Quantity
 
@@ -28,7 +29,7 @@ def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: 
         return np.asarray(dataset[()])
     except MemoryError as error:
         found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
-        raise InputError(culprit, found, "data that this machine's memory can hold") from error
+        raise OutOfMemoryError(culprit, found, "data that this machine's memory can hold") from error
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(culprit, f"data that HDF5 cannot read ({error})", "readable data") from error
 
@@ -45,7 +46,7 @@ def read_array(
     checks.shape(source.name(address), dataset, shape)
     values = read_values(source, address, dataset).astype(np.float64)
     checks.finite(source.name(address), values)
-    return values * unit_factor(source, address, quantity) if quantity else values
+    return in_unit(source, address, values, quantity) if quantity else values
 
 
 def read_length(source: Hdf5Source, address: str, quantity: Quantity, known: Collection[str] = ()) -> float:
@@ -53,6 +54,8 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity, known: Col
     value = read_number(source, address, quantity, known)
     if value <= 0:
         raise InputError(source.name(address), str(value), f"a {quantity.name} above 0", "correct the value")
+    if value < 1 / quantity.largest:
+        raise InputError(source.name(address), str(value), f"a {quantity.name} of a real scanner")
     return value
 
 
@@ -65,7 +68,7 @@ def read_number(
         raise InputError(source.name(address), f"shape {dataset.shape}", "one number")
     values = read_values(source, address, dataset).astype(np.float64)
     checks.finite(source.name(address), values)
-    return float(values.reshape(())) * (unit_factor(source, address, quantity) if quantity else 1.0)
+    return float((in_unit(source, address, values, quantity) if quantity else values).reshape(()))
 
 
 def read_integers(
@@ -82,6 +85,8 @@ def read_word(
 ) -> str:
     """A required string, one of ``allowed`` where they are given."""
     dataset = source.dataset(address, known)
+    if dataset.size != 1:  # many entries may all be one long text, which the file's size does not bound
+        raise InputError(source.name(address), f"shape {dataset.shape}", "a string")
     try:
         word = as_text(dataset[()])
     except (OSError, RuntimeError, TypeError, ValueError) as error:
@@ -91,6 +96,18 @@ def read_word(
     if allowed is not None:
         checks.one_of(source.name(address), word, allowed)
     return word
+
+
+def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
+    """Finite values (any shape) in the package's unit; InputError for some beyond all reason."""
+    values = values * unit_factor(source, address, quantity)
+    size = np.abs(values).max(initial=0.0)
+    if size > quantity.largest:
+        expected = f"at most {quantity.largest:g} of the package's unit for a {quantity.name}"
+        raise InputError(
+            source.name(address), f"a value of size {size:.6g}", expected, "correct the value or its unit"
+        )
+    return values
 
 
 def unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
@@ -116,11 +133,13 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
     try:
         if name not in found.attrs:
             return None
-        text = as_text(found.attrs[name])
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        shape = found.attrs.get_id(name).shape
+        value = found.attrs[name] if math.prod(shape) == 1 else f"shape {shape}"
+        text = as_text(value) if math.prod(shape) == 1 else None
+    except (OSError, RuntimeError, TypeError, ValueError, LookupError) as error:
         raise InputError(culprit, f"an attribute that HDF5 cannot read ({error})", "a string") from error
     if text is None:
-        raise InputError(culprit, repr(found.attrs[name]), "a string")
+        raise InputError(culprit, checks.shown(value), "a string")
     return text
 
 

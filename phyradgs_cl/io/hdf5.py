@@ -18,8 +18,9 @@ import h5py
 from phyradgs_cl.errors import InputError
 
 _MOST_SOFT_LINKS = 16
-_MOST_EXPANSION = 200
-_FREE_BYTES = 1 << 30
+# Masks of zeros shrink a thousandfold, frames hardly at all: a file of some size may unfold to so many times that.
+_MOST_EXPANSION = 100
+_FREE_BYTES = 64 << 20
 
 
 @contextmanager
@@ -125,7 +126,7 @@ class Hdf5Source:
     def near_miss(self, parent: str, name: str, known: Collection[str], cutoff: float = 0.6) -> str:
         """What to do about a name that is nearly ``name`` and means nothing else; "" if there is none."""
         group = self.find(parent)
-        strangers = [n for n in group if n not in known] if isinstance(group, h5py.Group) else []
+        strangers = [n for n in group if n != name and n not in known] if isinstance(group, h5py.Group) else []
         by_lower = {n.lower(): n for n in strangers}
         close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
         return f"rename {by_lower[close[0]]!r} to {name!r}" if close else ""

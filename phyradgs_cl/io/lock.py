@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,6 +17,13 @@ except ImportError:  # Windows has no such locks: two runs on one output are not
     fcntl = None  # type: ignore[assignment]
 
 
+_LOOK_EVERY_S = 0.2
+
+
+class BusyError(OutputError):
+    """Another run is at work on the output."""
+
+
 def lock_path(output: str | Path) -> Path:
     """The lock file of ``output``; it is there while a run is, and means nothing once that has ended."""
     target = Path(os.path.realpath(output))
@@ -23,13 +31,16 @@ def lock_path(output: str | Path) -> Path:
 
 
 @contextmanager
-def only_run(output: str | Path) -> Iterator[None]:
-    """Holds the lock of ``output``; raises OutputError if another run does. A dead run's file is taken over."""
+def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Holds the lock of ``output``; raises BusyError if another run still does after ``wait_s``.
+
+    A dead run's file is taken over.
+    """
     if fcntl is None:
         yield
         return
     path = lock_path(output)
-    descriptor = _locked(path, output)
+    descriptor = _locked(path, output, time.monotonic() + wait_s)
     signals.unfinished.add(str(path))
     try:
         os.ftruncate(descriptor, 0)
@@ -42,8 +53,8 @@ def only_run(output: str | Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _locked(path: Path, output: str | Path) -> int:
-    """A descriptor of the file that is at ``path``, locked."""
+def _locked(path: Path, output: str | Path, deadline_s: float) -> int:
+    """A descriptor of the file that is at ``path``, locked by the deadline."""
     while True:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
@@ -55,8 +66,11 @@ def _locked(path: Path, output: str | Path) -> int:
         except BlockingIOError:
             holder = _holder(descriptor)
             os.close(descriptor)
+            if time.monotonic() < deadline_s:
+                time.sleep(_LOOK_EVERY_S)
+                continue
             remedy = "wait for it, or choose another output"
-            raise OutputError(
+            raise BusyError(
                 str(output), f"another run{holder} is at work on it", "one run an output", remedy
             ) from None
         except OSError:  # a file system without locks

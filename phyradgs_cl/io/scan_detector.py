@@ -11,6 +11,7 @@ from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import scan_schema as schema
 from phyradgs_cl.io.datasets import (
+    in_unit,
     read_array,
     read_attribute,
     read_integers,
@@ -18,7 +19,6 @@ from phyradgs_cl.io.datasets import (
     read_number,
     read_values,
     read_word,
-    unit_factor,
 )
 from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.units import LENGTH, TIME
@@ -121,8 +121,9 @@ def _read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: b
     if dataset.shape not in ((), (1,), used.shape):
         raise InputError(culprit, f"shape {dataset.shape}", f"one number or shape {used.shape}")
     values = read_values(source, address, dataset).astype(np.float64).reshape(-1)
-    values = (values if values.shape != used.shape else values[used]) * unit_factor(source, address, TIME)
+    values = values if values.shape != used.shape else values[used]
     checks.finite(culprit, values)
+    values = in_unit(source, address, values, TIME)
     if values.min() < 0:
         raise InputError(culprit, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
     if np.ptp(values) > 1e-6 * values.max():

@@ -12,12 +12,13 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import scan_schema as schema
-from phyradgs_cl.io.datasets import read_values, unit_factor
+from phyradgs_cl.io.datasets import in_unit, read_values
 from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan_header import ScanHeader, read_header
 from phyradgs_cl.io.units import ATTENUATION
 
+LARGEST_LINE_INTEGRAL = 1e6
 # (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, bad pixels.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
@@ -152,7 +153,7 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
     address = header.reference_address
     values = read_values(source, address, source.dataset(address))
     checks.finite(source.name(address), values)
-    return (values * unit_factor(source, address, ATTENUATION)).astype(np.float32)
+    return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 
 def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None) -> np.ndarray:
@@ -186,6 +187,10 @@ def _convert(
     if projections.shape != header.scan.projections.shape:
         raise InputError(culprit, f"line integrals {projections.shape}", str(header.scan.projections.shape))
     checks.finite(culprit, projections)
+    largest = float(np.abs(projections).max())
+    if largest > LARGEST_LINE_INTEGRAL:
+        expected = f"at most {LARGEST_LINE_INTEGRAL:g}: nothing shines through more than some tens"
+        raise InputError(culprit, f"a line integral of size {largest:.6g}", expected, "check the quantity")
     return np.ascontiguousarray(projections, dtype=np.float32), bad
 
 

@@ -94,6 +94,8 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     scan.check_timing()
     mask_shape = check_mask(source, entry, data.shape)
     has_reference = _check_reference(source, entry, grid)
+    if not has_grid:
+        _warn_of_grid(source, entry, grid)
     _warn_of_ignored(source, entry)
     return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, has_grid)
 
@@ -115,10 +117,19 @@ def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry)
     address = f"{entry}/{schema.GRID}"
     if source.optional_group(address, KNOWN) is not None:
         return read_grid(source, address), True
-    grid = default_grid(geometry)
-    size = " × ".join(str(n) for n in grid.shape)
-    _log.warning("%s: no grid; %s voxels of %.4g mm taken", source.name(address), size, grid.voxel_size_mm[0])
+    try:
+        grid = default_grid(geometry)
+    except InputError as error:
+        remedy = "correct the geometry, or store the grid"
+        raise InputError(
+            source.name(address), "no grid, and none that follows", error.expected, remedy
+        ) from error
     return grid, False
+
+
+def _warn_of_grid(source: Hdf5Source, entry: str, grid: Grid) -> None:
+    where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
+    _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
 
 
 def _read_model(source: Hdf5Source, entry: str) -> str:

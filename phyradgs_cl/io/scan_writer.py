@@ -16,6 +16,7 @@ from phyradgs_cl.io import scan_schema as schema
 from phyradgs_cl.io.atomic import written_beside
 from phyradgs_cl.io.datasets import new_group, write_number
 from phyradgs_cl.io.grid_io import write_grid
+from phyradgs_cl.io.new_hdf5 import new_hdf5
 from phyradgs_cl.io.scan_motion import write_motion
 
 _log = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ def write_scan(
     """
     frames, key = _checked_frames(scan, data, image_key, quantity)
     _check_expressible(scan)
-    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
+    with written_beside(path) as temporary, new_hdf5(temporary) as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         entry = new_group(file, "entry", "NXentry")
         entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"

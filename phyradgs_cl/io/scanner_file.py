@@ -15,7 +15,9 @@ from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.grid_io import default_grid
+from phyradgs_cl.io.units import LENGTH
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -33,6 +35,7 @@ _TABLES: dict[str, tuple[str, ...]] = {
     "readout": ("axis", "direction", "ratio"),
 }
 _WORDS = ("title",)
+MOST_LINES = 65_536
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
             content = tomllib.load(file)
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a scanner file (TOML)") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
         raise InputError(str(path), f"text that is not TOML ({error})", "a scanner file (TOML)") from error
     return scanner_from(path, content)
 
@@ -97,7 +100,7 @@ def _describes_scanner(path: Path) -> bool:
     try:
         with open(path, "rb") as file:
             return "source" in tomllib.load(file)
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
 
 
@@ -145,7 +148,11 @@ def _grid(volume: _Table) -> Grid:
     offset_mm = volume.triple("offset_mm", (0.0, 0.0, 0.0))
     if any(n < 1 or n != int(n) for n in shape):
         raise InputError(volume.culprit("shape"), str(list(shape)), "three counts of at least 1 (z, y, x)")
-    if min(size_mm) <= 0:
+    if math.prod(shape) > MOST_VOXELS:
+        raise InputError(
+            volume.culprit("shape"), checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels"
+        )
+    if min(size_mm) < 1 / LENGTH.largest:
         raise InputError(volume.culprit("size_mm"), str(list(size_mm)), "three lengths above 0 (z, y, x)")
     voxel_mm = tuple(side / n for side, n in zip(size_mm, shape, strict=True))
     return Grid(tuple(int(n) for n in shape), voxel_mm, offset_mm)
@@ -165,7 +172,7 @@ class _Table:
     def __init__(self, path: Path, name: str, values: object) -> None:
         self._where = f"{path} [{name}]"
         if not isinstance(values, dict):
-            raise InputError(self._where, repr(values), "a table of keys")
+            raise InputError(self._where, checks.shown(values), "a table of keys")
         _refuse_unknown(self._where, values, _TABLES[name], "a key")
         self._values: dict[str, object] = values
 
@@ -180,21 +187,22 @@ class _Table:
         if value is None:
             raise InputError(self.culprit(key), "nothing", "a number", "add the key")
         number = _finite(value)
-        if number is None or number < minimum:
-            least = f" of at least {minimum:g}" if math.isfinite(minimum) else ""
-            raise InputError(self.culprit(key), repr(value), f"a finite number{least}")
+        if number is None or number < minimum or abs(number) > LENGTH.largest:
+            lowest = minimum if math.isfinite(minimum) else -LENGTH.largest
+            expected = f"a finite number from {lowest:g} to {LENGTH.largest:g}"
+            raise InputError(self.culprit(key), checks.shown(value), expected)
         return number
 
     def positive(self, key: str) -> float:
         value = self.number(key)
-        if value <= 0:
+        if value < 1 / LENGTH.largest:
             raise InputError(self.culprit(key), f"{value:g}", "a length above 0")
         return value
 
     def count(self, key: str) -> int:
         value = self.number(key, minimum=1)
-        if value != int(value):
-            raise InputError(self.culprit(key), f"{value:g}", "a whole number")
+        if value != int(value) or value > MOST_LINES:
+            raise InputError(self.culprit(key), f"{value:g}", f"a whole number of at most {MOST_LINES}")
         return int(value)
 
     def triple(
@@ -206,7 +214,11 @@ class _Table:
         numbers = [_finite(value) for value in values] if isinstance(values, (list, tuple)) else []
         triple = tuple(number for number in numbers if number is not None)
         if len(numbers) != 3 or len(triple) != 3:
-            raise InputError(self.culprit(key), repr(values), "three finite numbers [z, y, x]")
+            raise InputError(self.culprit(key), checks.shown(values), "three finite numbers [z, y, x]")
+        if max(abs(number) for number in triple) > LENGTH.largest:
+            raise InputError(
+                self.culprit(key), checks.shown(values), f"three numbers of at most {LENGTH.largest:g}"
+            )
         return triple
 
 

@@ -11,11 +11,13 @@ from types import MappingProxyType
 class Quantity:
     """A physical quantity: factors from the accepted unit names to the one that the package computes in.
 
-    ``assumed`` is the unit of a dataset without a units attribute.
+    ``assumed`` is the unit of a dataset without a units attribute. ``largest``, in the package's unit, is far beyond any
+    scanner: numbers past it are damage, and would overflow later.
     """
 
     name: str
     assumed: str
+    largest: float
     factors: MappingProxyType[str, float]
 
     def factor(self, unit: str) -> float | None:
@@ -28,14 +30,15 @@ class Quantity:
         return ", ".join(name for name in self.factors if len(name) <= 4 and name.isascii())
 
 
-def _quantity(name: str, assumed: str, factors: dict[tuple[str, ...], float]) -> Quantity:
+def _quantity(name: str, assumed: str, largest: float, factors: dict[tuple[str, ...], float]) -> Quantity:
     flat = {unit: factor for names, factor in factors.items() for unit in names}
-    return Quantity(name, assumed, MappingProxyType(flat))
+    return Quantity(name, assumed, largest, MappingProxyType(flat))
 
 
 LENGTH = _quantity(
     "length",
     "mm",
+    1e9,
     {
         ("mm", "millimeter", "millimetre", "millimeters", "millimetres"): 1.0,
         ("cm", "centimeter", "centimetre", "centimeters", "centimetres"): 10.0,
@@ -46,6 +49,7 @@ LENGTH = _quantity(
 TIME = _quantity(
     "time",
     "s",
+    1e12,
     {
         ("s", "sec", "second", "seconds"): 1.0,
         ("ms", "millisecond", "milliseconds"): 1e-3,
@@ -55,10 +59,12 @@ TIME = _quantity(
 ANGLE = _quantity(
     "angle",
     "deg",
+    1e8,
     {("deg", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "radian", "radians"): 1.0},
 )
 ATTENUATION = _quantity(
     "attenuation",
     "1/mm",
+    1e9,
     {("1/mm", "mm^-1", "mm-1"): 1.0, ("1/cm", "cm^-1", "cm-1"): 0.1, ("1/m", "m^-1", "m-1"): 1e-3},
 )

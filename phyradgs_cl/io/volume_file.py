@@ -14,15 +14,17 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io.atomic import written_beside
-from phyradgs_cl.io.datasets import new_group, read_array, read_values, read_word, unit_factor, write_number
+from phyradgs_cl.io.datasets import in_unit, new_group, read_array, read_values, read_word, write_number
 from phyradgs_cl.io.grid_io import read_grid, write_grid
 from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
+from phyradgs_cl.io.new_hdf5 import new_hdf5
 from phyradgs_cl.io.units import ATTENUATION, LENGTH
 
 _DATA = "/entry/reconstruction"
 _VOLUME = f"{_DATA}/volume"
 _AXES = ("z", "y", "x")
+_MOST_ARRAYS = 16
 _AXIS_TOLERANCE = 1e-3  # of a voxel: what axes stored in float32 need
 
 
@@ -59,7 +61,7 @@ def write_volume(
     """
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
-    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
+    with written_beside(path) as temporary, new_hdf5(temporary) as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         entry = new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
@@ -80,7 +82,7 @@ def read_volume(path: str | Path) -> StoredVolume:
         dataset, grid = _checked(source)
         values = read_values(source, _VOLUME, dataset)
         checks.finite(source.name(_VOLUME), values)
-        volume = (values * unit_factor(source, _VOLUME, ATTENUATION)).astype(np.float32)
+        volume = in_unit(source, _VOLUME, values, ATTENUATION).astype(np.float32)
         provenance = _read_facts(source, "provenance") or {}
         return StoredVolume(volume, grid, provenance, _read_gaussians(source), _read_facts(source, "metrics"))
 
@@ -189,8 +191,11 @@ def _read_gaussians(source: Hdf5Source) -> dict[str, np.ndarray] | None:
     group = source.optional_group("/entry/gaussians")
     if group is None:
         return None
+    if len(group) > _MOST_ARRAYS:  # each may be all of the file, once more
+        raise InputError(source.name("/entry/gaussians"), f"{len(group)} arrays", f"at most {_MOST_ARRAYS}")
     addresses = {name: f"/entry/gaussians/{name}" for name in group}
     arrays = {name: read_values(source, a, source.dataset(a)) for name, a in addresses.items()}
     for name, values in arrays.items():
-        checks.finite(source.name(addresses[name]), values)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite for everybody who reads on
+            checks.finite(source.name(addresses[name]), values.astype(np.float32))
     return arrays

@@ -7,7 +7,7 @@ from phyradgs_cl.operators.backproject import backproject, backproject_lines
 from phyradgs_cl.operators.intensity import IntensityOperator
 from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
-from phyradgs_cl.operators.rays import RayProjector
+from phyradgs_cl.operators.ray_projector import RayProjector
 from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA, SplatProjector
 from phyradgs_cl.operators.voxelise import Voxeliser, voxelise
 

@@ -1,22 +1,29 @@
-"""Voxel-driven backprojection with FDK's distance weight, from one pose a frame or one pose a line."""
+"""Voxel-driven backprojection with FDK's distance weight, from one pose a frame or one pose a line.
+
+Where memory is short the volume is made brick by brick, and views go to the device in smaller parts; neither changes a bit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.bricks import Brick, Shape, cut
 from phyradgs_cl.operators.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 from phyradgs_cl.operators.rays import voxel_matrices
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Room, Runtime, with_smaller_bricks
 
 _VIEWS_A_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28
+_VIEWS_SHARE = 0.25  # of the room
 _BLOCK_VOXELS = 128  # along z for a work-item of the upright kernel
 _COLUMN_ROWS = 512  # detector rows that such a block may meet
 _UPRIGHT = 1e-7  # of the depth: how far u or depth may move over the whole height
+_Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
 def backproject(
@@ -28,16 +35,10 @@ def backproject(
     """
     matrices = voxel_matrices(pose, grid)
     block = 0 if rt.pixel_items else _upright_block(matrices, grid)
+    views = _Views(frames.transpose(0, 2, 1) if block else frames, matrices, weight)
     if block:
-        return _upright(rt, frames, matrices, weight, grid, block)
-    nz, ny, nx = grid.shape
-    kernel = rt.kernel("backproject", "backproject", IMAGE_GUARD=GUARD)
-    volume = padded_zeros(rt, nz * ny, nx)
-    for part in _launches(frames):
-        data = _images(rt, frames[part], matrices[part], weight[part])
-        items = (-(-nx // rt.lanes), ny, nz)
-        rt.launch(kernel, items, *data, *_volume_shape(grid), volume, group=rt.group())
-    return unpad_rows(rt.download(volume), grid.shape)
+        return _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, block, *where))
+    return _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
 
 
 def backproject_lines(
@@ -51,41 +52,85 @@ def backproject_lines(
     """
     if axis == "columns":
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
-    nz, ny, nx = grid.shape
     matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(frames), -1)
-    kernel = rt.kernel("backproject", "backproject_lines", IMAGE_GUARD=GUARD)
-    volume = padded_zeros(rt, nz * ny, nx)
     across = np.int32(axis == "columns")
-    for part in _launches(frames):
-        data = _images(rt, frames[part], matrices[part], weight[part])
-        rt.launch(
-            kernel, (nx, ny, nz), *data, *_volume_shape(grid), across, volume, group=rt.group(on_cpu=16)
-        )
-    return unpad_rows(rt.download(volume), grid.shape)
+    views = _Views(frames, matrices, weight)
+    return _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where))
 
 
-def _upright(
-    rt: Runtime, frames: np.ndarray, matrices: np.ndarray, weight: np.ndarray, grid: Grid, block: int
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Frames (F, lines, width), the matrices (F, …) and weights (F,) that go with them."""
+
+    frames: np.ndarray
+    matrices: np.ndarray
+    weight: np.ndarray
+
+    def bytes(self, count: int) -> int:
+        """What so many of them take on the device."""
+        _, rows, width = self.frames.shape
+        return 4 * count * (2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
+
+    def parts(self, room: Room) -> Iterator[slice]:
+        """Views that go to the device in one piece."""
+        most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
+        count = max(1, min(_VIEWS_A_LAUNCH, most_bytes // self.bytes(1)))
+        for first in range(0, len(self.frames), count):
+            yield slice(first, min(first + count, len(self.frames)))
+
+
+_Launch = Callable[["_Arguments", Brick, DeviceArray], None]
+
+
+def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> np.ndarray:
+    """The volume (z, y, x), in bricks of a multiple of ``step`` voxels along z where it does not fit as a whole."""
+
+    def attempt(share: float) -> np.ndarray:
+        room = rt.room()
+        parts = list(views.parts(room.scaled(share)))
+        views_bytes = views.bytes(parts[0].stop)
+        bricks = cut(grid.shape, (step, 1), lambda shape: (_volume_bytes(shape), views_bytes), room, share)
+        volume = np.empty(grid.shape, np.float32)
+        for brick in bricks:
+            volume[brick.box] = _backprojected(rt, views, parts, brick, launch)
+        return volume
+
+    return with_smaller_bricks("FDK's backprojection", attempt)
+
+
+def _backprojected(
+    rt: Runtime, views: _Views, parts: list[slice], brick: Brick, launch: _Launch
 ) -> np.ndarray:
-    nz, ny, nx = grid.shape
+    nz, ny, nx = brick.shape
+    volume = padded_zeros(rt, nz * ny, nx)
+    for part in parts:
+        images = _images(rt, views.frames[part], views.matrices[part], views.weight[part])
+        launch(images, brick, volume)
+        del images  # before the next part's
+    return unpad_rows(rt.download(volume), brick.shape)
+
+
+def _general(rt: Runtime, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+    nz, ny, nx = brick.shape
+    kernel = rt.kernel("backproject", "backproject", IMAGE_GUARD=GUARD)
+    rt.launch(kernel, (-(-nx // rt.lanes), ny, nz), *images, *_volume_shape(brick), volume, group=rt.group())
+
+
+def _lines(rt: Runtime, across: np.int32, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+    nz, ny, nx = brick.shape
+    kernel = rt.kernel("backproject", "backproject_lines", IMAGE_GUARD=GUARD)
+    group = rt.group(on_cpu=16)
+    rt.launch(kernel, (nx, ny, nz), *images, *_volume_shape(brick), across, volume, group=group)
+
+
+def _upright(rt: Runtime, block: int, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+    """``images`` are transposed: the width that they tell is the number of rows."""
+    nz, ny, nx = brick.shape
     defines = {"IMAGE_GUARD": GUARD, "BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
     kernel = rt.kernel("backproject", "backproject_upright", **defines)
-    volume = padded_zeros(rt, nz * ny, nx)
-    for part in _launches(frames):
-        image, table, weights, views, columns, rows, *rest = _images(
-            rt, frames[part].transpose(0, 2, 1), matrices[part], weight[part]
-        )
-        data = (
-            image,
-            table,
-            weights,
-            views,
-            rows,
-            columns,
-            *rest,
-        )  # the transposed image's width is the rows
-        rt.launch(kernel, (nx, ny, -(-nz // block)), *data, *_volume_shape(grid), np.int32(block), volume)
-    return unpad_rows(rt.download(volume), grid.shape)
+    image, table, weights, views, columns, rows, *rest = images
+    data = (image, table, weights, views, rows, columns, *rest)
+    rt.launch(kernel, (nx, ny, -(-nz // block)), *data, *_volume_shape(brick), np.int32(block), volume)
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> int:
@@ -104,17 +149,7 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> int:
     return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_a_voxel, 1e-3)))
 
 
-def _launches(frames: np.ndarray) -> Iterator[slice]:
-    """Parts of the views (F, rows, columns) that go to the device in one piece."""
-    image_bytes = 4 * frames.shape[1] * (frames.shape[2] + 2 * GUARD)
-    count = max(1, min(_VIEWS_A_LAUNCH, _BYTES_A_LAUNCH // image_bytes))
-    for first in range(0, len(frames), count):
-        yield slice(first, first + count)
-
-
-def _images(
-    rt: Runtime, frames: np.ndarray, matrices: np.ndarray, weight: np.ndarray
-) -> tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]:
+def _images(rt: Runtime, frames: np.ndarray, matrices: np.ndarray, weight: np.ndarray) -> _Arguments:
     """The kernels' first arguments: padded images on the device, matrices, weights, and their sizes."""
     views, rows, width = frames.shape
     pitch = pitch_of(width)
@@ -125,6 +160,12 @@ def _images(
     return (rt.upload(stacked), rt.upload(matrices, np.float32), rt.upload(weight, np.float32), *sizes)
 
 
-def _volume_shape(grid: Grid) -> tuple[np.ndarray, np.int32]:
-    nz, ny, nx = grid.shape
-    return np.array([nx, ny, nz, 0], np.int32), np.int32(pitch_of(nx))
+def _volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
+    nz, ny, nx = brick.shape
+    shape, origin = np.array([nx, ny, nz, 0], np.int32), np.array([*brick.start[::-1], 0], np.int32)
+    return shape, origin, np.int32(pitch_of(nx))
+
+
+def _volume_bytes(shape: Shape) -> int:
+    nz, ny, nx = shape
+    return 4 * (2 * GUARD + nz * ny * pitch_of(nx))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
 _CHUNK = 512
 _SLACK = 1.25
+_MOST_ENTRIES = 2**31 - 1  # indices of entries are ints
 
 
 class TileLists:
@@ -27,10 +28,14 @@ class TileLists:
         self._counts: DeviceArray = rt.empty(1, np.int32)
 
     def build(self, extents: DeviceArray, count: int, stride: int) -> None:
-        """Fills ``starts`` (tiles + 1,) and ``entries`` from extents (6, stride)."""
+        """Fills ``starts`` (tiles + 1,) and ``entries`` from extents (6, stride).
+
+        Raises MemoryShortage for 2^31 entries or more, which smaller bricks of a volume may not have.
+        """
         rt = self.rt
-        chunks = max(-(-count // _CHUNK), 1)
+        chunks = chunks_of(count)
         if self._counts.size < self.total * chunks:
+            self._counts = rt.empty(1, np.int32)  # the old goes before the new comes
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = (
             np.int32(stride),
@@ -53,8 +58,13 @@ class TileLists:
         )
         rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(self.total), self.starts)
         needed = self._total_entries()
+        if needed >= _MOST_ENTRIES:
+            found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
+            remedy = "use fewer or smaller Gaussians"
+            raise MemoryShortage("lists of splats a tile", found, expected, remedy)
         if needed > self.entries.size:
-            self.entries = rt.empty(int(needed * _SLACK) + 16, np.int32)
+            self.entries = rt.empty(1, np.int32)
+            self.entries = rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
         rt.launch(
             rt.kernel("binning", "bin_fill"),
             chunks,
@@ -67,5 +77,15 @@ class TileLists:
             group=group,
         )
 
+    @staticmethod
+    def bytes(tiles: int, count: int) -> int:
+        """What lists of ``count`` splats take beside their entries."""
+        return 4 * (tiles + 1 + tiles * chunks_of(count))
+
     def _total_entries(self) -> int:
         return int(self.rt.read_item(self.starts, self.total))
+
+
+def chunks_of(count: int) -> int:
+    """Parts in which splats are counted, each by one work-item."""
+    return max(-(-count // _CHUNK), 1)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
+from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.cell_layers import layered
 from phyradgs_cl.operators.ray_operator import RayOperator
 from phyradgs_cl.runtime import Runtime
 
@@ -29,17 +29,13 @@ class IntensityOperator:
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells]
     ) -> None:
-        split = [layers(table) for table in tables]
-        count = max(len(parts) for parts in split)
+        ones, self._weights = layered(tables)
         self.volume_shape = grid.shape
         self.frames_shape = (len(tables), *detector_shape)
-        self._operators, self._weights = [], []
-        for k in range(count):
-            parts = [p[k] if k < len(p) else _empty(p[0]) for p in split]
-            weights = np.stack([part.line_weights() for part in parts]).astype(np.float32)
-            self._weights.append(weights[:, :, None] if tables[0].axis == "rows" else weights[:, None, :])
-            ones = [replace(part, weight=np.ones(part.count)) for part in parts]
-            self._operators.append(RayOperator(rt, grid, detector_shape, ones))
+        self._operators: list[RayOperator] = []
+        for part in ones:  # one memory for all: they are used in turns
+            memory = self._operators[0].memory if self._operators else None
+            self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
         self._shares = self._weights
 
     def expected(self, volume: np.ndarray) -> np.ndarray:
@@ -73,20 +69,3 @@ class IntensityOperator:
         part._weights = [weight[chosen] for weight in self._weights]
         part._shares = part._weights
         return part
-
-
-def layers(table: TimeCells) -> list[TimeCells]:
-    """The cells of a frame in tables in which no line has more than one; cells sorted by line stay so."""
-    numbers = layer_numbers(table)
-    return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
-
-
-def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    names = ("pose", "time_s", "line_start", "line_stop", "weight")
-    return replace(table, **{name: getattr(table, name)[cells] for name in names})
-
-
-def _empty(table: TimeCells) -> TimeCells:
-    """A table of a frame without cells: one that serves no line, because a table must not be empty."""
-    one = _some(table, [0])
-    return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

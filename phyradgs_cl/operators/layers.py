@@ -26,7 +26,8 @@ class Layers:
             self._drawn, self._shares, self._by_layers = (
                 padded_zeros(self.rt, self.lines, self.width, self._count) for _ in range(3)
             )
-        return self._drawn
+        floats = cells.layers * (GUARD + self.lines * pitch_of(self.width)) + GUARD
+        return DeviceArray(self._drawn.buffer, (floats,), self._drawn.dtype)
 
     def merge(self, cells: DeviceCells, merged: DeviceArray) -> None:
         """Writes −ln Σ w exp(−p) of the layers that were drawn last into ``merged``."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
-from functools import cached_property
 from typing import Protocol as Interface
 
 import numpy as np
@@ -12,9 +11,11 @@ import numpy as np
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.cell_layers import averaged, layered
 from phyradgs_cl.operators.layout import pad_rows, unpad_rows
+from phyradgs_cl.operators.ray_memory import RayMemory
 from phyradgs_cl.operators.rays import RayCells, RayLayout, launch_adjoint, launch_forward
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
 
 
 class LinearOperator(Interface):
@@ -41,30 +42,39 @@ class RayOperator:
 
     detector_shape (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis.
     Tables are uploaded once and shared with every subset, and so are the device's volume and frames: use an operator
-    and its subsets one at a time. Each call is one launch, or as few as the device's largest allocation allows.
+    and its subsets one at a time, and operators that were given one ``memory``. Each call is one launch, or as few as
+    memory allows: a volume that does not fit is taken brick by brick (docs/large.md).
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector.
     """
 
     def __init__(
-        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells]
+        self,
+        rt: Runtime,
+        grid: Grid,
+        detector_shape: tuple[int, int],
+        tables: Sequence[TimeCells],
+        *,
+        memory: RayMemory | None = None,
     ) -> None:
         _check_tables(tables, detector_shape)
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
         self.volume_shape = grid.shape
         self._axis = tables[0].axis
-        layout = RayLayout.of(grid, detector_shape, self._axis)
-        self._shared = _Shared(rt, layout, tables)
+        layout = RayLayout.of_scan(grid, detector_shape, self._axis)
+        self.memory = memory or RayMemory(rt, layout, len(tables))
+        self._tables = list(tables)
+        self._cells = RayCells.upload(rt, grid, self._tables)
         self._choose(np.arange(len(tables)))
 
     @property
     def tables(self) -> list[TimeCells]:
         """The cells of each frame."""
-        return [self._shared.tables[f] for f in self._chosen]
+        return [self._tables[f] for f in self._chosen]
 
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
-        return self._project(volume, "log")
+        return self.project(volume, "log")
 
     def intensity_gap(self, volume: np.ndarray) -> np.ndarray:
         """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
@@ -72,32 +82,63 @@ class RayOperator:
         Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
         to what an intensity detector measured of about x, it is what a log detector would have measured.
         """
-        return self._project(volume, "gap")
+        return self.project(volume, "gap")
 
-    def _project(self, volume: np.ndarray, average: str) -> np.ndarray:
+    def project(self, volume: np.ndarray, average: str) -> np.ndarray:
+        """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""
         _check_shape("volume", volume, self.volume_shape)
-        shared = self._shared
-        shared.write_volume(volume)
+        return with_smaller_bricks(
+            "ray-driven projector", lambda share: self._project(volume, average, share)
+        )
+
+    def _project(self, volume: np.ndarray, average: str, share: float) -> np.ndarray:
+        bricks = self.memory.plan(share)
+        if average != "log" and len(bricks) > 1:
+            return self._project_layers(volume, average)
         result = np.empty(self.frames_shape, np.float32)
-        for part, listed in self._batches:
-            frames = shared.frames(listed.size)
-            launch_forward(
-                self.rt, shared.layout, shared.cells, listed, shared.volume, frames, average=average
-            )
-            by_line = unpad_rows(self.rt.download(frames), shared.layout.frames_shape(listed.size))
+        for part in self.memory.batches(len(self._chosen)):
+            listed = self._listed(part)
+            frames = self.memory.frames(listed.size)
+            for k, brick in enumerate(bricks):
+                if k + part.start == 0 or len(bricks) > 1:
+                    layout, on_device = self.memory.write_volume(volume, brick)
+                launch_forward(
+                    self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
+                )
+            by_line = unpad_rows(self.rt.download(frames), layout.frames_shape(listed.size))
             result[part] = self._lines_first(by_line)
         return result
+
+    def _project_layers(self, volume: np.ndarray, average: str) -> np.ndarray:
+        """Averages that need a whole ray at a time, where no brick has one: every layer of cells by itself."""
+        ones, weights = layered(self.tables)
+        like = (self.rt, self.grid, self.detector_shape)
+        return averaged(
+            [RayOperator(*like, tables, memory=self.memory).forward(volume) for tables in ones],
+            weights,
+            average,
+        )
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
         """Aᵀ y; frames (F, rows, columns), result (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
-        shared = self._shared
-        for part, listed in self._batches:
-            on_device = shared.frames(listed.size)
-            self.rt.write(on_device, pad_rows(self._lines_first(frames[part])))
-            more = part.start > 0
-            launch_adjoint(self.rt, shared.layout, shared.cells, listed, on_device, shared.volume, add=more)
-        return shared.layout.unpad_volume(self.rt.download(shared.volume))
+        return with_smaller_bricks("ray-driven backprojector", lambda share: self._adjoint(frames, share))
+
+    def _adjoint(self, frames: np.ndarray, share: float) -> np.ndarray:
+        bricks = self.memory.plan(share)
+        parts = list(self.memory.batches(len(self._chosen)))
+        result = np.empty(self.volume_shape, np.float32)
+        for k, brick in enumerate(bricks):
+            layout, on_device = self.memory.volume(brick)
+            for part in parts:
+                listed = self._listed(part)
+                by_line = self.memory.frames(listed.size)
+                if k == 0 or len(parts) > 1:
+                    self.rt.write(by_line, pad_rows(self._lines_first(frames[part])))
+                add = part.start > 0
+                launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
+            result[brick.box] = layout.inside(self.rt.download(on_device))
+        return result
 
     def subset(self, frames: Sequence[int]) -> RayOperator:
         """The same operator on some of the frames, in this order; cheap, but worth keeping if it is used again."""
@@ -111,50 +152,18 @@ class RayOperator:
     def _choose(self, chosen: np.ndarray) -> None:
         self._chosen = chosen
         self.frames_shape = (len(chosen), *self.detector_shape)
-        self._batches = list(self._shared.batches(chosen))
+        self._lists: dict[tuple[int, int], DeviceArray] = {}
+
+    def _listed(self, part: slice) -> DeviceArray:
+        """The indices of some of the chosen frames on the device."""
+        key = part.start, part.stop
+        if key not in self._lists:
+            self._lists[key] = self.rt.upload(self._chosen[part], np.int32)
+        return self._lists[key]
 
     def _lines_first(self, frames: np.ndarray) -> np.ndarray:
         """Frames (F, rows, columns) with the readout's lines as rows; its own inverse."""
         return frames if self._axis == "rows" else frames.transpose(0, 2, 1)
-
-
-class _Shared:
-    """What an operator and its subsets share: the cells of all frames, a padded volume and padded frames."""
-
-    def __init__(self, rt: Runtime, layout: RayLayout, tables: Sequence[TimeCells]) -> None:
-        self.rt, self.layout, self.tables = rt, layout, list(tables)
-        self.cells = RayCells.upload(rt, layout.grid, self.tables)
-        floats = rt.device.largest_allocation_bytes // 4
-        fitting = (floats - layout.frames_floats(0)) // (layout.frames_floats(1) - layout.frames_floats(0))
-        self._most = max(1, min(len(self.tables), fitting))
-
-    @cached_property
-    def volume(self) -> DeviceArray:
-        return self.rt.zeros(self.layout.volume_floats)
-
-    @cached_property
-    def _padded(self) -> np.ndarray:
-        """The volume's padded floats on the host, kept because fresh pages cost more than the copy."""
-        return self.layout.pad_volume(np.zeros(self.layout.grid.shape, np.float32))
-
-    @cached_property
-    def _all_frames(self) -> DeviceArray:
-        return self.rt.zeros(self.layout.frames_floats(self._most))
-
-    def write_volume(self, volume: np.ndarray) -> None:
-        self.layout.inside(self._padded)[...] = volume
-        self.rt.write(self.volume, self._padded)
-
-    def frames(self, count: int) -> DeviceArray:
-        """Memory for ``count`` frames of one batch, whatever was in it."""
-        whole = self._all_frames
-        return DeviceArray(whole.buffer, (self.layout.frames_floats(count),), whole.dtype)
-
-    def batches(self, chosen: np.ndarray) -> Iterator[tuple[slice, DeviceArray]]:
-        """Runs of the chosen frames that fit into one allocation, with their uploaded indices."""
-        for start in range(0, len(chosen), self._most):
-            part = slice(start, min(start + self._most, len(chosen)))
-            yield part, self.rt.upload(chosen[part], np.int32)
 
 
 def _check_tables(tables: Sequence[TimeCells], detector_shape: tuple[int, int]) -> None:

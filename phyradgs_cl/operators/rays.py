@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import transpose_pose
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.layout import GUARD, pad_rows, pitch_of, projection_matrices, unpad_rows
+from phyradgs_cl.operators.bricks import Brick, whole
+from phyradgs_cl.operators.layout import GUARD, pitch_of, projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _RAY_CELL_FLOATS = 16
@@ -31,20 +31,31 @@ AVERAGES = ("log", "intensity", "gap")  # gap: log less intensity; in the order 
 
 @dataclass(frozen=True)
 class RayLayout:
-    """How volumes (z, y, x) and stacks of frames of ``lines`` × ``width`` pixels lie in device memory."""
+    """How volumes (z, y, x) and stacks of frames of ``lines`` × ``width`` pixels lie in device memory.
+
+    ``brick``: which voxels of the grid the volume has. A border of zeros around it makes it a volume of its own, so
+    that the frames of all bricks add up to those of the whole.
+    """
 
     grid: Grid
     lines: int
     width: int
+    brick: Brick
 
     @classmethod
-    def of(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> RayLayout:
+    def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> RayLayout:
+        """The whole grid, with the readout's lines as rows of the frames."""
         rows, columns = detector_shape
-        return cls(grid, rows, columns) if axis == "rows" else cls(grid, columns, rows)
+        lines, width = (rows, columns) if axis == "rows" else (columns, rows)
+        return cls(grid, lines, width, whole(grid.shape))
+
+    def of(self, brick: Brick) -> RayLayout:
+        """The same frames with another part of the grid."""
+        return replace(self, brick=brick)
 
     @property
     def volume_floats(self) -> int:
-        nz, ny, nx = self.grid.shape
+        nz, ny, nx = self.brick.shape
         return 2 * GUARD + (nz + 2 * _BORDER) * (ny + 2 * _BORDER) * pitch_of(nx)
 
     def frames_floats(self, count: int) -> int:
@@ -55,7 +66,7 @@ class RayLayout:
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
         """The volume (z, y, x) as a view of its padded floats."""
-        nz, ny, nx = self.grid.shape
+        nz, ny, nx = self.brick.shape
         padded = flat[GUARD:-GUARD].reshape(nz + 2 * _BORDER, ny + 2 * _BORDER, pitch_of(nx))
         return padded[_BORDER:-_BORDER, _BORDER:-_BORDER, :nx]
 
@@ -68,11 +79,12 @@ class RayLayout:
         return np.ascontiguousarray(self.inside(flat))
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """The kernels' arguments about shapes: voxels, pitch, voxel size, lines, width, pitch."""
-        nz, ny, nx = self.grid.shape
+        """The kernels' arguments about shapes: voxels, the first of them, pitch, voxel size, lines, width, pitch."""
+        nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (
             np.array([nx, ny, nz, 0], np.int32),
+            np.array([*self.brick.start[::-1], 0], np.int32),
             np.int32(pitch_of(nx)),
             np.array([dx, dy, dz, 0], np.float32),
             np.int32(self.lines),
@@ -124,8 +136,12 @@ def launch_forward(
     frames: DeviceArray,
     *,
     average: str = "log",
+    add: bool = False,
 ) -> None:
-    """The listed frames of a padded volume, into ``frames``; ``average``, one of AVERAGES, is over a line's cells."""
+    """The listed frames of a padded volume, into ``frames``; ``average``, one of AVERAGES, is over a line's cells.
+
+    ``add`` lays them onto what is there: line integrals of several bricks, for ``log`` alone.
+    """
     blocks = -(-layout.width // rt.lanes)
     rt.launch(
         rt.kernel("rays", "rays_forward", **_defines(rt, layout)),
@@ -137,6 +153,7 @@ def launch_forward(
         frame_list,
         *layout.constants(),
         np.int32(AVERAGES.index(average)),
+        np.int32(add),
         frames,
         group=rt.group(on_cpu=min(blocks, 8)),
     )
@@ -153,7 +170,7 @@ def launch_adjoint(
     add: bool = False,
 ) -> None:
     """Sums the listed frames onto a padded volume."""
-    nz, ny, nx = layout.grid.shape
+    nz, ny, nx = layout.brick.shape
     bx, by, bz = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt)
     owners = (-(-nx // bx), -(-ny // by), -(-nz // bz))
     group = rt.group(on_cpu=1, on_gpu=_BLOCK**3)
@@ -179,6 +196,12 @@ def brick_of(rt: Runtime) -> tuple[int, int, int]:
     """Voxels (x, y, z) that a work-item of the adjoint owns: larger bricks share fewer rays, 14 % faster."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
+
+
+def owner_steps(rt: Runtime) -> tuple[int, int]:
+    """Voxels (z, y) of which the adjoint's owners are made: bricks that are multiples have the bits of the whole."""
+    x, y, z = brick_of(rt)
+    return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 
 
 def _defines(rt: Runtime, layout: RayLayout) -> dict[str, int]:
@@ -229,51 +252,3 @@ def voxel_matrices(pose: np.ndarray, grid: Grid) -> np.ndarray:
     pitch = np.array(grid.voxel_size_mm[::-1])
     shift = np.einsum("cij,j->ci", matrix[:, :, :3], first) + matrix[:, :, 3]
     return np.concatenate([matrix[:, :, :3] * pitch, shift[:, :, None]], -1).reshape(-1, 12)
-
-
-class RayProjector:
-    """Line integrals of a voxel grid, weighted over a frame's cells: the merged frame, in one launch.
-
-    Joseph's method: one bilinear sample a plane of each ray's own main axis; voxels outside are zero.
-    """
-
-    def __init__(self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str = "rows") -> None:
-        self.rt, self.grid, self.axis = rt, grid, axis
-        self._layout = RayLayout.of(grid, detector_shape, axis)
-        self._only = rt.upload(np.zeros(1, np.int32))
-        self._image = rt.zeros(self._layout.frames_floats(1))
-
-    def upload_volume(self, volume: np.ndarray) -> DeviceArray:
-        """A volume (z, y, x) in the padded layout."""
-        return self.rt.upload(self._layout.pad_volume(volume))
-
-    def _check(self, table: TimeCells) -> None:
-        """Cells of another panel would be read past their ends."""
-        expected = (self.axis, self._layout.lines)
-        if (table.axis, table.lines) != expected:
-            found = f"{table.lines} lines along {table.axis}"
-            raise InputError("time cells", found, f"{expected[1]} lines along {expected[0]}, the projector's")
-
-    def forward(self, volume: DeviceArray, table: TimeCells, detector_model: str = "log") -> np.ndarray:
-        """The merged frame (rows, columns) float32 of a padded volume in 1/mm.
-
-        ``log`` averages line integrals over the cells; ``intensity`` takes −ln of the mean transmission.
-        """
-        self._check(table)
-        cells = RayCells.upload(self.rt, self.grid, [table])
-        launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
-        image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]
-        return image if self.axis == "rows" else np.ascontiguousarray(image.T)
-
-    def adjoint(self, frame: np.ndarray, table: TimeCells, volume: DeviceArray, *, add: bool = False) -> None:
-        """Aᵀ of ``forward`` with the log model: a frame (rows, columns) onto a padded volume."""
-        self._check(table)
-        image = self.rt.upload(pad_rows(frame if self.axis == "rows" else frame.T))
-        cells = RayCells.upload(self.rt, self.grid, [table])
-        launch_adjoint(self.rt, self._layout, cells, self._only, image, volume, add=add)
-
-    def backproject(self, frame: np.ndarray, table: TimeCells) -> np.ndarray:
-        """Aᵀ frame as an array (z, y, x) float32."""
-        volume = self.rt.zeros(self._layout.volume_floats)
-        self.adjoint(frame, table, volume)
-        return self._layout.unpad_volume(self.rt.download(volume))

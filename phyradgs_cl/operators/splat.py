@@ -87,7 +87,12 @@ class SplatProjector:
 
     def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
         """The merged frame in the padded layout; valid until the next call."""
-        self._prepare(gaussians, cells)
+        self.draw(gaussians, cells)
+        return self.merge(cells)
+
+    def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
+        """The frame before its layers are merged: what several clouds' frames can be added up in, flat, padded."""
+        self.prepare(gaussians, cells)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         rt = self.rt
         kernel = rt.kernel(
@@ -118,6 +123,10 @@ class SplatProjector:
             drawn,
             group=16 if self.by_pixel else 1,
         )
+        return drawn
+
+    def merge(self, cells: DeviceCells) -> DeviceArray:
+        """The merged frame of what was drawn last; valid until the next call."""
         if self._layers is not None:
             self._layers.merge(cells, self.image)
         return self.image
@@ -127,7 +136,7 @@ class SplatProjector:
     ) -> None:
         """Writes dL/dparameters into ``gradients`` (13, stride), rows as cl/common/gradient.h says.
 
-        Uses what the last ``forward`` of the same Gaussians and cells prepared.
+        Uses what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells.
         """
         rt = self.rt
         group = _BACKWARD_GROUP if self.by_pixel else 1
@@ -195,12 +204,15 @@ class SplatProjector:
             "MOVING": int(cells.moving),
         }
 
-    def _prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
+    def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
+        """Sees every Gaussian from every pose: what ``draw`` begins with, and ``backward`` needs."""
         rt = self.rt
         footprints = gaussians.stride * cells.count
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
+            self._records = rt.empty(1)  # the old goes before the new comes
             self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
         if self._sums.size < footprints * SUM_FLOATS:
+            self._sums = rt.empty(1)
             self._sums = rt.empty(footprints * SUM_FLOATS)
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)

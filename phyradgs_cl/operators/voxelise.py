@@ -6,6 +6,7 @@ import numpy as np
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.binning import TileLists
+from phyradgs_cl.operators.bricks import Shape, cut
 from phyradgs_cl.operators.layout import (
     GUARD,
     DeviceGaussians,
@@ -16,7 +17,7 @@ from phyradgs_cl.operators.layout import (
     unpad_rows,
 )
 from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
 
 RECORD_FLOATS = 20
 SUM_FLOATS = 16
@@ -35,10 +36,8 @@ class Voxeliser:
         self.pitch = pitch_of(nx)
         self.cutoff2 = np.float32(cutoff_sigma**2)
         self.by_pixel = rt.pixel_items
-        tile_x = 16 if self.by_pixel else self.pitch
-        tile = (tile_x, _TILE_ROWS, _TILE_ROWS)
-        self.tile = np.array([*tile, 0], np.int32)
-        self.lists = TileLists(rt, tile, (-(-nx // tile_x), -(-ny // _TILE_ROWS), -(-nz // _TILE_ROWS)))
+        self.lists = TileLists(rt, *_tiles(rt, shape))
+        self.tile = self.lists.tile
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self.volume = padded_zeros(rt, nz * ny, nx)
         self._records = rt.empty(1)
@@ -54,7 +53,7 @@ class Voxeliser:
         Lengths in the Gaussians' unit; ``start`` runs z, y, x. A part has the same bits as the whole.
         """
         rt = self.rt
-        self._prepare(gaussians, grid, start)
+        self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         kernel = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines)
         nz, ny, _ = self.shape
@@ -86,6 +85,8 @@ class Voxeliser:
     ) -> None:
         """``weight`` × dL/dparameters into (or, with ``add``, onto) ``gradients`` (13, stride); after ``forward``."""
         rt = self.rt
+        if self._sums.size < gaussians.stride * SUM_FLOATS:
+            self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
         rt.launch(
             rt.kernel("voxel_backward", "voxel_backward", **self._defines),
             gaussians.count,
@@ -111,11 +112,11 @@ class Voxeliser:
             group=rt.group(),
         )
 
-    def _prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
+    def prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
+        """What ``forward`` begins with, and ``backward`` needs."""
         rt, stride = self.rt, gaussians.stride
         if self._records.size < stride * RECORD_FLOATS:
             self._records = rt.empty(stride * RECORD_FLOATS)
-            self._sums = rt.zeros(stride * SUM_FLOATS)
             self._extents = rt.empty(6 * stride, np.int32)
         rt.launch(
             rt.kernel("voxel_prepare", "voxel_prepare", **self._defines),
@@ -155,19 +156,49 @@ def voxelise(
     cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
     brick_bytes: int = _DEFAULT_BRICK_BYTES,
 ) -> np.ndarray:
-    """The whole grid (z, y, x) float32, slab by slab, so that the device holds ``brick_bytes`` of voxels at most."""
-    nz, ny, nx = grid.shape
-    slab = max(1, min(nz, brick_bytes // (4 * ny * pitch_of(nx))))
+    """The whole grid (z, y, x) float32, brick by brick: the device holds ``brick_bytes`` of voxels at a time, or less
+    where memory is short. Bricks have the bits of the whole.
+    """
+
+    def attempt(share: float) -> np.ndarray:
+        gaussians = DeviceGaussians.upload(rt, rows)
+        return _in_bricks(rt, gaussians, grid, cutoff_sigma, brick_bytes, share)
+
+    return with_smaller_bricks("voxeliser", attempt)
+
+
+def _in_bricks(
+    rt: Runtime, gaussians: DeviceGaussians, grid: Grid, cutoff_sigma: float, brick_bytes: int, share: float
+) -> np.ndarray:
+    nx, records_bytes = grid.shape[2], 4 * gaussians.stride * (RECORD_FLOATS + 6)
+
+    def needs(shape: Shape) -> tuple[int, ...]:
+        nz, ny, _ = shape
+        voxels_bytes = 4 * (2 * GUARD + nz * ny * pitch_of(nx))
+        if voxels_bytes > brick_bytes and nz * ny > 1:
+            return (room.free_bytes + 1,)  # more than was asked for
+        lists_bytes = TileLists.bytes(int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
+        entries_bytes = lists_bytes  # how many there are is known when they are counted
+        return voxels_bytes, lists_bytes, entries_bytes, records_bytes
+
+    room = rt.room()
     volume = np.empty(grid.shape, np.float32)
-    gaussians = DeviceGaussians.upload(rt, rows)
-    voxelisers: dict[int, Voxeliser] = {}
-    for start in range(0, nz, slab):
-        shape = (min(slab, nz - start), ny, nx)
-        if shape[0] not in voxelisers:
-            voxelisers[shape[0]] = Voxeliser(rt, shape, cutoff_sigma=cutoff_sigma)
-        part = voxelisers[shape[0]].forward(gaussians, grid, (start, 0, 0))
-        volume[start : start + shape[0]] = unpad_rows(rt.download(part), shape)
+    made: Voxeliser | None = None
+    for brick in cut(grid.shape, (1, 1), needs, room, share):
+        if made is None or made.shape != brick.shape:
+            made = None  # before the next one takes its memory
+            made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
+        part = made.forward(gaussians, grid, brick.start)
+        volume[brick.box] = unpad_rows(rt.download(part), brick.shape)
     return volume
+
+
+def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
+    """Size of a tile, and number of tiles of a volume (z, y, x), both along x, y, z."""
+    nz, ny, nx = shape
+    tile_x = 16 if rt.pixel_items else pitch_of(nx)
+    tile = (tile_x, _TILE_ROWS, _TILE_ROWS)
+    return tile, (-(-nx // tile_x), -(-ny // _TILE_ROWS), -(-nz // _TILE_ROWS))
 
 
 def index_matrix(grid: Grid) -> np.ndarray:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from phyradgs_cl.checks import one_of, positive
 from phyradgs_cl.fields.volume import Grid
 from phyradgs_cl.phantoms.ellipsoids import Ellipsoid, EllipsoidPhantom, rotation_about_z
-from phyradgs_cl.phantoms.from_file import LoadedVolume, load_volume
 from phyradgs_cl.phantoms.procedural_foot import foot
 from phyradgs_cl.phantoms.procedural_jaw import jaw
 from phyradgs_cl.phantoms.shepp_logan import shepp_logan
@@ -28,12 +27,10 @@ __all__ = [
     "PHANTOMS",
     "Ellipsoid",
     "EllipsoidPhantom",
-    "LoadedVolume",
     "Phantom",
     "VoxelPhantom",
     "foot",
     "jaw",
-    "load_volume",
     "make_phantom",
     "rotation_about_z",
     "shepp_logan",

@@ -18,15 +18,16 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.parallel import Communicator
+from phyradgs_cl.reconstructors.checked_state import check_like, checked_history, count_of
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
+from phyradgs_cl.reconstructors.reporting import report_once
 from phyradgs_cl.reconstructors.result import (
     Progress,
     ProgressReport,
     Reconstruction,
     State,
-    history,
     history_arrays,
-    state_arrays,
 )
 from phyradgs_cl.reconstructors.system import System, norm
 from phyradgs_cl.runtime import Runtime
@@ -101,11 +102,12 @@ def run_iterations(
     algorithm = make(system)
     iteration, record = 0, []
     if resume is not None:
-        iteration = int(state_arrays(resume, ["iteration"])[0])
+        check_like(resume, algorithm.state())
+        iteration = count_of(resume, "iteration", options.iterations)
+        record, before_s = checked_history(resume)
         algorithm.restore(resume)
-        record, before_s = history(resume)
         started -= before_s
-    loop = _Loop(algorithm, options, scan.grid, norm(system.measured) or 1.0, report, started)
+    loop = _Loop(algorithm, options, scan.grid, norm(system.measured) or 1.0, report, started, rt.ranks)
     loop.record = record
     loop.run(iteration)
     facts: dict[str, object] = {
@@ -116,6 +118,7 @@ def run_iterations(
         "stopped_by": loop.stopped_by,
         "seconds": time.perf_counter() - started,
         "interrupted_at": loop.iteration if loop.stopped_by == "interrupt" else None,
+        "ranks": rt.ranks.size,
     }
     state = None
     if loop.stopped_by == "interrupt":
@@ -134,7 +137,9 @@ class _Loop:
         measured_norm: float,
         report: ProgressReport,
         started: float,
+        ranks: Communicator,
     ) -> None:
+        self.ranks = ranks
         self.algorithm, self.options, self.grid, self.report = algorithm, options, grid, report
         self.measured_norm, self.started = measured_norm, started
         self.record: list[dict[str, float]] = []
@@ -148,7 +153,7 @@ class _Loop:
                 self._iterate()
                 if self.algorithm.finished:
                     self.stopped_by = self.algorithm.finished
-                elif self.iteration < self.options.iterations and request.is_set:
+                elif self.iteration < self.options.iterations and self.ranks.any(request.is_set):
                     self.stopped_by = "interrupt"
                 if self.stopped_by != "iterations":
                     return
@@ -177,14 +182,11 @@ class _Loop:
         if change < self.options.tolerance:
             self.stopped_by = "tolerance"
         total = self.options.iterations
-        try:
-            self.report(
-                Progress(
-                    *(self.iteration, total, residual, 0, seconds),
-                    quantity="residual",
-                    state=self.state,
-                    volume=lambda: (self.algorithm.volume, self.grid),
-                )
-            )
-        except KeyboardInterrupt:
-            self.stopped_by = "interrupt" if self.iteration < total else self.stopped_by
+        progress = Progress(
+            *(self.iteration, total, residual, 0, seconds),
+            quantity="residual",
+            state=self.state,
+            volume=lambda: (self.algorithm.volume, self.grid),
+        )
+        if report_once(self.ranks, self.report, progress) and self.iteration < total:
+            self.stopped_by = "interrupt"

@@ -15,11 +15,13 @@ from phyradgs_cl.reconstructors.asd_pocs import AsdPocsOptions, asd_pocs
 from phyradgs_cl.reconstructors.cgls import CglsOptions, cgls
 from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, fdk
 from phyradgs_cl.reconstructors.fista_tv import FistaTvOptions, fista_tv
+from phyradgs_cl.reconstructors.naf import NAF_PRESETS, naf
 from phyradgs_cl.reconstructors.phyradgs import phyradgs
 from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
 from phyradgs_cl.reconstructors.r2 import r2
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.reconstructors.sart import OS_SART, SartOptions, os_sart, sart
+from phyradgs_cl.reconstructors.sax_nerf import SAX_PRESETS, sax_nerf
 from phyradgs_cl.reconstructors.sirt import SirtOptions, sirt
 from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
 from phyradgs_cl.runtime import Runtime
@@ -35,22 +37,27 @@ _MODELS_WITH = {
 
 @dataclass(frozen=True)
 class Method:
-    """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed."""
+    """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed, and can
+    several ranks share its work.
+    """
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
     is_resumable: bool = True
+    is_shared: bool = False
 
 
 METHODS = {
-    "phyradgs": Method(phyradgs, PRESETS),
-    "r2": Method(r2, {"published": R2_PUBLISHED}),
-    "sart": Method(sart, {"default": SartOptions()}),
-    "os-sart": Method(os_sart, {"default": OS_SART}),
-    "sirt": Method(sirt, {"default": SirtOptions()}),
-    "cgls": Method(cgls, {"default": CglsOptions()}),
-    "asd-pocs": Method(asd_pocs, {"default": AsdPocsOptions()}),
-    "fista-tv": Method(fista_tv, {"default": FistaTvOptions()}),
+    "phyradgs": Method(phyradgs, PRESETS, is_shared=True),
+    "r2": Method(r2, {"published": R2_PUBLISHED}, is_shared=True),
+    "sart": Method(sart, {"default": SartOptions()}, is_shared=True),
+    "os-sart": Method(os_sart, {"default": OS_SART}, is_shared=True),
+    "sirt": Method(sirt, {"default": SirtOptions()}, is_shared=True),
+    "cgls": Method(cgls, {"default": CglsOptions()}, is_shared=True),
+    "asd-pocs": Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True),
+    "fista-tv": Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True),
+    "naf": Method(naf, NAF_PRESETS),
+    "sax-nerf": Method(sax_nerf, SAX_PRESETS),
     "fdk": Method(fdk, FDK_PRESETS, is_resumable=False),
 }
 
@@ -89,8 +96,24 @@ def reconstruct(
     ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing.
     """
     chosen = method_options(method) if options is None else options
+    if rt.ranks.size > 1:
+        _check_ranks(method, rt)
     ready = prepared(scan, InputOptions() if before is None else before)
     return METHODS[method].run(ready, chosen, rt, seed=seed, report=report, **extra)
+
+
+def _check_ranks(method: str, rt: Runtime) -> None:
+    """InputError where the method has no work for several ranks, or ranks would not come to the same numbers."""
+    if not METHODS[method].is_shared:
+        sharing = ", ".join(name for name, one in METHODS.items() if one.is_shared)
+        found = f"{rt.ranks.size} ranks"
+        raise InputError(f"--method {method}", found, f"one, or one of {sharing}", "start it without mpiexec")
+    device, first = rt.device.name, rt.ranks.tell(rt.device.name)
+    if device != first:
+        culprit = f"device of rank {rt.ranks.rank}"
+        raise InputError(
+            culprit, device, f"that of rank 0, {first}", "choose devices of one kind with --device"
+        )
 
 
 def input_options(changes: Mapping[str, Any]) -> InputOptions:

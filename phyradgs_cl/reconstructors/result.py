@@ -70,9 +70,3 @@ def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
 def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dict[str, np.ndarray]:
     """A convergence record and the seconds so far as entries of a state."""
     return {"record": np.array(json.dumps(list(record))), "seconds": np.array(seconds)}
-
-
-def history(state: State) -> tuple[list[dict[str, float]], float]:
-    """The inverse of ``history_arrays``; raises InputError for a state that lacks them."""
-    record, seconds = state_arrays(state, ("record", "seconds"))
-    return json.loads(str(record)), float(seconds)

@@ -12,6 +12,7 @@ from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 
+SPLITS = ("frames", "domain")
 _WEIGHT = (0, 1e6)
 _RANGES = {
     "ssim_weight": _WEIGHT,
@@ -42,6 +43,11 @@ class SplatOptions:
     edge of the random sub-volume in voxels. ``scale_min_voxels`` > 0 raises the smallest scale to that share
     of a voxel. ``detector_model``: what is averaged over a line's times, line integrals (log) or intensity, or
     what the scan says. ``pixel_footprint`` lets pixels average over their area.
+
+    ``iterations`` counts frames: a step of Adam is taken every ``batch`` of them (0: as many as there are ranks), with
+    rates × √batch. ``split`` says what ranks share out: ``frames``, every rank with all Gaussians, or the ``domain``, every
+    rank with its own. ``parts``: into how many parts a frame's lines, or the Gaussians, are cut for that (0: as many as
+    there are ranks for them); the same batch and parts give the same bits on any number of ranks (docs/cluster.md).
     """
 
     motion: Motion = Motion("exact")
@@ -67,12 +73,18 @@ class SplatOptions:
     scale_min: float = 0.001
     scale_min_voxels: float = 0.0
     scale_max: float = 1.0
+    batch: int = 0
+    split: str = "frames"
+    parts: int = 0
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
 
     def __post_init__(self) -> None:
         checks.within("--iterations", self.iterations, 0, 1_000_000_000)
         checks.within("--gaussians (0 chooses from the grid)", self.gaussians, 0, 100_000_000)
+        checks.within("--batch (0: as many as ranks)", self.batch, 0, 1_000_000)
+        checks.one_of("--split", self.split, SPLITS)
+        checks.within("--parts (0: as many as ranks)", self.parts, 0, 1_000_000)
         checks.fields_within("", self, _RANGES)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         if self.scale_max <= self.scale_min:
@@ -91,6 +103,12 @@ class SplatOptions:
             return self.gaussians
         voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
         return int(min(max(voxels / 16, 1000), 50_000))
+
+    def batch_for(self, frames: int, ranks: int) -> int:
+        """Frames a step: as asked, else one for every rank that has work of its own, none twice."""
+        if self.batch > frames:
+            raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
+        return self.batch or (min(ranks, frames) if self.split == "frames" else 1)
 
     @property
     def asks_for_gaussians(self) -> bool:

@@ -12,6 +12,7 @@ from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators.intensity import IntensityOperator
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
+from phyradgs_cl.reconstructors.shared_operator import Intensity, SharedIntensity, SharedOperator
 from phyradgs_cl.runtime import Runtime
 
 _SHORTEST_PATH = 0.1  # of the longest
@@ -30,21 +31,24 @@ class System:
     operator: LinearOperator
     measured: np.ndarray
     valid: np.ndarray | None = None
-    intensity: IntensityOperator | None = None
+    intensity: Intensity | None = None
     light: np.ndarray | None = None
 
     @classmethod
     def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> System:
         """The scan's frames with the cells of ``motion``; ``detector_model``: log, intensity, or the scan's own."""
         tables = [motion.cells(scan, f) for f in range(scan.frames)]
-        operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+        operator: LinearOperator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
-        intensity = None
+        intensity: Intensity | None = None
         if model == "intensity" and any(
             averages(table) for table in tables
         ):  # of one value both are the mean
             intensity = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+        if rt.ranks.size > 1:
+            operator = SharedOperator(rt.ranks, operator)
+            intensity = None if intensity is None else SharedIntensity(rt.ranks, intensity)
         if scan.pixel_mask is None:
             return cls(operator, measured, None, intensity)
         valid = np.broadcast_to(scan.pixel_mask == 0, measured.shape)

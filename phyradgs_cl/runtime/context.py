@@ -7,13 +7,15 @@ import time
 import warnings
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
 
 from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
+from phyradgs_cl.runtime.faults import naming_failures, translated
+from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, memory_limit
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 from phyradgs_cl.runtime.source import kernel_source
 
@@ -22,30 +24,14 @@ log = logging.getLogger(__name__)
 LANE_CHOICES = (1, 4, 8, 16)
 
 
-@dataclass(eq=False)
-class DeviceArray:
-    """A typed, shaped piece of device memory."""
-
-    buffer: cl.Buffer
-    shape: tuple[int, ...]
-    dtype: np.dtype
-
-    @property
-    def size(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64))
-
-    @property
-    def nbytes(self) -> int:
-        return self.size * self.dtype.itemsize
-
-
 class Runtime:
     """Owns everything OpenCL. Declare (``kernel``), allocate (``empty``, ``upload``), call (``launch``).
 
     ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
     the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
     ``pixel_items`` selects the launch shape: a work-item a pixel and small groups (GPUs, needs ``lanes`` 1), or a
-    work-item a band of lines (CPUs).
+    work-item a band of lines (CPUs). ``memory`` (bytes, or text as 2GiB) limits what its buffers hold together.
+    ``ranks``: the processes that work on the same scan, each with a Runtime of its own on the device that is its turn.
     """
 
     def __init__(
@@ -56,12 +42,20 @@ class Runtime:
         fp64: bool | None = None,
         pixel_items: bool | None = None,
         profile: bool = False,
+        memory: str | int | None = None,
+        ranks: Communicator | None = None,
     ) -> None:
+        limit_bytes = memory_limit(memory)
+        self.ranks: Communicator = Alone() if ranks is None else ranks
         self.device: DeviceInfo
-        self.device, self.reason = choose_device(device)
-        self.context = cl.Context([self.device.handle])
+        self.device, self.reason = choose_device(device, self.ranks.local_rank)
+        self.ledger = MemoryLedger(self.device, limit_bytes)
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
-        self.queue = cl.CommandQueue(self.context, properties=properties)
+        try:
+            self.context = cl.Context([self.device.handle])
+            self.queue = cl.CommandQueue(self.context, properties=properties)
+        except cl.Error as error:
+            raise translated(error, self.ledger, "opening it") from error
         self.lanes = lanes or default_lanes(self.device)
         if self.lanes not in LANE_CHOICES:
             raise DeviceError("lanes", str(self.lanes), f"one of {LANE_CHOICES}")
@@ -71,9 +65,6 @@ class Runtime:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
         self.profile = profile
         self._profile = Profile()
-        self._allocated_bytes = 0
-        self.peak_bytes = 0
-        """Most device memory that was held at one time, since the start or the last ``reset_peak``."""
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], cl.Kernel] = {}
 
@@ -100,7 +91,7 @@ class Runtime:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 built = cl.Program(self.context, kernel_source(program)).build(options=list(options))
-        except cl.RuntimeError as error:
+        except cl.Error as error:
             message_lines = [line for line in str(error).splitlines() if "error:" in line]
             message = " ".join((message_lines or str(error).splitlines())[:3])[:600]
             raise DeviceError(
@@ -115,43 +106,42 @@ class Runtime:
     # --- memory -------------------------------------------------------------------------------------
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
-        """Uninitialised memory. Raises DeviceError when the device has too little."""
+        """Uninitialised memory. Raises MemoryShortage when the device, or the limit, has too little."""
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         kind = np.dtype(dtype)
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
-        if nbytes > self.device.largest_allocation_bytes:
-            limit = f"at most {self.device.largest_allocation_bytes / 2**20:.0f} MiB in one allocation"
-            raise DeviceError(
-                f"memory of {self.device.name}", f"{nbytes / 2**20:.0f} MiB", limit, "use a smaller problem"
-            )
+        self.ledger.check(nbytes, self.device.largest_allocation_bytes)
         try:
             buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes)
         except cl.Error as error:
-            found = f"{nbytes / 2**20:.0f} MiB refused ({error})"
-            raise DeviceError(f"memory of {self.device.name}", found, "enough free memory") from error
+            raise translated(error, self.ledger, f"{nbytes / 2**20:.0f} MiB") from error
         array = DeviceArray(buffer, shape, kind)
-        self._count(nbytes)
-        weakref.finalize(array, self._count, -nbytes)
+        self.ledger.count(nbytes)
+        weakref.finalize(array, self.ledger.count, -nbytes)
         return array
 
-    def _count(self, nbytes: int) -> None:
-        self._allocated_bytes += nbytes
-        self.peak_bytes = max(self.peak_bytes, self._allocated_bytes)
+    def room(self) -> Room:
+        """What an operator may plan with now: what is left of the limit, and the largest allocation."""
+        return self.ledger.room(self.device.largest_allocation_bytes)
+
+    @property
+    def peak_bytes(self) -> int:
+        """Most device memory that was held at one time, since the start or the last ``reset_peak``."""
+        return self.ledger.peak_bytes
 
     def reset_peak(self) -> None:
         """``peak_bytes`` counts from what is held now."""
-        self.peak_bytes = self._allocated_bytes
+        self.ledger.peak_bytes = self.ledger.held_bytes
 
     def zeros(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
         array = self.empty(shape, dtype)
         self.fill(array, 0)
         return array
 
+    @naming_failures("a fill")
     def fill(self, array: DeviceArray, value: float) -> None:
-        pattern = np.array(value, dtype=array.dtype)
-        event = cl.enqueue_fill_buffer(
-            self.queue, array.buffer, pattern, 0, max(array.nbytes, array.dtype.itemsize)
-        )
+        pattern, nbytes = np.array(value, dtype=array.dtype), max(array.nbytes, array.dtype.itemsize)
+        event = cl.enqueue_fill_buffer(self.queue, array.buffer, pattern, 0, nbytes)
         self._record("fill", event, array.nbytes)
 
     def upload(self, values: np.ndarray, dtype: np.typing.DTypeLike | None = None) -> DeviceArray:
@@ -160,18 +150,21 @@ class Runtime:
         self.write(array, values)
         return array
 
+    @naming_failures("a copy to it")
     def write(self, array: DeviceArray, values: np.ndarray) -> None:
         """Copies host values (same size) into an existing array; the host array may be reused afterwards."""
         values = np.ascontiguousarray(values, dtype=array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, array.buffer, values, is_blocking=True)
 
+    @naming_failures("a copy from it")
     def download(self, array: DeviceArray) -> np.ndarray:
         values = np.empty(array.shape, array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, values, array.buffer, is_blocking=True)
         return values
 
+    @naming_failures("a copy from it")
     def read_item(self, array: DeviceArray, index: int) -> np.generic:
         """One element of a flat array; waits for the queue."""
         value = np.empty(1, array.dtype)
@@ -179,12 +172,14 @@ class Runtime:
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
         return value[0]
 
+    @naming_failures("a copy")
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
         event = cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes)
         self._record("copy", event, 2 * source.nbytes)
 
     # --- launches -----------------------------------------------------------------------------------
 
+    @naming_failures()
     def launch(self, kernel: cl.Kernel, items: int | tuple[int, ...], *args: object, group: int = 1) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
@@ -201,6 +196,7 @@ class Runtime:
         """The work-group size for this class of device."""
         return on_gpu if self.pixel_items else on_cpu
 
+    @naming_failures("the work before")
     def finish(self) -> None:
         self.queue.finish()
 

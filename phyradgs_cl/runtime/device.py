@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.errors import DeviceError, NoSuchDeviceError
 from phyradgs_cl.runtime import pocl
 
 pocl.prepare_environment()
@@ -58,11 +58,13 @@ def list_devices() -> list[DeviceInfo]:
     return found
 
 
-def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
+def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
     """The device to use and the reason in words.
 
     ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a
-    device's or platform's name. Raises DeviceError when nothing fits.
+    device's or platform's name, or several of these with commas. Where several processes share a machine, ``turn`` counts
+    them: each takes the next of the list, or else, where no index is given, the next device like the one found first.
+    Raises DeviceError when nothing fits.
     """
     source = "--device"
     if not wish:
@@ -81,7 +83,11 @@ def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
             "install your vendor's OpenCL driver; on Linux x86-64, pip install 'phyradgs-cl[cpu]' brings PoCL for the CPU",
         )
     if wish:
-        return _wished(wish, source, devices)
+        several = [one for one in wish.split(",") if one.strip()] or [wish]
+        named = several[turn % len(several)]
+        found, reason = _wished(named, source, devices)
+        is_exact = len(several) > 1 or named.strip().isdigit()
+        return found if is_exact else _alike(found, devices, turn), reason
     eligible = [d for d in devices if d.by_default]
     if not eligible:
         names = ", ".join(d.name for d in devices)
@@ -89,7 +95,14 @@ def choose_device(wish: str | None = None) -> tuple[DeviceInfo, str]:
             "OpenCL", f"only {names}", "a real device", "name one with --device to use it all the same"
         )
     best = max(eligible, key=lambda d: d.rank)
-    return best, f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
+    reason = f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
+    return _alike(best, devices, turn), reason
+
+
+def _alike(found: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:
+    """``found``, or the ``turn``-th after it of the devices of its platform and name."""
+    same = [d for d in devices if (d.platform, d.name) == (found.platform, found.name)]
+    return same[(same.index(found) + turn) % len(same)]
 
 
 def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
@@ -101,7 +114,7 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
         matching = [d for d in devices if wish.lower() in f"{d.platform} {d.name}".lower()]
     if not matching:
         known = "; ".join(f"{d.index}: {d.name} ({d.platform})" for d in devices)
-        raise DeviceError(source, repr(wish), f"an index, cpu, gpu or part of a name: {known}")
+        raise NoSuchDeviceError(source, repr(wish), f"an index, cpu, gpu or part of a name: {known}")
     return max(matching, key=lambda d: d.rank), f"asked for by {source}={wish}"
 
 

@@ -20,11 +20,14 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from phyradgs_cl.parallel import Launch, launched
+
 log = logging.getLogger(__name__)
 
 _RECORD_BYTES = 2048
 _USER_SPACE = 1 << 47
 CACHE_VARIABLE = "POCL_CACHE_DIR"
+THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _unwritable: Path | None = None
 _kept_alive: list[ctypes.Array] = []
 
@@ -38,6 +41,7 @@ def prepare_environment() -> None:
     global _unwritable
     if platform.system() != "Linux":
         return
+    _share_cores(launched())
     wish = os.environ.get(CACHE_VARIABLE)
     folder = Path(wish) if wish else _own_cache()
     if not _can_write(folder):
@@ -47,6 +51,14 @@ def prepare_environment() -> None:
         except OSError:  # not there either: PoCL will have no device
             return
     os.environ[CACHE_VARIABLE] = str(folder)
+
+
+def _share_cores(launch: Launch) -> None:
+    """Gives each of several processes on a machine its part of the cores, unless their launcher has bound them."""
+    cores = os.cpu_count() or 1
+    is_bound = len(os.sched_getaffinity(0)) < cores
+    if launch.local_size > 1 and not is_bound:
+        os.environ.setdefault(THREADS_VARIABLE, str(max(1, cores // launch.local_size)))
 
 
 def unwritable_cache() -> Path | None:

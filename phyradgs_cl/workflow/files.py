@@ -14,12 +14,13 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import (
     file_kind,
+    load_volume,
     read_scan,
     read_volume,
     scan_summary,
     volume_summary,
 )
-from phyradgs_cl.phantoms import load_volume
+from phyradgs_cl.io.held_warnings import held_warnings
 
 _KINDS = {
     "scan": "a scan",
@@ -30,7 +31,7 @@ _KINDS = {
 
 def load_scan(path: str | Path) -> Scan:
     """A scan file as line integrals; see ``io.read_scan``."""
-    with expecting(path, "scan"):
+    with expecting(path, "scan"), held_warnings():
         return read_scan(path, counts_to_attenuation)
 
 

@@ -8,8 +8,8 @@ import logging
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
     check_writable,
     checkpoint_path,
@@ -29,6 +29,7 @@ from phyradgs_cl.io import (
     write_volume,
 )
 from phyradgs_cl.metrics import compare
+from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import (
     METHODS,
     InputOptions,
@@ -81,36 +82,57 @@ class _Keeper:
         self.path, self.fingerprint, self.every_s, self.report = path, fingerprint, every_s, report
         self.last_s = time.monotonic()
         self.failed = False
+        self.kept: int | None = None
+        """The iteration of the checkpoint that is there, if this run has written one."""
 
     def __call__(self, progress: Progress) -> None:
         self.report(progress)
         due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
         if due and progress.state is not None and progress.iteration < progress.iterations:
-            self._keep(dict(progress.state()))
+            self._keep(dict(progress.state()), progress.iteration)
             self.last_s = time.monotonic()
 
-    def _keep(self, state: dict[str, np.ndarray]) -> None:
+    def _keep(self, state: dict[str, np.ndarray], iteration: int) -> None:
         try:
             write_checkpoint(self.path, state, self.fingerprint)
+            self.kept = iteration
         except OutputError as error:
             if not self.failed:
                 log.warning("no checkpoint: %s", error)
             self.failed = True
 
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """Errors of the body say that there is a checkpoint to go on from, if there is one."""
+        try:
+            with naming_host_memory():
+                yield
+        except PhyradgsError as error:
+            if self.kept is not None:
+                way_on = f"--resume goes on from iteration {self.kept}"
+                error.remedy = "; ".join(part for part in (error.remedy, way_on) if part)
+            raise
+
 
 @np.errstate(all="ignore")
 def run_reconstruction(
-    job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
+    job: ReconstructionJob,
+    make_runtime: Callable[[], Runtime],
+    report: ProgressReport,
+    ranks: Communicator | None = None,
 ) -> tuple[Reconstruction, dict[str, float]]:
     """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
 
     An interrupted run writes the volume as far as it got, and a checkpoint beside it that ``resume`` continues; a run
     that is killed leaves its last checkpoint. Raises OutputError while another run is at work on the same output.
+    Of ``ranks``, which the runtime must have too, rank 0 alone writes; the others have no metrics.
     """
+    leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)
-    check_writable(job.output)
+    if leads:
+        check_writable(job.output)
     refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
-    with only_run(job.output):
+    with only_run(job.output) if leads else nullcontext():
         return _reconstructed(job, options, make_runtime, report)
 
 
@@ -124,15 +146,18 @@ def _reconstructed(
     scan_hash = sha256_of(job.scan)
     fingerprint = _fingerprint(scan_hash, job, options)
     extra: dict[str, Any] = {"before": job.before}
+    leads = rt.ranks.rank == 0
     if job.resume:
-        extra["resume"] = _resumed(job, fingerprint)
-    else:
+        extra["resume"] = rt.ranks.tell(_resumed(job, fingerprint) if leads else None)
+    elif leads:
         _set_aside(checkpoint_path(job.output))
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
     result: Reconstruction | None = None
     try:
-        with keep_finished_work():
+        with keeper.telling(), keep_finished_work():
             result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=keeper, **extra)
+            if not leads:
+                return result, {}
             with finish_despite_interrupt():
                 metrics = compare(result.volume, scan.reference) if scan.reference is not None else {}
                 _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))

@@ -21,11 +21,11 @@ from phyradgs_cl.bench import (
     rows_of,
     run_bench,
 )
+from phyradgs_cl.bench import rows as bench_rows
 from phyradgs_cl.bench.published import TABLE1, TABLE2
 from phyradgs_cl.bench.results import KEY, Present, append_line, read_lines
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.reconstructors import METHODS
 
 FACTS = {**dict.fromkeys(KEY, 1), "options": {"motion": {"name": "static"}, "iterations": 5}, "metrics": {}}
 
@@ -142,9 +142,22 @@ def test_a_plan_runs_over_seeds_volumes_and_protocols(tmp_path: Path) -> None:
     assert json.loads(json.dumps([run.facts for run in plan_runs(job)]))
 
 
-def test_rows_that_are_not_there_yet_are_not_run(tmp_path: Path) -> None:
-    job = BenchJob("table1", tmp_path, rows=["NAF", "FDK"], names=["jaw"], protocols=["rapid"])
-    assert {run.row.method for run in plan_runs(job)} == {"fdk"}
+@pytest.mark.parametrize(
+    ("torch", "gpu", "size", "methods"),
+    [
+        (False, False, "XS", {"fdk"}),
+        (True, False, "M", {"fdk", "naf"}),
+        (True, False, "L", {"fdk"}),
+        (True, True, "L", {"fdk", "naf"}),
+    ],
+)
+def test_neural_rows_run_where_their_machine_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, torch: bool, gpu: bool, size: str, methods: set[str]
+) -> None:
+    monkeypatch.setattr(bench_rows, "has_torch", lambda: torch)
+    monkeypatch.setattr(bench_rows, "has_accelerator", lambda: gpu)
+    job = BenchJob("table1", tmp_path, size=size, rows=["NAF", "FDK"], names=["jaw"], protocols=["rapid"])
+    assert {run.row.method for run in plan_runs(job)} == methods
 
 
 @pytest.mark.parametrize(
@@ -177,12 +190,10 @@ def test_lists_of_the_command_line() -> None:
         listed_seeds("--seeds", "1,x")
 
 
-def test_every_default_row_with_a_known_method_has_options() -> None:
+def test_every_default_row_has_options() -> None:
     for kind in KINDS:
         for row in rows_of(kind):
-            if row.method in METHODS:
-                options = row.options(100, 10)
-                assert options.motion.name == row.motion
+            assert row.options(100, 10).motion.name == row.motion
 
 
 def test_sizes_of_ones_own_are_checked() -> None:

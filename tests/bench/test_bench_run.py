@@ -24,6 +24,7 @@ from phyradgs_cl.bench import (
     result_text,
     run_bench,
 )
+from phyradgs_cl.bench import rows as bench_rows
 from phyradgs_cl.bench import run as bench_run
 from phyradgs_cl.bench.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, standing
 from phyradgs_cl.bench.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
@@ -92,7 +93,10 @@ def test_lines_have_what_is_needed_to_make_them_again(job: BenchJob, rt: Runtime
     assert {"psnr_db", "ssim", "psnr_2d_db", "ssim_2d", "data_range"} <= line["metrics"].keys()
 
 
-def test_tables_have_means_papers_numbers_and_rows_to_come(job: BenchJob, rt: Runtime) -> None:
+def test_tables_have_means_papers_numbers_and_rows_without_pytorch(
+    job: BenchJob, rt: Runtime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_rows, "has_torch", lambda: False)
     job = replace(job, rows=[*ROWS, "NAF"], seeds=(0, 1))
     run_bench(job, lambda: rt)
     lines = read_lines(job.output / RESULTS)
@@ -105,7 +109,7 @@ def test_tables_have_means_papers_numbers_and_rows_to_come(job: BenchJob, rt: Ru
     ]
     assert f"| {np.mean(per_seed):.2f} ± {np.std(per_seed, ddof=1):.2f} |" in rows["PhyRadGS"]
     assert rows["PhyRadGS"].endswith("| 31.23 / 0.871 |")
-    assert "NAF (not yet)" in rows
+    assert "NAF (needs PyTorch)" in rows
     assert "ball" in text
     with open(job.output / "table1_T.csv", newline="") as file:
         records = list(csv.DictReader(file))
@@ -342,14 +346,17 @@ def test_other_iterations_and_readouts_have_tables_of_their_own(job: BenchJob, t
     assert job.stem == "table1_T"
 
 
-def test_rows_to_come_are_said_and_alone_refused(
-    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture
+def test_rows_without_pytorch_are_said_and_alone_refused(
+    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InputError, match="--rows: found NAF, which this program does not have yet"):
+    monkeypatch.setattr(bench_rows, "has_torch", lambda: False)
+    with pytest.raises(
+        InputError, match=r"--rows: found NAF \(needs PyTorch\); expected one of .*pip install"
+    ):
         run_bench(replace(job, rows=["NAF"]), no_runtime)
     assert not job.output.exists()
     run_bench(replace(job, rows=["NAF", "FDK"], names=["ball"]), lambda: rt)
-    assert "--rows: NAF: not in this program yet, left out" in caplog.text
+    assert "left out: NAF needs PyTorch" in caplog.text
 
 
 def test_volumes_at_the_resolution_of_the_grid_are_said_once(

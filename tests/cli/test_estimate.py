@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from phyradgs_cl import estimate as room
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.estimate import duration, estimate
+from phyradgs_cl.estimate import duration, estimate, shortened
 from phyradgs_cl.reconstructors import method_options
 from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.workflow import load_scan
@@ -59,7 +60,38 @@ def test_time_is_that_of_a_run_whose_iterations_are_alike(rt, scan, clock, metho
     found = estimate(load_scan(scan), method, options, rt)
     assert found.seconds == pytest.approx(2.0 + 0.25 * iterations)
     assert found.iterations == iterations and found.seconds_an_iteration > 0
-    assert sum(clock.iterations) <= 200
+    assert sum(clock.iterations) <= 300
+
+
+def test_a_trial_goes_through_the_whole_schedule() -> None:
+    options = method_options("phyradgs", None, {"iterations": 6000})
+    trial = shortened(options, 200)
+    share = trial.iterations / options.iterations
+    assert trial.control.start_iteration == round(share * options.control.start_iteration)
+    assert trial.parameter_terms_from == round(share * options.parameter_terms_from)
+    assert any(trial.control.is_due(i, 200) for i in range(1, 201))
+    assert replace(trial, iterations=6000, control=options.control, parameter_terms_from=500) == options
+    still = replace(options, control=replace(options.control, every=0))
+    assert shortened(still, 200).control.every == 0
+    assert shortened(options, 9000) == options
+
+
+def test_fast_iterations_are_told_from_noise(rt, scan, monkeypatch) -> None:
+    """A pass of a millisecond: three of them say nothing, hundreds do."""
+    made = Clock(2.0, 0.001)
+    monkeypatch.setattr(room, "time", made)
+    monkeypatch.setattr(room, "reconstruct", made.reconstruct)
+    found = estimate(load_scan(scan), "sirt", method_options("sirt", None, {"iterations": 5000}), rt)
+    assert max(made.iterations) >= 100
+    assert found.seconds == pytest.approx(7.0)
+    assert found.trial_iterations == sum(made.iterations)
+
+
+def test_what_is_around_the_method_counts(rt, scan, clock) -> None:
+    options = method_options("phyradgs", None, {"iterations": 300})
+    found = estimate(load_scan(scan), "phyradgs", options, rt, around=lambda result: 1.5)
+    assert (found.seconds, found.around_s) == (pytest.approx(2.0 + 75 + 1.5), 1.5)
+    assert "1.5 s to read, compare and write" in found.text()
 
 
 def test_what_has_no_iterations_is_run(rt, scan, clock) -> None:
@@ -84,6 +116,29 @@ def test_the_command_says_time_and_memory(cli, scan, capsys, method) -> None:
     assert re.search(r"^time +\S+ (s|min)", text, re.M) and re.search(r"^memory +\d+ MiB", text, re.M)
 
 
+@pytest.mark.parametrize(
+    ("words", "name"), [(["--strips", "2", "--sub-intervals", "1"], "micro"), (["--segments", "2"], "exact")]
+)
+def test_the_words_of_reconstruct(cli, scan, monkeypatch, words, name) -> None:
+    """All that changes how long a run takes can be said to both."""
+    asked = []
+
+    def fake(scan, method, options, rt, before, around):
+        asked.append((options, before))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("phyradgs_cl.commands.estimate.estimate", fake)
+    more = ["--detector-model", "intensity", "--median-filter", "3", "--ignore-lag", "--time-error", "0.01"]
+    cli.run(["estimate", str(scan), *words, *(more if name == "exact" else more[:-2])])
+    options, before = asked[0]
+    assert options.motion.name.startswith(name) and options.detector_model == "intensity"
+    assert (before.median_filter, before.ignore_lag) == (3, True)
+    wanted = (2, 1) if name == "micro" else (2, 0.01)
+    motion = options.motion
+    found = (motion.strips, motion.sub_intervals) if name == "micro" else (motion.segments, motion.time_error)
+    assert found == wanted
+
+
 def test_a_wrong_option_is_named_as_reconstruct_names_it(cli, scan, capsys) -> None:
     assert cli.run(["estimate", str(scan), "--motion", "per-row"]) == 2
     assert "--motion" in capsys.readouterr().err
@@ -105,7 +160,7 @@ def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
         == 0
     )
     text = capsys.readouterr().out
-    assert re.search(r"^splat_forward +6 ", text, re.M) and re.search(r"^splat_backward +5 ", text, re.M)
+    assert re.search(r"^splat_forward +5 ", text, re.M) and re.search(r"^splat_backward +5 ", text, re.M)
     assert "Gpairs/s" in text and "Gflop/s" in text
     assert cli.run(["reconstruct", str(scan), "-o", output, "--iterations", "5"]) == 0
     assert "Gpairs/s" not in capsys.readouterr().out

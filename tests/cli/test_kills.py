@@ -100,7 +100,7 @@ def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
     finally:
         first.kill()
         first.wait()
-    assert second.returncode == 2
+    assert second.returncode == 4
     assert second.stderr.count("\n") == 1 and str(first.pid) in second.stderr and "volume.h5" in second.stderr
 
 

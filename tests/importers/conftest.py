@@ -69,24 +69,25 @@ def image(geometry: ConeGeometry, angle_rad: float) -> np.ndarray:
 
 @pytest.fixture
 def make_truth() -> Callable[..., Truth]:
-    """A factory of scans; ``fly`` turns the gantry on during the exposures (frames show its opening pose)."""
+    """The factory of scans, ``truth``."""
+    return truth
 
-    def make(
-        fly: bool = False, axis: str = "rows", direction: int = 1, geometry: ConeGeometry = GEOMETRY
-    ) -> Truth:
-        angle_rad = np.deg2rad(10.0 + 25.0 * np.arange(FRAMES))
-        frames = np.stack([image(geometry, a) for a in angle_rad]).astype(np.float32)
-        exposure_s, frame_time_s = 0.4, 1.25
-        start_s = np.arange(FRAMES) * frame_time_s
-        arc = np.deg2rad(25.0) * exposure_s / frame_time_s if fly else 0.0
-        shutter = Shutter(exposure_s, 0.3, axis, direction) if fly else Shutter(0.0)
-        sweeps = FrameSweeps(start_s, shutter.exposure_s, angle_rad, angle_rad + arc)
-        orbit = CircularOrbit(geometry, sweeps)
-        reference = BALLS.voxelise(GRID)
-        scan = Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference)
-        return Truth(scan, angle_rad)
 
-    return make
+def truth(
+    fly: bool = False, axis: str = "rows", direction: int = 1, geometry: ConeGeometry = GEOMETRY
+) -> Truth:
+    """A scan; ``fly`` turns the gantry on during the exposures (frames show its opening pose)."""
+    angle_rad = np.deg2rad(10.0 + 25.0 * np.arange(FRAMES))
+    frames = np.stack([image(geometry, a) for a in angle_rad]).astype(np.float32)
+    exposure_s, frame_time_s = 0.4, 1.25
+    start_s = np.arange(FRAMES) * frame_time_s
+    arc = np.deg2rad(25.0) * exposure_s / frame_time_s if fly else 0.0
+    shutter = Shutter(exposure_s, 0.3, axis, direction) if fly else Shutter(0.0)
+    sweeps = FrameSweeps(start_s, shutter.exposure_s, angle_rad, angle_rad + arc)
+    orbit = CircularOrbit(geometry, sweeps)
+    reference = BALLS.voxelise(GRID)
+    scan = Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference)
+    return Truth(scan, angle_rad)
 
 
 @pytest.fixture

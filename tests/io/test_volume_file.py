@@ -10,8 +10,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import file_kind, read_volume, sha256_of, volume_summary, write_volume
-from phyradgs_cl.phantoms.from_file import load_volume
+from phyradgs_cl.io import file_kind, load_volume, read_volume, sha256_of, volume_summary, write_volume
 
 GRID = Grid((2, 3, 4), (1.5, 1.25, 1.0), (0.1, -0.2, 0.3))
 PROVENANCE = {"method": "fdk", "seed": 7, "options": {"filter": "ram-lak", "M": [1, 2]}, "loss": float("inf")}

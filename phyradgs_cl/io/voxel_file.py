@@ -1,4 +1,4 @@
-"""A voxel phantom from an HDF5 file: a bare `volume`, or one of this package's volume files."""
+"""Voxels of any origin from an HDF5 file: a bare `volume`, or one of this package's volume files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io.datasets import read_attribute, read_values
+from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 
 _BARE = "/volume"
 _ENTRY = "/entry/reconstruction"
@@ -32,38 +34,29 @@ def load_volume(path: str | Path) -> LoadedVolume:
     `x` in mm beside it. Negative values are allowed: real reconstructions have them.
 
     Raises:
-        InputError: no such file, not HDF5, no such dataset, not 3D, empty, not numbers, NaN or
-            infinity, axes that do not fit; names the file and the dataset.
+        InputError: no such file, not HDF5, no such dataset, not 3D, empty, not numbers, NaN or infinity, larger than
+            the file can hold, kept in another file, axes that do not fit; names the file and the dataset.
     """
-    file = Path(path)
-    if not file.is_file():
-        raise InputError(str(file), "no such file", "an HDF5 file", "check the path")
-    try:
-        handle = h5py.File(file, "r")
-    except OSError as error:
-        raise InputError(str(file), f"not readable as HDF5 ({error})", "an HDF5 file") from error
-    with handle:
-        name = _dataset_name(handle, file)
-        volume = _read(handle, name, f"{file}:{name}")
-        grid = _read_grid(handle, file, volume.shape) if name != _BARE else None
+    with open_hdf5(path) as source:
+        name = _dataset_name(source)
+        volume = _read(source, name)
+        grid = _read_grid(source, volume.shape) if name != _BARE else None
     return LoadedVolume(volume, grid)
 
 
-def _dataset_name(handle: h5py.File, file: Path) -> str:
+def _dataset_name(source: Hdf5Source) -> str:
     for name in (_BARE, f"{_ENTRY}/volume"):
-        if isinstance(handle.get(name), h5py.Dataset):
+        if isinstance(source.find(name), h5py.Dataset):
             return name
-    found = "root members " + (", ".join(sorted(handle)) or "none")
-    raise InputError(str(file), found, f"a 3D dataset {_BARE} or {_ENTRY}/volume")
+    found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
+    raise InputError(str(source.path), found, f"a 3D dataset {_BARE} or {_ENTRY}/volume")
 
 
-def _read(handle: h5py.File, name: str, culprit: str) -> NDArray[np.float32]:
-    dataset = handle[name]
+def _read(source: Hdf5Source, name: str) -> NDArray[np.float32]:
+    dataset, culprit = source.dataset(name), source.name(name)
     if dataset.ndim != 3 or 0 in dataset.shape:
         raise InputError(culprit, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
-    if dataset.dtype.kind not in "iuf":
-        raise InputError(culprit, f"type {dataset.dtype}", "integers or real floating-point numbers")
-    raw = _values(dataset, culprit)
+    raw = read_values(source, name, dataset)
     if raw.dtype.kind in "iu":
         return (raw / np.float32(np.iinfo(raw.dtype).max)).astype(np.float32)
     with np.errstate(over="ignore"):
@@ -76,15 +69,8 @@ def _read(handle: h5py.File, name: str, culprit: str) -> NDArray[np.float32]:
     return volume
 
 
-def _values(dataset: h5py.Dataset, culprit: str) -> NDArray[np.generic]:
-    try:
-        return np.asarray(dataset[()])
-    except OSError as error:  # a truncated file, or a compression filter that is not installed
-        raise InputError(culprit, f"data that cannot be read ({error})", "a complete dataset") from error
-
-
-def _read_grid(handle: h5py.File, file: Path, shape: tuple[int, ...]) -> Grid:
-    axes = [_read_axis(handle, file, f"{_ENTRY}/{axis}", n) for axis, n in zip("zyx", shape, strict=True)]
+def _read_grid(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
+    axes = [_read_axis(source, f"{_ENTRY}/{axis}", n) for axis, n in zip("zyx", shape, strict=True)]
     # One voxel along an axis has no spacing of its own: take that of the axis that has one.
     known = [s for _, s in axes if s is not None]
     sizes = tuple(s if s is not None else (known[0] if known else 1.0) for _, s in axes)
@@ -92,25 +78,21 @@ def _read_grid(handle: h5py.File, file: Path, shape: tuple[int, ...]) -> Grid:
     return Grid((nz, ny, nx), (sizes[0], sizes[1], sizes[2]), (axes[0][0], axes[1][0], axes[2][0]))
 
 
-def _read_axis(handle: h5py.File, file: Path, name: str, count: int) -> tuple[float, float | None]:
+def _read_axis(source: Hdf5Source, name: str, count: int) -> tuple[float, float | None]:
     """Centre and spacing in mm of an axis of voxel centres; the spacing is None for a single voxel."""
-    culprit = f"{file}:{name}"
-    dataset = handle.get(name)
-    if not isinstance(dataset, h5py.Dataset) or dataset.shape != (count,) or dataset.dtype.kind not in "iuf":
+    culprit, dataset = source.name(name), source.optional(name)
+    if dataset is None or dataset.shape != (count,):
         found = getattr(dataset, "shape", "nothing")
         raise InputError(culprit, str(found), f"{count} voxel centres in mm")
-    axis = np.asarray(_values(dataset, culprit), dtype=np.float64)
-    unit = _text(dataset.attrs.get("units", "mm"))
+    axis = read_values(source, name, dataset).astype(np.float64)
+    unit = read_attribute(source, name, "units") or "mm"
     if unit != "mm":
         raise InputError(culprit, f"units {unit!r}", "units 'mm'")
     if count == 1 and np.isfinite(axis[0]):
         return float(axis[0]), None
-    spacing = (axis[-1] - axis[0]) / (count - 1) if count > 1 else np.nan
-    straight = np.abs(np.diff(axis) - spacing) <= _AXIS_TOLERANCE * abs(spacing)
+    with np.errstate(all="ignore"):  # ends at infinity are found below
+        spacing = (axis[-1] - axis[0]) / (count - 1) if count > 1 else np.nan
+        straight = np.abs(np.diff(axis) - spacing) <= _AXIS_TOLERANCE * abs(spacing)
     if not (np.isfinite(spacing) and spacing > 0 and straight.all()):
         raise InputError(culprit, "values that are not evenly rising", "voxel centres at even distances")
     return float(axis[0] + axis[-1]) / 2, float(spacing)
-
-
-def _text(value: object) -> str:
-    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)

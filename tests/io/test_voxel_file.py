@@ -10,7 +10,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
-from phyradgs_cl.phantoms import load_volume
+from phyradgs_cl.io import load_volume
 
 
 def _write(path: Path, data: object, name: str = "volume") -> Path:
@@ -58,9 +58,9 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none.h5: found no such file"):
         load_volume(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("not a volume")
-    with pytest.raises(InputError, match=r"text.h5: found not readable as HDF5"):
+    with pytest.raises(InputError, match=r"text.h5: found a file that is not HDF5"):
         load_volume(tmp_path / "text.h5")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="found a folder"):
         load_volume(tmp_path)
 
 

@@ -1,0 +1,142 @@
+"""Peak memory of host and device by method, and what `phyradgs estimate` says beside what then happens.
+
+    python benchmarks/estimate_check.py [--quick] [--size 64] [--methods phyradgs,r2,sirt] [--device D] [--json FILE]
+
+Estimate and run are processes of their own, one after the other. Ratios are said over happened, for the wall time of the
+whole process (its start, reading, writing and comparing too), the largest resident memory, and the most that was held in
+device buffers.
+On a CPU the resident memory has the buffers in it. --estimates no measures the runs alone: memory by method.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from measuring import Facts, child, finish, median, parser_of, where
+
+from phyradgs_cl.acquisition import ConeGeometry, make_protocol
+from phyradgs_cl.api import save_scan
+from phyradgs_cl.estimate import estimate, peak_host_bytes, seconds_around, seconds_since_start
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors import method_options
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+from phyradgs_cl.workflow import ReconstructionJob, load_scan, run_reconstruction
+
+RUNS: dict[str, tuple[str, Facts]] = {
+    "fdk": ("fdk", {}),
+    "sart": ("sart", {}),
+    "sirt": ("sirt", {}),
+    "sirt per-row": ("sirt", {"motion": "per-row"}),
+    "cgls": ("cgls", {}),
+    "asd-pocs": ("asd-pocs", {}),
+    "fista-tv": ("fista-tv", {}),
+    "r2": ("r2", {}),
+    "phyradgs static": ("phyradgs", {"motion": "static"}),
+    "phyradgs 8x5": ("phyradgs", {"motion": "micro-views"}),
+    "phyradgs": ("phyradgs", {}),
+}
+
+
+def make_scan(path: Path, size: int, device: str | None) -> None:
+    rt, detector = Runtime(device), 2 * size
+    geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
+    scene = phantom_scene(rt, "foot", geometry, Grid.cube(size, 2.0), size, "rows", 0)
+    options = SimulationOptions(protocol=make_protocol("rapid"), noise="tigre")
+    save_scan(path, simulate(scene.source, geometry, scene.grid, options, reference=scene.reference))
+
+
+def said(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
+    """What an estimate says, in this process."""
+    method, changes = changed(name, iterations)
+    loaded, rt = load_scan(scan), Runtime(device)
+    before_s = seconds_since_start()
+    found = estimate(
+        loaded,
+        method,
+        method_options(method, None, changes),
+        rt,
+        around=lambda result: before_s + seconds_around(scan, loaded, result),
+    )
+    return {
+        "seconds": found.seconds,
+        "host_bytes": found.host_bytes,
+        "device_bytes": found.device_bytes,
+        "trial_seconds": found.trial_seconds,
+    }
+
+
+def happened(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
+    """What a run takes, in this process."""
+    method, changes = changed(name, iterations)
+    rt = Runtime(device)
+    job = ReconstructionJob(scan, scan.with_name("volume.h5"), method=method, changes=changes)
+    result, metrics = run_reconstruction(job, lambda: rt, lambda progress: None)
+    return {
+        "method_seconds": result.facts["seconds"],
+        "host_bytes": peak_host_bytes(),
+        "device_bytes": rt.peak_bytes,
+        "gaussians": result.facts.get("gaussians", 0),
+        "psnr_db": metrics["psnr_db"],
+    }
+
+
+def changed(name: str, iterations: int | None) -> tuple[str, Facts]:
+    method, changes = RUNS[name]
+    more = {} if iterations is None or method == "fdk" else {"iterations": iterations}
+    return method, {**changes, **more}
+
+
+def one(name: str, scan: Path, words: list[str], with_estimate: bool) -> Facts:
+    line: Facts = {"method": name}
+    if with_estimate:
+        line["said"] = child(__file__, "--child", "said", str(scan), name, *words)
+    begun = time.perf_counter()
+    line["happened"] = child(__file__, "--child", "happened", str(scan), name, *words)
+    line["happened"]["seconds"] = time.perf_counter() - begun  # type: ignore[index]
+    if with_estimate:
+        keys = ("seconds", "host_bytes", "device_bytes")
+        line["ratio"] = {key: line["said"][key] / max(line["happened"][key], 1e-9) for key in keys}  # type: ignore[index]
+    return line
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--methods", default=",".join(RUNS))
+    parser.add_argument("--iterations", type=int, default=None, help="else each method's own")
+    parser.add_argument("--estimates", choices=("yes", "no"), default="yes")
+    parser.add_argument("--child", nargs=3, default=None, metavar=("WHAT", "SCAN", "METHOD"))
+    arguments = parser.parse_args()
+    if arguments.child:
+        what, scan, name = arguments.child
+        call = said if what == "said" else happened
+        print(json.dumps(call(Path(scan), name, arguments.device, arguments.iterations)))
+        return
+    if arguments.quick:
+        arguments.size, arguments.iterations = 16, arguments.iterations or 4
+    names = arguments.methods.split(",")
+    if unknown := set(names) - set(RUNS):
+        sys.exit(f"no such method: {', '.join(sorted(unknown))}; there are {', '.join(RUNS)}")
+    words = ["--device", arguments.device] if arguments.device else []
+    words += ["--iterations", str(arguments.iterations)] if arguments.iterations else []
+    facts = where(Runtime(arguments.device)) | {"size": arguments.size}
+    with tempfile.TemporaryDirectory() as folder:
+        scan = Path(folder) / "scan.h5"
+        make_scan(scan, arguments.size, arguments.device)
+        lines = [one(name, scan, words, arguments.estimates == "yes") for name in names]
+    facts["runs"] = lines
+    if arguments.estimates == "yes":
+        ratios: list[dict[str, float]] = [line["ratio"] for line in lines]  # type: ignore[misc]
+        facts["median_ratio"] = {key: median([r[key] for r in ratios]) for key in ratios[0]}
+        within = [abs(r["seconds"] - 1) <= 0.3 for r in ratios]
+        facts["time_within_30_percent"] = f"{sum(within)} of {len(within)}"
+    finish(facts, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

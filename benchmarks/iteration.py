@@ -1,0 +1,107 @@
+"""Where the time of one iteration goes: binning, forward, loss, backward, TV, Adam, density control, gaps of the host.
+
+    python benchmarks/iteration.py [--quick] [--size 128] [--gaussians 50000] [--rounds 5] [--device D] [--json FILE]
+
+Kernel times are OpenCL events, the rest is the host's clock. Motions take turns, round by round; medians over rounds of
+the mean iteration. "gaps" is what an iteration takes beyond its kernels: launches, copies, Python. Density control is one
+round of it, on the host, and counts with a hundredth an iteration (control.every).
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from measuring import Facts, finish, median, parser_of, where
+from splat_speed import fly_scan
+
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splat_run import SplatRun
+from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
+from phyradgs_cl.runtime import Runtime
+
+MOTIONS = {"static": Motion("static"), "8x5": Motion("micro-views", 8, 5), "exact": Motion("exact")}
+STAGES = {
+    "prepare": ("splat_prepare",),
+    "binning": ("bin_count", "bin_within", "bin_starts", "bin_fill"),  # the sub-volume of TV is binned too
+    "forward": ("splat_forward", "intensity_merge"),
+    "loss": ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient", "intensity_split"),
+    "backward": ("splat_backward", "splat_chain"),
+    "tv": ("voxel_prepare", "voxel_forward", "total_variation", "voxel_backward", "voxel_chain"),
+    "adam": ("activate", "chain_activations", "adam_step"),
+}
+
+
+def make_run(rt: Runtime, scan: Scan, motion: Motion, count: int) -> SplatRun:
+    fdk = static_fdk(rt, scan)
+    scale = internal_scale(fdk, scan.grid)
+    grid = scan.grid.scaled(1 / scale.length_mm)
+    options, rng = SplatOptions(motion=motion, gaussians=count), np.random.default_rng(0)
+    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
+    return SplatRun(rt, scan, options, scale, population, rng)
+
+
+def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
+    """Milliseconds an iteration, by stage."""
+    rt.kernel_seconds()
+    started = time.perf_counter()
+    for _ in range(iterations):
+        run.step()
+    rt.finish()
+    wall_s = time.perf_counter() - started
+    kernels = rt.kernel_seconds()
+    known = {name for names in STAGES.values() for name in names}
+    seconds = {stage: sum(kernels.get(name, 0.0) for name in names) for stage, names in STAGES.items()}
+    seconds["other kernels"] = sum(s for name, s in kernels.items() if name not in known)
+    seconds["gaps"] = wall_s - sum(kernels.values())
+    seconds["iteration"] = wall_s
+    return {stage: 1e3 * s / iterations for stage, s in seconds.items()}
+
+
+def control_ms(run: SplatRun) -> float:
+    """One round of density control, which leaves the run with another cloud."""
+    started = time.perf_counter()
+    run._control_density()
+    run.rt.finish()
+    return 1e3 * (time.perf_counter() - started)
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument(
+        "--size", type=int, default=128, help="voxels a side; the panel has twice as many pixels"
+    )
+    parser.add_argument("--gaussians", type=int, default=50_000)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--iterations", type=int, default=10, help="in a round")
+    arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.size, arguments.gaussians, arguments.rounds, arguments.iterations = 24, 800, 1, 2
+    rt = Runtime(arguments.device, profile=True)
+    facts: Facts = where(rt) | {"size": arguments.size, "gaussians": arguments.gaussians}
+    scan = fly_scan(rt, 2 * arguments.size)
+    runs = {name: make_run(rt, scan, motion, arguments.gaussians) for name, motion in MOTIONS.items()}
+    for run in runs.values():
+        one_round(rt, run, 3)
+    rounds: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
+    for _ in range(arguments.rounds):
+        for name, run in runs.items():
+            rounds[name].append(one_round(rt, run, arguments.iterations))
+    motions: dict[str, dict[str, float]] = {}
+    for name, found in rounds.items():
+        motions[name] = {stage: round(median([f[stage] for f in found]), 4) for stage in found[0]}
+        motions[name]["kernel_share"] = round(1 - median([f["gaps"] / f["iteration"] for f in found]), 4)
+        motions[name]["density_control_round"] = round(control_ms(runs[name]), 3)
+        motions[name]["density_control"] = motions[name]["density_control_round"] / 100
+    facts["ms"] = motions
+    facts["over_static"] = {n: m["iteration"] / motions["static"]["iteration"] for n, m in motions.items()}
+    finish(facts, arguments.json)
+    print("| stage | " + " | ".join(motions) + " |\n|---" + "|---" * len(motions) + "|")
+    for stage in motions["static"]:
+        print(f"| {stage} | " + " | ".join(f"{m[stage]:.3g}" for m in motions.values()) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""PSNR against seconds for naf, sax-nerf and phyradgs, static and with motion known: lines of JSON, then a figure.
+
+    python benchmarks/neural_time.py run VOLUMES RESULTS.jsonl [--names cthead,walnut] [--size 64] [--methods a,b] ...
+    python benchmarks/neural_time.py draw RESULTS.jsonl FIGURE.png
+
+Scans are those of quality.py. A run's volume is scored on the way, each time that a tenth more time has passed; scoring
+(and the volume that it needs) is not counted. Seconds begin with the call: FDK and kernel builds are in them. A run is in
+the file once it is done; what the file has is not run again. Run it on a quiet machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from quality import append, file_for, make_scan, read_lines
+
+from phyradgs_cl import __version__
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.metrics import compare
+from phyradgs_cl.reconstructors import Progress, method_options, reconstruct
+from phyradgs_cl.runtime import Runtime
+
+METHODS = {
+    "naf": ("naf", {}),
+    "naf per-row": ("naf", {"motion": "per-row"}),
+    "sax-nerf": ("sax-nerf", {}),
+    "sax-nerf per-row": ("sax-nerf", {"motion": "per-row"}),
+    "phyradgs static": ("phyradgs", {"motion": "static"}),
+    "phyradgs exact": ("phyradgs", {"motion": "exact"}),
+}
+KEY = ("volume", "method", "size", "seed", "factor")
+_SPACING = 1.1
+
+
+class Scores:
+    """A report that scores the present volume now and then, and keeps a clock that stands still meanwhile."""
+
+    def __init__(self, reference: np.ndarray) -> None:
+        self.reference = reference
+        self.points: list[dict[str, float]] = []
+        self._started, self._scoring_s, self._due_s = time.perf_counter(), 0.0, 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        begun = time.perf_counter()
+        seconds = begun - self._started - self._scoring_s
+        if (
+            seconds >= self._due_s
+            and progress.volume is not None
+            and progress.iteration < progress.iterations
+        ):
+            self._add(progress.iteration, seconds, progress.volume()[0])
+            self._due_s = _SPACING * seconds
+        self._scoring_s += time.perf_counter() - begun
+
+    def finish(self, iteration: int, volume: np.ndarray) -> None:
+        """The result of the run."""
+        self._add(iteration, time.perf_counter() - self._started - self._scoring_s, volume)
+
+    def _add(self, iteration: int, seconds: float, volume: np.ndarray) -> None:
+        metrics = compare(volume, self.reference)
+        point = {"iteration": iteration, "seconds": round(seconds, 3)}
+        self.points.append({**point, "psnr_db": metrics["psnr_db"], "ssim": metrics["ssim"]})
+
+
+def run_one(rt: Runtime, scan: Scan, label: str, factor: float, seed: int) -> dict[str, object]:
+    """The scores of one run; ``factor``: iterations as a multiple of the default's."""
+    method, changes = METHODS[label]
+    iterations = max(round(factor * method_options(method).iterations), 1)
+    options = method_options(method, None, {**changes, "iterations": iterations})
+    assert scan.reference is not None
+    scores = Scores(scan.reference)
+    result = reconstruct(scan, method, rt, options, seed=seed, report=scores)
+    scores.finish(iterations, result.volume)
+    return {
+        "points": scores.points,
+        "iterations": iterations,
+        "device": rt.device.name,
+        "torch_device": result.facts.get("torch_device"),
+        "torch_version": result.facts.get("torch_version"),
+        "cpu": platform.processor() or platform.machine(),
+        "version": __version__,
+        "options": str(result.facts["options"]),
+    }
+
+
+def run_all(arguments: argparse.Namespace) -> None:
+    rt = Runtime(arguments.device)
+    results = Path(arguments.results)
+    done = {tuple(line[name] for name in KEY) for line in read_lines(results)}
+    for name in arguments.names.split(","):
+        scan: Scan | None = None
+        for label in arguments.methods.split(","):
+            for factor in (float(text) for text in arguments.factors.split(",")):
+                values = (name, label, arguments.size, arguments.seed, factor)
+                if values in done:
+                    continue
+                path = file_for(Path(arguments.volumes), name, arguments.size)
+                scan = scan or make_scan(rt, path, arguments, arguments.seed)
+                facts = dict(zip(KEY, values, strict=True))
+                append(results, {**facts, **run_one(rt, scan, label, factor, arguments.seed)})
+
+
+def draw(lines: Sequence[dict], path: Path) -> None:
+    """A panel a volume; a line a method, from its longest run, and a dot at the end of every run."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    names = sorted({str(line["volume"]) for line in lines})
+    labels = [label for label in METHODS if any(line["method"] == label for line in lines)]
+    colours = dict(zip(("naf", "sax-nerf", "phyradgs"), ("tab:blue", "tab:green", "tab:orange"), strict=True))
+    figure, axes = plt.subplots(
+        1, len(names), figsize=(5 * len(names), 3.8), squeeze=False, layout="constrained"
+    )
+    for panel, name in zip(axes[0], names, strict=True):
+        for label in labels:
+            runs = [line for line in lines if (line["volume"], line["method"]) == (name, label)]
+            for run in sorted(runs, key=lambda run: run["factor"]):
+                seconds, psnr = ([point[key] for point in run["points"]] for key in ("seconds", "psnr_db"))
+                colour = colours[METHODS[label][0]]
+                is_static = METHODS[label][1].get("motion", "static") == "static"
+                is_longest = run["factor"] == max(run["factor"] for run in runs)
+                style = "--" if is_static else "-"
+                panel.plot(
+                    seconds,
+                    psnr,
+                    style,
+                    color=colour,
+                    alpha=1.0 if is_longest else 0.4,
+                    label=label if is_longest else None,
+                )
+                panel.plot(seconds[-1], psnr[-1], "o", color=colour, ms=4)
+        panel.set(xscale="log", xlabel="seconds", ylabel="PSNR (dB)", title=name)
+        panel.grid(alpha=0.3)
+    axes[0][0].legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    run = commands.add_parser("run")
+    run.add_argument("volumes", help="folder of volumes")
+    run.add_argument("results", help="JSON lines, appended to")
+    run.add_argument("--names", default="cthead,walnut")
+    run.add_argument("--methods", default=",".join(METHODS))
+    run.add_argument("--factors", default="1", help="iterations as multiples of the defaults, e.g. 0.25,1,4")
+    run.add_argument("--size", type=int, default=64)
+    run.add_argument("--axis", default="rows")
+    run.add_argument("--protocol", default="rapid")
+    run.add_argument("--seed", type=int, default=0)
+    run.add_argument("--device", default=None)
+    run.set_defaults(do=run_all)
+    picture = commands.add_parser("draw")
+    picture.add_argument("results")
+    picture.add_argument("figure")
+    picture.set_defaults(do=lambda a: draw(read_lines(Path(a.results)), Path(a.figure)))
+    arguments = parser.parse_args()
+    arguments.do(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""Are the views spread over the turn?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.timing import azimuth_rad
+
+_WIDE = 3.0  # times the median step
+_SAME_RAD = 1e-6
+_QUESTION = "angles"
+
+
+def check_angles(scan: Scan) -> Finding:
+    """The largest gap between neighbouring views, against three times the usual one; a short scan may leave its own gap.
+
+    Views that cover half a turn and the fan (or more) leave one gap that is no fault; less is one whatever the steps.
+    """
+    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
+    poses = np.stack([scan.trajectory.pose(f, middle_s[f : f + 1])[0] for f in range(scan.frames)])
+    angles_rad = np.sort(azimuth_rad(poses) % (2 * np.pi))
+    gaps_deg = np.rad2deg(np.diff(angles_rad, append=angles_rad[0] + 2 * np.pi))
+    apart_deg = gaps_deg[gaps_deg > math.degrees(_SAME_RAD)]
+    if apart_deg.size < 3:
+        text, advice = f"{apart_deg.size} different angles", "check rotation_angle and its unit (degrees)"
+        return Finding(_QUESTION, SUSPICIOUS, float(apart_deg.size), 3.0, "angles", text, advice)
+    usual_deg = float(np.median(apart_deg))
+    widest = np.sort(apart_deg)[::-1]
+    covered_deg, needed_deg = 360 - float(widest[0]), 180 + 2 * _half_fan_deg(scan)
+    is_short = widest[0] > _WIDE * usual_deg
+    if is_short and covered_deg < needed_deg - 1:
+        text = f"views cover {covered_deg:.4g}°, half a turn and the fan are {needed_deg:.4g}°"
+        advice = "expect streaks along the missing directions; check rotation_angle, its unit and its sign"
+        return Finding(_QUESTION, SUSPICIOUS, covered_deg, needed_deg, "degrees", text, advice)
+    gap_deg = float(widest[1] if is_short else widest[0])
+    text = f"{apart_deg.size} angles over {covered_deg:.4g}°, usually {usual_deg:.3g}° apart, at most {gap_deg:.3g}°"
+    if gap_deg <= _WIDE * usual_deg:
+        return Finding(_QUESTION, OK, gap_deg, _WIDE * usual_deg, "degrees", text)
+    advice = "are frames missing, or angles mixed up? Leave out what is not to be trusted (image_key 3)"
+    return Finding(_QUESTION, SUSPICIOUS, gap_deg, _WIDE * usual_deg, "degrees", text, advice)
+
+
+def _half_fan_deg(scan: Scan) -> float:
+    """Half the fan that the reconstruction's box takes, no more than the panel sees."""
+    geometry = scan.geometry
+    seen = math.atan2(
+        geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm
+    )
+    radius_mm = max(scan.grid.size_mm[1:]) / 2
+    taken = math.asin(min(1.0, radius_mm / geometry.source_to_axis_mm))
+    return math.degrees(min(seen, taken))

@@ -1,0 +1,64 @@
+"""Does the detector cover the object?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.detector import noise_level
+
+_LARGEST_SHARE = 0.1  # of the largest line integral
+_DISPLACED = 0.1  # of the panel's width: from here a panel is shifted on purpose
+_NOISES = 4.0
+_FRAMES = 0.1  # of all: how many may touch a border
+_QUESTION = "coverage"
+
+
+def check_coverage(scan: Scan) -> Finding:
+    """What the panel's side columns see, against a tenth of the largest line integral.
+
+    A border counts as touched where the mean over a few neighbouring rows of its two outermost columns is above the
+    threshold and above the noise, in a tenth of the frames. A displaced panel may cut the object on its short side.
+    Rows are not asked: objects longer than the panel are the rule.
+    """
+    p = np.asarray(scan.projections)
+    if p.shape[2] < 8:
+        return Finding(_QUESTION, CANNOT_TELL, 0.0, 0.0, "line integral", "fewer than 8 columns")
+    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, p.shape)
+    largest = float(np.percentile(p if valid is None else p[valid], 99.9))
+    threshold = max(_LARGEST_SHARE * largest, _NOISES * noise_level(p, valid))
+    sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
+    allowed = _cut_on_purpose(scan)
+    asked = {name: level for name, level in sides.items() if name != allowed}
+    name, level = max(asked.items(), key=lambda item: item[1])
+    text = f"at most {level:.3g} at the {name} border, where air is 0 and the object reaches {largest:.3g}"
+    if level <= threshold:
+        return Finding(_QUESTION, OK, level, threshold, "line integral", text)
+    advice = (
+        "the object reaches beyond the panel (or air is not 0: check the flats). Expect a bright rim; FDK suffers most, "
+        "iterative methods less with a grid that holds the whole object"
+    )
+    return Finding(_QUESTION, SUSPICIOUS, level, threshold, "line integral", text, advice)
+
+
+def _border(p: np.ndarray, valid: np.ndarray | None, columns: slice) -> float:
+    """The largest mean over eight rows of the border's columns, in the frame at the 90th percentile."""
+    edge = p[:, :, columns]
+    weight = np.ones(edge.shape) if valid is None else valid[:, :, columns].astype(float)
+    rows = max(1, edge.shape[1] // 8)
+    starts = np.arange(0, edge.shape[1], rows)
+    total = np.add.reduceat((edge * weight).sum(2), starts, axis=1)
+    count = np.add.reduceat(weight.sum(2), starts, axis=1)
+    means = np.where(count > 0, total / np.maximum(count, 1), 0).max(1)
+    return float(np.percentile(means, 100 * (1 - _FRAMES)))
+
+
+def _cut_on_purpose(scan: Scan) -> str | None:
+    """The side on which a displaced panel is short of the axis."""
+    geometry = scan.geometry
+    offset_mm = geometry.detector_offset_mm[1]
+    width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1]
+    if abs(offset_mm) < _DISPLACED * width_mm:
+        return None
+    return "left" if offset_mm > 0 else "right"

@@ -1,0 +1,68 @@
+"""Are there pixels that say the same in every frame, or always something other than their neighbours?"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import maximum_filter, median_filter, minimum_filter
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+
+_DEVIATIONS = 10.0
+_NORMAL_MAD = 1.4826
+_SHARE = 2e-4  # of the panel's pixels
+_LEAST_FRAMES = 5
+_MOST_TIMES = 0.7  # of the frames
+_MOST_FRAMES = 40
+_QUESTION = "dead pixels"
+
+
+def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
+    """The share of pixels that are dead and not masked, against 0.02 %; and where they are (v, u) bool.
+
+    Dead is a pixel that never changes while those around it do, or one that lies beyond all its neighbours in 70 % of the
+    frames, its median distance from the median of 3 × 3 pixels being more than ten of the panel's usual deviations.
+    """
+    known = _masked(scan)
+    if scan.frames < _LEAST_FRAMES:
+        text = f"fewer than {_LEAST_FRAMES} frames"
+        return Finding(_QUESTION, CANNOT_TELL, 0.0, _SHARE, "share of pixels", text), np.zeros(
+            known.shape, bool
+        )
+    chosen = np.unique(np.linspace(0, scan.frames - 1, _MOST_FRAMES).round().astype(int))
+    frames = np.asarray(scan.projections)[chosen]
+    dead = (_constant(frames) | _apart(frames)) & ~known
+    share = float(dead.sum() / max(int((~known).sum()), 1))
+    text = f"{int(dead.sum())} pixels ({100 * share:.2g} %) that the mask does not have"
+    if share <= _SHARE:
+        return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text), dead
+    row, column = (int(i[0]) for i in np.nonzero(dead))
+    text += f", the first at row {row}, column {column}"
+    advice = "add them to pixel_mask: phyradgs reconstruct then leaves them out"
+    return Finding(_QUESTION, SUSPICIOUS, share, _SHARE, "share of pixels", text, advice), dead
+
+
+def _masked(scan: Scan) -> np.ndarray:
+    """Pixels (v, u) that are masked in every frame."""
+    if scan.pixel_mask is None:
+        return np.zeros(scan.geometry.detector_shape, bool)
+    mask = np.asarray(scan.pixel_mask) != 0
+    return mask if mask.ndim == 2 else mask.all(0)
+
+
+def _constant(frames: np.ndarray) -> np.ndarray:
+    swing = np.ptp(frames, axis=0)
+    return (swing == 0) & (median_filter(swing, size=3) > 0)
+
+
+def _apart(frames: np.ndarray) -> np.ndarray:
+    """Pixels beyond all their neighbours in most frames, by far: edges of the object pass, or have neighbours alike."""
+    ring = np.ones((3, 3), bool)
+    ring[1, 1] = False
+    above = np.mean([frame > maximum_filter(frame, footprint=ring) for frame in frames], axis=0)
+    below = np.mean([frame < minimum_filter(frame, footprint=ring) for frame in frames], axis=0)
+    apart = np.median([frame - median_filter(frame, size=3) for frame in frames], axis=0)
+    usual = _NORMAL_MAD * float(np.median(np.abs(apart - np.median(apart))))
+    floor = 1e-3 * float(np.percentile(frames, 99.9))
+    far = np.abs(apart - np.median(apart)) > _DEVIATIONS * max(usual, floor, 1e-12)
+    return far & (np.maximum(above, below) > _MOST_TIMES)

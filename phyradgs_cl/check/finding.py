@@ -1,0 +1,30 @@
+"""What a check found: one answer a question, with the number it rests on."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The answer to one question.
+
+    verdict: ``ok``, ``suspicious`` or ``cannot tell``. value: what was measured, in ``unit``; threshold: where it
+    becomes suspicious, in the same unit. text: what was found, advice: what to do about it (empty where nothing is).
+    uncertainty: standard deviation of ``value``, where it is an estimate.
+    """
+
+    question: str
+    verdict: str
+    value: float
+    threshold: float
+    unit: str
+    text: str
+    advice: str = ""
+    uncertainty: float | None = None
+
+    def facts(self) -> dict[str, object]:
+        """The fields as plain values, for JSON."""
+        return asdict(self)

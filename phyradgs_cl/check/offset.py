@@ -1,0 +1,74 @@
+"""Where is the axis of rotation on the panel?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.residual import fitted
+from phyradgs_cl.check.statistics import vertex
+from phyradgs_cl.check.variants import Path, shifted
+from phyradgs_cl.runtime import Runtime
+
+_SEARCH = (-2.0, -1.0, 0.0, 1.0, 2.0)  # coarse pixels
+_SEARCH_ITERATIONS = 6
+_STEP = 0.25  # coarse pixels
+_MOST_STEPS = 8
+_TOLERATED = 0.2  # coarse pixels
+_LEAST_TOLERATED = 0.5  # pixels
+_DEVIATIONS = 4.0
+_QUESTION = "centre of rotation"
+
+
+@dataclass(frozen=True, eq=False)
+class Offset:
+    """A shift of the panel in pixels of the scan, its standard deviation, and the residuals (F,) of the nearest trial."""
+
+    pixels: float
+    spread: float
+    residuals: np.ndarray
+
+
+def best_offset(rt: Runtime, scan: Scan) -> Offset:
+    """The shift of the panel along u, within two coarse pixels, that explains a coarse ``scan`` best.
+
+    A coarse search, then a parabola through three neighbouring shifts; ``spread`` is NaN where there is no minimum.
+    """
+    block = scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
+    coarse = [float(fitted(rt, shifted(scan, block * s), _SEARCH_ITERATIONS).sum()) for s in _SEARCH]
+    centre = _SEARCH[int(np.argmin(coarse))]
+    known: dict[float, np.ndarray] = {}
+
+    def at(shift: float) -> np.ndarray:
+        if shift not in known:
+            known[shift] = fitted(rt, shifted(scan, block * shift))
+        return known[shift]
+
+    for _ in range(_MOST_STEPS):
+        trials = [centre - _STEP, centre, centre + _STEP]
+        lowest = int(np.argmin([at(s).sum() for s in trials]))
+        if lowest == 1:
+            break
+        centre = trials[lowest]
+    around = np.array([centre - _STEP, centre, centre + _STEP])
+    found, spread = vertex(around, np.stack([at(s) for s in around]))
+    return Offset(block * found, block * spread, at(centre))
+
+
+def check_offset(offset: Offset, block: int, pitch_mm: float) -> Finding:
+    """The shift against half a pixel, a fifth of a coarse pixel of ``block``, and four standard deviations."""
+    threshold = max(_LEAST_TOLERATED, _TOLERATED * block, _DEVIATIONS * offset.spread)
+    if not (math.isfinite(offset.pixels) and math.isfinite(offset.spread)):
+        return Finding(_QUESTION, CANNOT_TELL, 0.0, _LEAST_TOLERATED, "pixels", "no shift fits best")
+    shift_mm = offset.pixels * pitch_mm
+    text = f"the panel is {offset.pixels:+.2f} ± {offset.spread:.2f} pixels ({shift_mm:+.4g} mm) from where it is said to be"
+    value = (offset.pixels, threshold, "pixels", text)
+    if abs(offset.pixels) <= threshold:
+        verdict = OK if threshold <= block else CANNOT_TELL
+        return Finding(_QUESTION, verdict, *value, uncertainty=offset.spread)
+    advice = f"add {shift_mm:.4g} mm to detector_offset along u: --fix-offset writes a copy of the scan"
+    return Finding(_QUESTION, SUSPICIOUS, *value, advice, offset.spread)

@@ -1,0 +1,28 @@
+"""Does the gantry turn the way that the angles say?"""
+
+from __future__ import annotations
+
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.offset import Offset
+from phyradgs_cl.check.statistics import gain, standing
+
+_ERRORS = 3.0
+_LEAST_GAIN = 1.02
+_QUESTION = "sign of rotation"
+
+
+def check_rotation(stated: Offset, other: Offset) -> Finding:
+    """Coarse reconstructions with the angles as they are and turned round, each with its own best panel shift.
+
+    Three standard errors decide, and a residual that is 2 % smaller: a mirror image in a narrow fan fits as well.
+    """
+    errors, ratio = standing(stated.residuals, other.residuals), gain(stated.residuals, other.residuals)
+    text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
+    values = (errors, -_ERRORS, "standard errors", text)
+    if errors >= _ERRORS and ratio >= _LEAST_GAIN:
+        return Finding(_QUESTION, OK, *values)
+    if errors <= -_ERRORS and ratio <= 1 / _LEAST_GAIN:
+        advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
+        return Finding(_QUESTION, SUSPICIOUS, *values, advice)
+    advice = "look for a feature whose side is known: a mirror image would fit as well"
+    return Finding(_QUESTION, CANNOT_TELL, *values, advice)

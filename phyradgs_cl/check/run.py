@@ -1,0 +1,105 @@
+"""All questions in the order in which they rest on each other; what is found is taken out of the way of the next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.angles import check_angles
+from phyradgs_cl.check.coarse import FINE, QUICK, coarse
+from phyradgs_cl.check.coverage import check_coverage
+from phyradgs_cl.check.dead_pixels import check_dead_pixels
+from phyradgs_cl.check.exposure import check_exposure
+from phyradgs_cl.check.finding import SUSPICIOUS, Finding
+from phyradgs_cl.check.gain import best_level, check_gain, without_drift
+from phyradgs_cl.check.offset import Offset, best_offset, check_offset
+from phyradgs_cl.check.readout import check_readout
+from phyradgs_cl.check.rotation import check_rotation
+from phyradgs_cl.check.saturation import CountReader, check_saturation
+from phyradgs_cl.check.timing import check_timing
+from phyradgs_cl.check.variants import Path, reversed_rotation, shifted
+from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
+from phyradgs_cl.runtime import Runtime
+
+
+@dataclass(frozen=True, eq=False)
+class CheckResult:
+    """The findings in order, and the shift of the panel along u in mm that explains the frames best (NaN: none does)."""
+
+    findings: list[Finding]
+    offset_mm: float
+    offset_spread_mm: float
+
+    @property
+    def suspicious(self) -> list[Finding]:
+        return [finding for finding in self.findings if finding.verdict == SUSPICIOUS]
+
+
+def check(
+    scan: Scan,
+    rt: Runtime,
+    counts: CountReader | None = None,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> CheckResult:
+    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was."""
+    scan = prepared(scan, InputOptions())
+    total = 8 + (scan.is_fly and scan.shutter.readout_s > 0) + (scan.is_fly and scan.shutter.exposure_s > 0)
+    found: list[Finding] = []
+
+    def add(finding: Finding) -> Finding:
+        found.append(finding)
+        report(len(found), total)
+        return finding
+
+    add(check_timing(scan))
+    add(check_angles(scan))
+    add(check_saturation(scan, counts))
+    finding, dead = check_dead_pixels(scan)
+    add(finding)
+    scan = _without(scan, dead)
+    add(check_coverage(scan))
+    quick = coarse(scan, QUICK)
+    stated, other = best_offset(rt, quick), best_offset(rt, reversed_rotation(quick))
+    is_reversed = add(check_rotation(stated, other)).verdict == SUSPICIOUS
+    offset = other if is_reversed else stated
+    block, pitch_mm = _block(quick), scan.geometry.pixel_size_mm[1]
+    centre = add(check_offset(offset, block, pitch_mm))
+    quick = _under(quick, is_reversed, offset, centre)
+    drift, level = _gain(rt, quick, add)
+    if scan.is_fly and scan.shutter.readout_s > 0:
+        fine = _under(coarse(scan, FINE), is_reversed, offset, centre)
+        add(check_readout(rt, without_drift(fine, drift, level)))
+    if scan.is_fly and scan.shutter.exposure_s > 0:
+        add(check_exposure(rt, without_drift(quick, drift, level)))
+    return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
+
+
+def _gain(rt: Runtime, scan: Scan, add: Callable[[Finding], Finding]) -> tuple[float, float]:
+    """(logarithm of the gain's growth, constant) to be taken out of the line integrals; zeros where the gain is steady."""
+    finding = add(check_gain(rt, scan))
+    if finding.verdict != SUSPICIOUS:
+        return 0.0, 0.0
+    drift = math.log1p(finding.value)
+    return drift, best_level(rt, without_drift(scan, drift))
+
+
+def _without(scan: Scan, dead: np.ndarray) -> Scan:
+    """The scan with dead pixels (v, u) in its mask."""
+    if not dead.any():
+        return scan
+    mask = dead if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | dead
+    return replace(scan, pixel_mask=mask)
+
+
+def _block(scan: Scan) -> int:
+    return scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
+
+
+def _under(scan: Scan, is_reversed: bool, offset: Offset, centre: Finding) -> Scan:
+    """The scan as the questions so far have it: turned round where it has to be, the panel where it really is."""
+    scan = reversed_rotation(scan) if is_reversed else scan
+    return shifted(scan, offset.pixels) if centre.verdict == SUSPICIOUS else scan

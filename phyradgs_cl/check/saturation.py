@@ -1,0 +1,79 @@
+"""Are pixels at the end of the detector's range?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
+from phyradgs_cl.detector import counts_to_attenuation
+
+_SHARE = 1e-3  # of the pixels at one end
+_TOUCHING = 0.5  # of those, with all four neighbours at the same end
+_ZERO = 1e-6  # line integral
+_QUESTION = "saturation"
+
+
+@dataclass
+class CountReader:
+    """Turns stored frames into line integrals, as ``counts_to_attenuation`` does, and remembers what the counts say.
+
+    For ``read_scan``; ``at_ceiling`` is the share of the projections' pixels at ``ceiling``, the largest count that any
+    frame has, None where the file does not hold counts.
+    """
+
+    ceiling: float | None = None
+    at_ceiling: float = field(default=0.0)
+
+    def __call__(
+        self, data: np.ndarray, image_key: np.ndarray, quantity: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if quantity == "counts":
+            frames = data[image_key == 0]
+            self.ceiling = float(data[image_key != 2].max())
+            self.at_ceiling = _clustered(frames == self.ceiling)
+        return counts_to_attenuation(data, image_key, quantity)
+
+
+def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
+    """The share of pixels that sit, with all their neighbours, at the same extreme value; 0.1 % is suspicious.
+
+    Noise that is cut off at 0 puts single pixels there, saturation whole areas. A line integral of exactly 0 is not
+    asked: it is air in simulated and in clipped scans.
+    """
+    if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
+        text = f"{100 * counts.at_ceiling:.2g} % of the pixels lie together at {counts.ceiling:g} counts"
+        advice = "the detector is saturated there: lower the exposure, or mask these pixels"
+        return Finding(_QUESTION, SUSPICIOUS, counts.at_ceiling, _SHARE, "share of pixels", text, advice)
+    p = np.asarray(scan.projections)
+    masked = (
+        np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)
+    )
+    lowest, highest = float(p[~masked].min()), float(p[~masked].max())
+    ends = {
+        "least": (0.0 if abs(lowest) < _ZERO else _clustered((p == lowest) & ~masked), lowest),
+        "largest": (_clustered((p == highest) & ~masked) if highest > _ZERO else 0.0, highest),
+    }
+    name, (share, value) = max(ends.items(), key=lambda item: item[1][0])
+    text = f"{100 * share:.2g} % of the pixels lie together at the {name} line integral, {value:.4g}"
+    if share <= _SHARE:
+        return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text)
+    advice = {
+        "least": "the detector is saturated behind thin parts: lower the exposure, or mask these pixels",
+        "largest": "no light comes through there: raise the exposure, or mask these pixels",
+    }[name]
+    return Finding(_QUESTION, SUSPICIOUS, share, _SHARE, "share of pixels", text, advice)
+
+
+def _clustered(extreme: np.ndarray) -> float:
+    """The share of pixels (F, v, u) at an extreme, if most of those have four such neighbours; else 0."""
+    count = int(np.count_nonzero(extreme))
+    if count == 0 or min(extreme.shape[1:]) < 3:
+        return 0.0
+    middle = extreme[:, 1:-1, 1:-1]
+    around = extreme[:, :-2, 1:-1] & extreme[:, 2:, 1:-1] & extreme[:, 1:-1, :-2] & extreme[:, 1:-1, 2:]
+    inner = int(np.count_nonzero(middle))
+    touching = int(np.count_nonzero(middle & around)) / inner if inner else 0.0
+    return count / extreme.size if touching > _TOUCHING else 0.0

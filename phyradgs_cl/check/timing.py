@@ -1,0 +1,97 @@
+"""Do exposure, readout and the frames' times fit each other and the angles?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
+from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
+
+_SLACK = 1e-3  # relative: times and angles are stored rounded
+_APART = 0.02  # relative: beyond what a gantry's speed varies without an encoder's word
+_QUESTION = "timing"
+
+
+def check_timing(scan: Scan) -> Finding:
+    """A line cannot open while it is open, nor a frame be read while the last one is, nor a gantry be at two angles.
+
+    The number is the worst of three shares: the exposure and the readout of the shortest time between frames (at most 1),
+    and one more than how far the angles between frames are from those that the speed within the frames gives.
+    """
+    starts_s = np.asarray(scan.frame_start_s, np.float64)
+    if scan.frames < 2:
+        return Finding(_QUESTION, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
+    period_s = float(np.diff(starts_s).min())
+    if period_s <= 0:
+        advice = "correct frame_start_time; frames must follow each other"
+        return Finding(
+            _QUESTION, SUSPICIOUS, period_s, 0.0, "s", "frames that start before their predecessors", advice
+        )
+    if not scan.is_fly:
+        return Finding(
+            _QUESTION, OK, 0.0, 1.0, "share", "the gantry stands while it exposes: any timing fits"
+        )
+    found = [
+        _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
+        _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
+    ]
+    if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
+        found.append(_speed(scan, starts_s))  # tables say the same within frames and between them
+    return _worst(*found)
+
+
+def exposure_arc_rad(scan: Scan) -> float:
+    """Angle by which the gantry turns while a line is open, of the frame in the middle; 0 where it stands."""
+    if not scan.is_fly:
+        return 0.0
+    frame = scan.frames // 2
+    start_s = float(scan.frame_start_s[frame])
+    ends = azimuth_rad(scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s])))
+    return abs(float(_wrapped(ends[1:] - ends[:1])[0]))
+
+
+def azimuth_rad(pose: np.ndarray) -> np.ndarray:
+    """Angles (...) about +z at which poses (..., 12) have their source, in (-π, π]."""
+    return np.arctan2(pose[..., 1], pose[..., 0])
+
+
+def _share(name: str, meaning: str, share: float) -> Finding:
+    if share <= 1 + _SLACK:
+        text = f"{name} takes {100 * share:.3g} % of the time between frames"
+        return Finding(_QUESTION, OK, share, 1.0, "share", text)
+    advice = f"correct the {name} time (is it stated {share:.3g} times too long?) or frame_start_time"
+    text = f"{name} takes {100 * share:.4g} % of the time between frames: {meaning}"
+    return Finding(_QUESTION, SUSPICIOUS, share, 1.0, "share", text, advice)
+
+
+def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
+    """Compares the angle to the next frame with the speed in this frame; as a median, since gantries are not clocks."""
+    span_s = scan.shutter.exposure_s or scan.shutter.span_s
+    moved, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
+    for frame in range(scan.frames - 1):
+        times_s = starts_s[frame] + np.array([0.0, span_s])
+        first, last = azimuth_rad(scan.trajectory.pose(frame, times_s))
+        following = azimuth_rad(scan.trajectory.pose(frame + 1, starts_s[frame + 1 : frame + 2]))[0]
+        moved[frame] = _wrapped(last - first) * (starts_s[frame + 1] - starts_s[frame]) / span_s
+        stepped[frame] = moved[frame] + _wrapped(following - first - moved[frame])
+    apart = float(np.median(np.abs(stepped - moved))) / max(float(np.median(np.abs(stepped))), 1e-9)
+    text = f"the angles between frames are {100 * apart:.2g} % from those that the speed in the frames gives"
+    if apart <= _APART:
+        return Finding(_QUESTION, OK, 1 + apart, 1 + _APART, "share", text)
+    degrees = math.degrees(float(np.median(moved))), math.degrees(float(np.median(stepped)))
+    advice = (
+        f"the gantry would turn {degrees[0]:.4g}° from frame to frame, the angles say {degrees[1]:.4g}°: correct the "
+        "exposure time, frame_start_time or rotation_angle_end"
+    )
+    return Finding(_QUESTION, SUSPICIOUS, 1 + apart, 1 + _APART, "share", text, advice)
+
+
+def _worst(*findings: Finding) -> Finding:
+    wrong = [f for f in findings if f.verdict == SUSPICIOUS]
+    return wrong[0] if wrong else max(findings, key=lambda f: f.value / f.threshold)
+
+
+def _wrapped(angle: np.ndarray | float) -> np.ndarray:
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,80 @@
+"""The same frames under another hypothesis: turned the other way, read the other way, exposed longer, panel shifted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.trajectory import Trajectory
+
+_MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at the plane y = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields below.
+
+    is_reversed: the gantry turns the other way (a mirror image of the poses, whose columns then run backwards);
+    offset_u_mm of the panel stays on its side. shift_px: the panel moves along u, in its own columns. block: pixels
+    become blocks. frames (F,): which frames of ``base`` are used; None: all.
+    """
+
+    base: Trajectory
+    columns: int
+    offset_u_mm: float = 0.0
+    is_reversed: bool = False
+    shift_px: float = 0.0
+    block: int = 1
+    frames: np.ndarray | None = None
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Poses (..., 12) at times (...)."""
+        number = frame if self.frames is None else int(self.frames[frame])
+        pose = np.array(self.base.pose(number, time_s))
+        if self.is_reversed:
+            pose = self._mirrored(pose)
+        pose[..., 3:6] += self.shift_px * pose[..., 6:9]
+        pose[..., 3:6] += (self.block - 1) / 2 * (pose[..., 6:9] + pose[..., 9:12])
+        pose[..., 6:] *= self.block
+        return pose
+
+    def _mirrored(self, pose: np.ndarray) -> np.ndarray:
+        pose = pose * _MIRROR
+        column = pose[..., 6:9]
+        pitch_mm = np.linalg.norm(column, axis=-1, keepdims=True)
+        pose[..., 3:6] += (self.columns - 1 - 2 * self.offset_u_mm / pitch_mm) * column
+        pose[..., 6:9] = -column
+        return pose
+
+
+def with_path(scan: Scan, **changes: Any) -> Scan:
+    """The scan with changed fields of its ``Path``."""
+    path = scan.trajectory
+    if not isinstance(path, Path):
+        on_circle = isinstance(path, CircularOrbit)
+        offset_u_mm = scan.geometry.detector_offset_mm[1] if on_circle else 0.0
+        path = Path(path, scan.geometry.detector_shape[1], offset_u_mm)
+    return replace(scan, trajectory=replace(path, **changes))
+
+
+def reversed_rotation(scan: Scan) -> Scan:
+    """The gantry turning the other way."""
+    return with_path(scan, is_reversed=True)
+
+
+def reversed_readout(scan: Scan) -> Scan:
+    """The last line read first."""
+    return replace(scan, shutter=replace(scan.shutter, direction=-scan.shutter.direction))
+
+
+def exposed(scan: Scan, factor: float) -> Scan:
+    """Lines open ``factor`` times as long, from the same moment, while the gantry turns as it does."""
+    return replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s))
+
+
+def shifted(scan: Scan, pixels: float) -> Scan:
+    """The panel moved along u by ``pixels`` of the scan as it was recorded, whatever it was binned to."""
+    return with_path(scan, shift_px=pixels)

@@ -1,0 +1,123 @@
+"""sweep: scans × settings × seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phyradgs_cl import signals
+from phyradgs_cl.cluster import LOCAL, Workers, has_dask
+from phyradgs_cl.commands.console import complain, remark, say
+from phyradgs_cl.commands.options import Scheduler, WorkerCount, file_argument
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.json_lines import Line
+from phyradgs_cl.progress import Ticker
+from phyradgs_cl.settings import device_wish, read_config
+from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, SweepProgress, read_grid, run_sweep
+
+EXAMPLE = (
+    "Example: phyradgs sweep grid.toml -o results\n\n"
+    "Runs that the results file in the folder has already are not made again: interrupt and repeat at will. "
+    "Docs: cluster.md."
+)
+
+
+def sweep_command(
+    grid: Annotated[Path, file_argument("GRID", "TOML file: scans, settings and seeds (docs: cluster.md).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="DIR", help=f"Folder for {RESULTS} (a line a run), volumes and tables."
+        ),
+    ],
+    scheduler: Scheduler = None,
+    workers: WorkerCount = None,
+    checkpoint_every: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS", help="Keep a checkpoint of each run so often; a lost run goes on from it."
+        ),
+    ] = 600.0,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="Devices of local workers, with commas: indices, cpu, gpu or parts of names.",
+            show_default="all GPUs, else the best device",
+        ),
+    ] = None,
+) -> None:
+    """Reconstruct many scans with many settings: a resumable results file, volumes, and tables."""
+    where = chosen_workers(scheduler, workers, device)
+    read = read_grid(read_config(grid, "GRID"), grid)
+    job = SweepJob(read, output, where, device if where is None else None, checkpoint_every)
+    interrupted = f"interrupted: finished runs are in {output / RESULTS}; repeat the command to go on"
+    signals.say_at_the_end(interrupted)
+    try:
+        with SweepTicker() as ticker:
+            written, failed = run_sweep(job, ticker)
+    except KeyboardInterrupt:
+        complain(interrupted)
+        raise typer.Exit(signals.status()) from None
+    for path in written:
+        say(str(path))
+    if failed:
+        complain(f"{failed} runs failed: {output / 'results.md'} says why; repeat the command to try again")
+        raise typer.Exit(2)
+
+
+def chosen_workers(scheduler: str | None, count: int | None, device: str | None) -> Workers | None:
+    """Workers as the options ask for them; None is this process, where nothing is asked for and Dask is missing."""
+    device_wish(device)
+    if scheduler is not None or count is not None or has_dask():
+        return Workers(LOCAL if scheduler is None else scheduler, count, device)
+    if device is not None and "," in device:
+        remedy = "pip install 'phyradgs-cl[cluster]'"
+        raise InputError("--device", repr(device), "one device, as dask.distributed is not installed", remedy)
+    remark("dask.distributed is not installed: one run after the other; pip install 'phyradgs-cl[cluster]'")
+    return None
+
+
+class SweepTicker:
+    """Progress of a sweep: a line a finished run, a counter for all, and for the iterations of a run made here."""
+
+    def __init__(self) -> None:
+        self.all, self.one, self.name = Ticker("run"), Ticker("iteration"), ""
+
+    def __enter__(self) -> SweepTicker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_lines()
+
+    def __call__(self, p: SweepProgress) -> None:
+        if p.dashboard:
+            remark(f"Dask's dashboard: {p.dashboard}")
+            return
+        if p.line is not None:
+            self._end_lines()
+            say(f"{p.done}/{p.total} {p.line['run']} ({p.line['label']}): {_found(p.line)}")
+        if p.progress is not None:
+            if p.name != self.name:
+                self.name, self.one = p.name, Ticker(f"{p.done + 1}/{p.total} {p.name}: iteration")
+            self.one.progress(p.progress)
+        else:
+            if p.line is None and p.done == p.total:  # said with the last line
+                return
+            failed = f"  {p.failed} failed" if p.failed else ""
+            self.all.show(p.done, p.total, f"{failed}  {p.running} under way" if p.running else failed)
+
+    def _end_lines(self) -> None:
+        for ticker in (self.all, self.one):
+            with ticker:
+                pass
+
+
+def _found(line: Line) -> str:
+    if "error" in line:
+        return f"failed: {line['error']}"
+    metrics = line["metrics"]
+    psnr = metrics.get("psnr_db")
+    scores = f"PSNR {psnr:.2f} dB, SSIM {metrics['ssim']:.4f}, " if psnr is not None else ""
+    return f"{scores}{line['seconds']:.1f} s"

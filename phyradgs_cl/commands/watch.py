@@ -1,0 +1,133 @@
+"""watch: scans reconstructed as they arrive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phyradgs_cl import signals
+from phyradgs_cl.commands.console import complain, say
+from phyradgs_cl.commands.options import (
+    Assignments,
+    Config,
+    Device,
+    Iterations,
+    Memory,
+    Method,
+    MotionModel,
+    Preset,
+    Seed,
+    file_argument,
+    given_options,
+)
+from phyradgs_cl.progress import Ticker
+from phyradgs_cl.reconstructors import ProgressReport
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import run_settings
+from phyradgs_cl.workflow import ReconstructionJob
+from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch
+
+EXAMPLE = (
+    "Example: phyradgs watch incoming -o volumes --method fista-tv\n\n"
+    "Kill and restart it at will: what is done stays done, and a run goes on from its checkpoint. Docs: cluster.md."
+)
+
+
+def watch_command(
+    folder: Annotated[Path, file_argument("FOLDER", "Folder in which scans arrive, as *.h5.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for a volume, or an error, of each scan."),
+    ],
+    method: Method = None,
+    motion: MotionModel = None,
+    iterations: Iterations = None,
+    preset: Preset = None,
+    seed: Seed = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="End when every complete scan has its volume or its error.")
+    ] = False,
+    poll_s: Annotated[
+        float, typer.Option("--poll-s", metavar="SECONDS", help="Between two looks at the folder.")
+    ] = 2.0,
+    settle_s: Annotated[
+        float,
+        typer.Option(
+            "--settle-s",
+            metavar="SECONDS",
+            help="How long a file must not have changed; one renamed into place is taken at once.",
+        ),
+    ] = 5.0,
+    checkpoint_every: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="Keep a checkpoint of the run under way so often."),
+    ] = 600.0,
+    memory: Memory = None,
+    device: Device = None,
+) -> None:
+    """Reconstruct the scans of a folder as they arrive, each once; failures are set aside with their message."""
+    given = given_options(
+        method=method,
+        motion=motion,
+        iterations=iterations,
+        preset=preset,
+        seed=seed,
+        device=device,
+        memory=memory,
+    )
+    settings = run_settings(config, given, assignments or [])
+    template = ReconstructionJob(
+        folder,
+        output,
+        method=settings.method,
+        preset=settings.preset,
+        changes=settings.changes,
+        seed=settings.seed,
+        config=config,
+        before=settings.before,
+        checkpoint_every_s=checkpoint_every,
+    )
+    job = WatchJob(folder, output, template, poll_s, settle_s, once)
+
+    def runtime() -> Runtime:
+        with settings.naming_origins():
+            return Runtime(settings.device, memory=settings.memory)
+
+    interrupted = f"interrupted: finished volumes are in {output}; the next start goes on from there"
+    signals.say_at_the_end(interrupted)
+    telling = _Telling(output)
+    try:
+        run_watch(job, runtime, telling.tell, telling.report)
+    except KeyboardInterrupt:
+        telling.end_line()
+        complain(interrupted)
+        raise typer.Exit(signals.status()) from None
+
+
+class _Telling:
+    """A counter for the scan under way, a line for each that is done or set aside."""
+
+    def __init__(self, output: Path) -> None:
+        self.output, self.ticker = output, Ticker("")
+
+    def report(self, scan: Path) -> ProgressReport:
+        self.ticker = Ticker(f"{scan.name}: iteration")
+        return self.ticker.progress
+
+    def tell(self, event: WatchEvent) -> None:
+        self.end_line()
+        if event.result is None:
+            complain(f"{event.scan}: set aside in {self.output}: {event.error}")
+            return
+        scores = event.metrics or {}
+        told = f", PSNR {scores['psnr_db']:.2f} dB, SSIM {scores['ssim']:.4f}" if scores else ""
+        facts = event.result.facts
+        say(f"{self.output / event.scan.name}: {facts['method']}, {facts['seconds']:.1f} s{told}")
+
+    def end_line(self) -> None:
+        with self.ticker:
+            pass

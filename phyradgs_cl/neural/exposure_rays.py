@@ -1,0 +1,81 @@
+"""The rays of a pixel: one to each of the times at which its line is exposed, from the frame's time cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers, layer_weights
+from phyradgs_cl.fields import Grid
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureRays:
+    """The rays of one frame's pixels.
+
+    pose (C, 12) in units of half the volume's longest side about the volume's centre; cell (K, lines), the cell of each
+    of a line's K times, which all weigh the same; axis: what a line is, rows or columns.
+    """
+
+    pose: np.ndarray
+    cell: np.ndarray
+    axis: str
+
+    @classmethod
+    def of_cells(cls, table: TimeCells, grid: Grid) -> ExposureRays:
+        """The rays of still cells in mm, for a volume on ``grid`` in mm.
+
+        Raises ValueError for a table whose lines have unlike numbers of cells, or unlike weights: no motion model makes one.
+        """
+        centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
+        pose = table.pose.copy()
+        pose[:, :3] -= centre
+        pose[:, 3:6] -= centre
+        numbers = layer_numbers(table)
+        weight = layer_weights(table, numbers)
+        if not np.allclose(weight, 1 / len(weight)):
+            raise ValueError("the times of a line do not weigh the same")
+        cell = np.zeros(weight.shape, np.int64)
+        for number, (layer, start, stop) in enumerate(
+            zip(numbers, table.line_start, table.line_stop, strict=True)
+        ):
+            cell[layer, start:stop] = number
+        return cls(pose / unit, cell, table.axis)
+
+    @property
+    def times(self) -> int:
+        """K, how many times a line has."""
+        return len(self.cell)
+
+    def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sources and directions (R, s, 3), unit length, of pixels (R, 2) row, column at some of their times (R, s)."""
+        rows, columns = pixels.T
+        line = rows if self.axis == "rows" else columns
+        pose = self.pose[self.cell[times, line[:, None]]]  # (R, s, 12)
+        along_row, down = columns[:, None, None], rows[:, None, None]
+        centre = pose[..., 3:6] + along_row * pose[..., 6:9] + down * pose[..., 9:12]
+        direction = centre - pose[..., :3]
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        return pose[..., :3], direction
+
+    def shadow(self, half_sides: Sequence[float], detector_shape: tuple[int, int]) -> tuple[slice, slice]:
+        """Rows and columns within which every pixel lies whose rays meet a box of ``half_sides`` (x, y, z) about 0."""
+        corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
+        steps, origin = self.pose[:, None, 6:12], self.pose[:, None, 3:6] - self.pose[:, None, :3]
+        to_corner = corners - self.pose[:, None, :3]  # (C, 8, 3)
+        matrix = np.stack(np.broadcast_arrays(to_corner, -steps[..., :3], -steps[..., 3:]), -1)
+        try:
+            place = np.linalg.solve(matrix, np.broadcast_to(origin, to_corner.shape)[..., None])[..., 0]
+        except np.linalg.LinAlgError:  # a corner that the panel cannot see
+            return slice(0, detector_shape[0]), slice(0, detector_shape[1])
+        scale, column, row = np.moveaxis(place, -1, 0)
+        if np.any(scale <= 0) or not np.all(np.isfinite(scale)):
+            return slice(0, detector_shape[0]), slice(0, detector_shape[1])
+        return _within(row, detector_shape[0]), _within(column, detector_shape[1])
+
+
+def _within(place: np.ndarray, count: int) -> slice:
+    first = int(np.clip(np.floor(place.min()), 0, count - 1))
+    return slice(first, int(np.clip(np.ceil(place.max()) + 1, first + 1, count)))

@@ -1,0 +1,154 @@
+"""What the neural methods can be told; constants and ranges, without PyTorch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.errors import InputError
+
+JITTERS = ("ray", "sample", "none")
+LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
+TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
+CELLS_A_VOXEL = 2.0  # of the finest level
+SAMPLES_A_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
+
+_RANGES = {
+    "iterations": (0, 1_000_000),
+    "rays": (1, 1_000_000),
+    "samples": (0, 100_000),
+    "times": (0, 10_000),
+    "levels": (0, 32),
+    "features": (1, 64),
+    "base_resolution": (1, 4096),
+    "level_growth": (1, 16),
+    "table_log2": (4, 28),
+    "layers": (2, 64),
+    "width": (1, 4096),
+    "density_bound": (1e-3, 1e6),
+    "first_share": (1e-6, 0.999),
+    "rate": (1e-9, 10),
+    "rate_factor": (1e-9, 1),
+    "rate_step": (0, 1_000_000),
+}
+_FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fractions
+
+
+@dataclass(frozen=True)
+class NeuralOptions:
+    """A field on a hash encoding and a small network, fitted to rays.
+
+    iterations: passes over all frames, of one step a frame. rays: pixels a step. samples: along a ray inside the volume,
+    0 for 1.5 a voxel of the longest side. jitter: of the samples: one random shift a ``ray``, one a ``sample`` inside its
+    own interval, ``none``. times: how many of a line's a step looks at, drawn anew for each pixel; 0: all of them.
+    positive_only: pixels with a line integral above 0 only.
+
+    levels (0: until the finest has two cells a voxel), features, base_resolution (cells along a side), level_growth,
+    table_log2 (most entries of a level): the encoding.
+    layers, width: the network. last_activation: its end; for a sigmoid density_bound, its largest value in units of FDK's
+    99.9th percentile, and first_share, the share of it at which the field starts everywhere. rate, rate_factor, rate_step:
+    Adam's rate, multiplied by the factor every so many passes; step 0 spreads one factor over the run. detector_model: what
+    is averaged over a line's times, or what the scan says.
+    torch_device: where PyTorch works.
+    """
+
+    motion: Motion = Motion("static")
+    detector_model: str = "scan"
+    iterations: int = 30
+    rays: int = 512
+    samples: int = 0
+    jitter: str = "ray"
+    times: int = 0
+    positive_only: bool = False
+    levels: int = 0
+    features: int = 2
+    base_resolution: int = 16
+    level_growth: float = 2.0
+    table_log2: int = 19
+    layers: int = 4
+    width: int = 32
+    last_activation: str = "sigmoid"
+    density_bound: float = 2.0
+    first_share: float = 0.05
+    rate: float = 1e-2
+    rate_factor: float = 0.1
+    rate_step: int = 0
+    torch_device: str = "auto"
+
+    def __post_init__(self) -> None:
+        checks.fields_within("", self, _RANGES)
+        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
+        checks.one_of("jitter", self.jitter, JITTERS)
+        checks.one_of("last_activation", self.last_activation, LAST_ACTIVATIONS)
+        checks.one_of("torch_device", self.torch_device, TORCH_DEVICES)
+        finest = self.base_resolution * self.level_growth ** max(self.levels - 1, 0)
+        if finest > _FINEST:
+            found = f"a finest level of {finest:.3g} cells along a side"
+            remedy = "take fewer levels or a smaller level_growth"
+            raise InputError("levels", found, f"at most {_FINEST}", remedy)
+        if self.motion.name == "exact":
+            expected = "static, static-start, micro-views or per-row: exact moves splats, and rays have none"
+            raise InputError("--motion", "'exact'", expected, "take --motion per-row")
+
+    def levels_for(self, longest_voxels: int) -> int:
+        """Levels of the encoding for a volume of so many voxels along its longest side."""
+        if self.levels or self.level_growth == 1:
+            return max(self.levels, 1)
+        steps = math.log(CELLS_A_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
+        finest = math.log(_FINEST / self.base_resolution, self.level_growth)
+        return 1 + max(math.ceil(min(steps, finest) - 1e-9), 0)
+
+    def samples_for(self, longest_voxels: int) -> int:
+        """Samples along a ray for a volume of so many voxels along its longest side."""
+        return self.samples or max(round(SAMPLES_A_VOXEL * longest_voxels), 2)
+
+    def times_for(self, count: int, model: str) -> int:
+        """How many of the ``count`` times of a line a step looks at.
+
+        Raises InputError for a number that would be biased: one time leaves no measure of the spread that a square adds, and
+        the logarithm of a mean intensity is not the mean over subsets.
+        """
+        if self.times == 0:
+            return count
+        if self.times < count and model == "intensity":
+            found = f"{self.times} of {count} times in the intensity model"
+            raise InputError("option times", found, f"0, or {count} and more: a subset is biased")
+        if self.times == 1 and count > 1:
+            expected = "0, or 2 and more: a single one is biased"
+            raise InputError("option times", f"1 of {count} times", expected)
+        return min(self.times, count)
+
+
+@dataclass(frozen=True)
+class LineOptions(NeuralOptions):
+    """The same with a transformer over line segments, and windows of neighbouring pixels beside the scattered rays.
+
+    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: a step, each of ``window``
+    by ``window`` pixels.
+    """
+
+    segment: int = 2
+    heads: int = 8
+    head_width: int = 4
+    blocks: int = 1
+    window: int = 8
+    windows: int = 16
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ranges = {
+            "segment": (1, 256),
+            "heads": (1, 256),
+            "head_width": (1, 1024),
+            "blocks": (1, 32),
+            "window": (1, 1024),
+            "windows": (0, 100_000),
+        }
+        checks.fields_within("", self, ranges)
+
+    def samples_for(self, longest_voxels: int) -> int:
+        """As for every field, in whole segments."""
+        return -(-super().samples_for(longest_voxels) // self.segment) * self.segment

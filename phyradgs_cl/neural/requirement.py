@@ -1,0 +1,29 @@
+"""Whether PyTorch is there, and what to say where it is not."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from phyradgs_cl.errors import InputError
+
+INSTALL = 'pip install "phyradgs-cl[neural]"'
+
+
+def has_torch() -> bool:
+    """Whether the package torch can be imported."""
+    return importlib.util.find_spec("torch") is not None
+
+
+def has_accelerator() -> bool:
+    """Whether PyTorch is there and has something faster than a CPU."""
+    if not has_torch():
+        return False
+    from phyradgs_cl.neural.torch_device import torch_device
+
+    return torch_device("auto").type != "cpu"
+
+
+def require_torch(culprit: str) -> None:
+    """Raise InputError that says what to install, unless PyTorch is there."""
+    if not has_torch():
+        raise InputError(culprit, "no PyTorch", "the package torch", INSTALL)

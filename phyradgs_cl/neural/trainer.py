@@ -1,0 +1,197 @@
+"""One step after the other of fitting a field to a scan's rays, and the state between two of them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import torch
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural.arrays import to_array, to_tensor
+from phyradgs_cl.neural.exposure_average import intensity_average, log_squares
+from phyradgs_cl.neural.exposure_rays import ExposureRays
+from phyradgs_cl.neural.neural_field import NeuralField, voxel_values
+from phyradgs_cl.neural.options import LineOptions, NeuralOptions
+from phyradgs_cl.neural.pixel_choice import chosen_times, scattered_pixels, windows_and_scattered_pixels
+from phyradgs_cl.neural.ray_integral import line_integrals, sample_shifts
+from phyradgs_cl.neural.torch_device import repeatable
+
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8
+_POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # at once: a cache's, a GPU's
+
+
+class Trainer:
+    """A field, its optimiser and what is drawn at random: everything that changes from step to step.
+
+    Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``.
+    """
+
+    def __init__(
+        self,
+        scan: Scan,
+        options: NeuralOptions,
+        field: NeuralField,
+        device: torch.device,
+        density_per_mm: float,
+        seed: int,
+    ) -> None:
+        self.scan, self.options, self.device = scan, options, device
+        self.field = field.to(device)
+        self.density_per_mm = density_per_mm
+        self.unit = density_per_mm * scan.grid.half_longest_mm  # of line integrals
+        self.rng = np.random.default_rng(seed)
+        tables = [options.motion.cells(scan, frame) for frame in range(scan.frames)]
+        self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
+        times = self.rays[0].times
+        stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        self.model = stated if times > 1 else "log"  # of one value both are the mean
+        self.times = options.times_for(times, self.model)
+        self.samples = options.samples_for(max(scan.grid.shape))
+        self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
+        half_sides = np.array(scan.grid.size_mm[::-1]) / 2 / scan.grid.half_longest_mm
+        self._shadows = [rays.shadow(half_sides, scan.geometry.detector_shape) for rays in self.rays]
+        self._half_sides = to_tensor(half_sides.astype(np.float32), device)
+        self._adam = torch.optim.Adam(self.field.parameters(), options.rate, _BETAS, _EPSILON)
+        self.steps, self.updates, self.queue = 0, 0, self._shuffled()
+        self.losses: list[float] = []
+
+    @property
+    def passes(self) -> int:
+        """Whole passes over the frames so far."""
+        return self.steps // self.scan.frames
+
+    @property
+    def is_between_passes(self) -> bool:
+        return self.steps % self.scan.frames == 0
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers are fitted."""
+        return sum(p.numel() for p in self.field.parameters())
+
+    def step(self) -> None:
+        """One frame: some pixels, their rays, the squared error, and Adam; its loss goes to ``losses``."""
+        if self.is_between_passes:
+            self.losses = []
+        frame = self.queue.pop()
+        pixels = self._pixels(frame)
+        for group in self._adam.param_groups:
+            group["lr"] = self._rate()
+        loss = 0.0
+        if len(pixels):
+            with repeatable(self.device):
+                self._adam.zero_grad(set_to_none=True)
+                loss = self._loss_and_gradient(frame, pixels)
+                self._adam.step()
+            self.updates += 1
+        self.losses.append(loss)
+        self.steps += 1
+        if not self.queue:
+            self.queue = self._shuffled()
+
+    def volume(self, grid: Grid) -> np.ndarray:
+        """The field at the voxels (nz, ny, nx) of the scan's grid in mm, 1/mm."""
+        unit_grid = Grid(grid.shape, grid.scaled(1 / grid.half_longest_mm).voxel_size_mm)
+        values = voxel_values(self.field, unit_grid, self.device, self.points_at_once)
+        return values * np.float32(self.density_per_mm)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that the next step depends on, and the losses of the pass so far."""
+        moments = [self._flat([self._moments(p)[k] for p in self.field.parameters()]) for k in range(2)]
+        return {
+            "parameters": self._flat([p.detach() for p in self.field.parameters()]),
+            "moments": np.stack(moments),
+            "steps": np.array(self.steps),
+            "updates": np.array(self.updates),
+            "queue": np.array(self.queue, np.int64),
+            "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+            "losses": np.array(self.losses, np.float64),
+        }
+
+    def restore(self, parameters: np.ndarray, moments: np.ndarray, updates: int) -> None:
+        """Goes on from values (n,) and Adam's moments (2, n) after so many updates; the rest is set by itself."""
+        first = 0
+        with torch.no_grad():
+            for p in self.field.parameters():
+                part = slice(first, first + p.numel())
+                p.copy_(to_tensor(parameters[part], self.device).reshape(p.shape))
+                mean, square = (to_tensor(m[part], self.device).reshape(p.shape) for m in moments)
+                if updates:
+                    step = torch.tensor(float(updates))
+                    self._adam.state[p] = {"step": step, "exp_avg": mean, "exp_avg_sq": square}
+                first += p.numel()
+        self.updates = updates
+
+    # --- one step -----------------------------------------------------------------------------------------
+
+    def _shuffled(self) -> list[int]:
+        return self.rng.permutation(self.scan.frames).tolist()
+
+    def _rate(self) -> float:
+        options = self.options
+        if options.rate_step:
+            return options.rate * options.rate_factor ** (self.passes // options.rate_step)
+        return options.rate * options.rate_factor ** (self.steps / (options.iterations * self.scan.frames))
+
+    def _pixels(self, frame: int) -> np.ndarray:
+        """Pixels (R, 2) of a frame that may be used and whose rays can meet the volume."""
+        scan, options = self.scan, self.options
+        usable = np.zeros(scan.geometry.detector_shape, bool)
+        usable[self._shadows[frame]] = True
+        if scan.pixel_mask is not None:
+            mask = np.asarray(scan.pixel_mask)
+            usable &= (mask[frame] if mask.ndim == 3 else mask) == 0
+        if options.positive_only:
+            usable &= scan.projections[frame] > 0
+        if isinstance(options, LineOptions):
+            return windows_and_scattered_pixels(
+                usable, options.rays, options.windows, options.window, self.rng
+            )
+        return scattered_pixels(usable, options.rays, self.rng)
+
+    def _loss_and_gradient(self, frame: int, pixels: np.ndarray) -> float:
+        """The mean squared error in internal units; its gradient is added up in the parameters, a chunk at a time."""
+        rays = self.rays[frame]
+        times = chosen_times(len(pixels), rays.times, self.times, self.rng)
+        shifts = sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
+        shifts = shifts.reshape(*times.shape, -1)
+        measured = self.scan.projections[frame][tuple(pixels.T)].astype(np.float32) / np.float32(self.unit)
+        at_once = max(self.points_at_once // (self.samples * self.times), 1)
+        total = 0.0
+        for start in range(0, len(pixels), at_once):
+            part = slice(start, start + at_once)
+            source, direction = rays(pixels[part], times[part])
+            squares = self._squares(source, direction, shifts[part], measured[part], rays.times)
+            loss = squares.sum() / len(pixels)
+            loss.backward()
+            total += float(loss.detach())
+        return total
+
+    def _squares(
+        self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
+    ) -> torch.Tensor:
+        """Squared errors (R,) of pixels with rays (R, s, 3) of their ``times`` times."""
+        from_, along, shift = (
+            to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
+            for a in (source, direction, shifts)
+        )
+        integrals = line_integrals(self.field, from_, along, self._half_sides, self.samples, shift)
+        integrals = integrals.reshape(source.shape[:2])
+        wanted = to_tensor(measured, self.device)
+        if self.model == "intensity":
+            return (intensity_average(integrals, self.unit) - wanted) ** 2
+        return log_squares(integrals, wanted, times)
+
+    # --- the optimiser's state ----------------------------------------------------------------------------
+
+    def _moments(self, parameter: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        state = self._adam.state.get(parameter)
+        if not state:
+            return torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state["exp_avg"], state["exp_avg_sq"]
+
+    @staticmethod
+    def _flat(tensors: list[torch.Tensor]) -> np.ndarray:
+        return np.concatenate([to_array(t).ravel() for t in tensors])

@@ -1,0 +1,60 @@
+"""The cells of frames in layers of one cell a line, and what a detector that adds photons makes of them, on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
+
+
+def layers(table: TimeCells) -> list[TimeCells]:
+    """The cells of a frame in tables in which no line has more than one; cells sorted by line stay so."""
+    numbers = layer_numbers(table)
+    return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
+
+
+def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
+    """Of many frames (F tables): the tables of each layer with weights of 1, and the cells' own weights.
+
+    Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis, 0 where a layer has no cell of a line.
+    """
+    split = [layers(table) for table in tables]
+    ones, weights = [], []
+    for k in range(max(len(parts) for parts in split)):
+        parts = [p[k] if k < len(p) else _empty(p[0]) for p in split]
+        weight = np.stack([part.line_weights() for part in parts]).astype(np.float32)
+        weights.append(weight[:, :, None] if tables[0].axis == "rows" else weight[:, None, :])
+        ones.append([replace(part, weight=np.ones(part.count)) for part in parts])
+    return ones, weights
+
+
+def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], average: str) -> np.ndarray:
+    """Frames (F, rows, columns) float32 from line integrals p of each layer (the same) and weights as of ``layered``.
+
+    ``intensity``: −ln Σ w exp(−p); ``gap``: what Σ w p is more than that. Lines without cells are 0. The twin of what
+    cl/rays.cl does where a line's cells are at hand together; weights of a line sum to 1.
+    """
+    seen = [np.broadcast_to(w > 0, p.shape) for p, w in zip(integrals, weights, strict=True)]
+    least = np.minimum.reduce([np.where(s, p, np.inf) for s, p in zip(seen, integrals, strict=True)])
+    least = np.where(np.isfinite(least), least, 0).astype(np.float64)
+    more, light = np.zeros_like(least), np.zeros_like(least)
+    for p, w in zip(integrals, weights, strict=True):
+        beyond = np.where(w > 0, p - least, 0)
+        more += w * beyond
+        light += w * np.expm1(-beyond)
+    dimmer = np.log1p(np.maximum(light, -0.9999999))
+    return (more + dimmer if average == "gap" else least - dimmer).astype(np.float32)
+
+
+def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
+    names = ("pose", "time_s", "line_start", "line_stop", "weight")
+    return replace(table, **{name: getattr(table, name)[cells] for name in names})
+
+
+def _empty(table: TimeCells) -> TimeCells:
+    """A table of a frame without cells: one that serves no line, because a table must not be empty."""
+    one = _some(table, [0])
+    return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

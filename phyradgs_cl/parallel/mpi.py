@@ -1,0 +1,137 @@
+"""Ranks of an MPI launch through mpi4py, which is imported here and only when it is needed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any, NoReturn
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.parallel.communicator import Alone, Communicator
+from phyradgs_cl.parallel.launch import Launch, launched
+
+_PATIENCE_S = 2.0
+_MOST_VALUES = 1 << 26  # of one call: counts of MPI before its version 4 end at 2³¹
+
+
+@lru_cache(maxsize=1)
+def launched_ranks(launch: Launch | None = None) -> Communicator:
+    """The ranks that this process was launched with, always the same; ``Alone``, without mpi4py, where it was not.
+
+    Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher.
+    """
+    found = launched() if launch is None else launch
+    if found.size == 1:
+        return Alone()
+    try:
+        from mpi4py import MPI
+    except ImportError as error:
+        culprit = f"rank {found.rank} of {found.size}"
+        remedy = 'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
+        raise InputError(culprit, "no package mpi4py", "the extra mpi", remedy) from error
+    world = MPI.COMM_WORLD
+    if world.size != found.size:
+        remedy = "start it with the mpiexec that mpi4py was built for (with srun: --mpi=pmi2 or pmix)"
+        raise InputError("mpi4py", f"{world.size} of {found.size} processes", "all of them", remedy)
+    return Mpi(world, found)
+
+
+class Mpi:
+    """A ``Communicator`` over an mpi4py communicator. ``timed`` waits for all before each call, to tell waiting apart."""
+
+    def __init__(self, comm: Any, launch: Launch, timed: bool = False) -> None:
+        self._comm, self._launch, self.timed = comm, launch, timed
+        self._failing = comm.Dup()  # where those who fail meet, whatever the others are at
+        self.rank, self.size = comm.rank, comm.size
+        self.local_rank, self.local_size = launch.local_rank, launch.local_size
+        self.exchanged_bytes, self.exchange_s, self.idle_s = 0, 0.0, 0.0
+
+    def add(self, values: np.ndarray) -> None:
+        self._reduce(values, "SUM")
+
+    def largest(self, values: np.ndarray) -> None:
+        self._reduce(values, "MAX")
+
+    def _reduce(self, values: np.ndarray, name: str) -> None:
+        from mpi4py import MPI
+
+        assert values.flags.c_contiguous, "a copy would be reduced, and lost"
+        flat = values.reshape(-1)
+        with self._counted(values.nbytes):
+            for first in range(0, flat.size, _MOST_VALUES):
+                self._comm.Allreduce(MPI.IN_PLACE, flat[first : first + _MOST_VALUES], getattr(MPI, name))
+
+    def any(self, flag: bool) -> bool:
+        flags = np.array([flag], np.int32)
+        self.largest(flags)
+        return bool(flags[0])
+
+    def tell(self, value: Any) -> Any:
+        with self._counted(0):
+            return self._comm.bcast(value, 0)
+
+    def join(self, values: np.ndarray) -> np.ndarray:
+        rows = np.ascontiguousarray(values)
+        with self._counted(rows.nbytes):
+            counts = self._comm.allgather(len(rows))
+            width = int(np.prod(rows.shape[1:], dtype=np.int64))
+            joined = np.empty((sum(counts), *rows.shape[1:]), rows.dtype)
+            self._comm.Allgatherv(rows, [joined, [count * width for count in counts]])
+        return joined
+
+    def gather(self, values: np.ndarray) -> np.ndarray:
+        joined = self.join(np.moveaxis(values, -1, 0))
+        return np.ascontiguousarray(np.moveaxis(joined, 0, -1))
+
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        with self._counted(sum(part.nbytes for part in parts)):
+            return self._comm.alltoall(list(parts))
+
+    def team(self, number: int) -> Mpi:
+        return _Team(self, self._comm.Split(number, self.rank), self._launch)
+
+    def all_fail(self) -> bool:
+        waiting = self._failing.Ibarrier()
+        deadline = time.monotonic() + _PATIENCE_S
+        while not waiting.Test():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.01)
+        return True
+
+    def abort(self, status: int) -> NoReturn:
+        self._comm.Abort(status)
+        raise SystemExit(status)
+
+    @contextmanager
+    def _counted(self, nbytes: int) -> Iterator[None]:
+        begun = time.perf_counter()
+        waited = 0.0
+        if self.timed:
+            self._comm.Barrier()
+            waited = time.perf_counter() - begun
+        try:
+            yield
+        finally:
+            self._note(nbytes, time.perf_counter() - begun, waited)
+
+    def _note(self, nbytes: int, seconds: float, waited: float) -> None:
+        self.exchanged_bytes += nbytes
+        self.exchange_s += seconds
+        self.idle_s += waited
+
+
+class _Team(Mpi):
+    """Some of the ranks; what they exchange counts as the whole's."""
+
+    def __init__(self, whole: Mpi, comm: Any, launch: Launch) -> None:
+        super().__init__(comm, launch, whole.timed)
+        self._whole = whole
+
+    def _note(self, nbytes: int, seconds: float, waited: float) -> None:
+        super()._note(nbytes, seconds, waited)
+        self._whole._note(nbytes, seconds, waited)

@@ -1,0 +1,88 @@
+"""States from files: what a checkpoint may not do to a run that goes on from it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.result import State, state_arrays
+
+_REMEDY = "start without --resume"
+
+
+def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:
+    """InputError unless ``state`` has every array of ``like``, each of its shape and kind, and finite."""
+    for name, found in zip(like, state_arrays(state, list(like)), strict=True):
+        check_array(name, found, np.asarray(like[name]).shape, np.asarray(like[name]).dtype)
+
+
+def check_cloud(state: State, frames: int) -> None:
+    """InputError unless raw (11, G), moments (2, 11, G), statistics (2, G) and a queue of ``frames`` fit each other."""
+    raw, moments, statistics, queue = state_arrays(state, ("raw", "moments", "statistics", "queue"))
+    gaussians = raw.shape[-1] if raw.ndim else 0
+    check_array("raw", raw, (11, max(gaussians, 1)), np.float32)
+    check_array("moments", moments, (2, 11, gaussians), np.float32)
+    check_array("statistics", statistics, (2, gaussians), np.float32)
+    check_array("queue", queue, (min(queue.size, frames),), np.int64)
+    if queue.size and not 0 <= queue.min() <= queue.max() < frames:
+        raise _damaged("queue", f"{queue.min()} to {queue.max()}", f"frames from 0 to {frames - 1}")
+
+
+def check_array(name: str, found: np.ndarray, shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> None:
+    """InputError unless an array of a state has this shape and type, and no NaN or infinity; texts have any length."""
+    wanted = np.dtype(dtype)
+    same = found.dtype.kind == "U" if wanted.kind == "U" else found.dtype == wanted
+    if found.shape != shape or not same:
+        raise _damaged(name, f"shape {found.shape} of {found.dtype}", f"shape {shape} of {wanted}")
+    if wanted.kind == "f" and not np.isfinite(found).all():
+        raise _damaged(name, "NaN or infinity", "finite numbers")
+
+
+def count_of(state: State, name: str, most: int) -> int:
+    """A whole number from 0 to ``most``."""
+    (found,) = state_arrays(state, [name])
+    check_array(name, found, (), np.int64)
+    if not 0 <= int(found) <= most:
+        raise _damaged(name, str(int(found)), f"a whole number from 0 to {most}")
+    return int(found)
+
+
+def parsed(state: State, name: str, kind: type) -> object:
+    """What the JSON text of a state means, of type ``kind``."""
+    (found,) = state_arrays(state, [name])
+    check_array(name, found, (), np.str_)
+    try:
+        content = json.loads(str(found))
+    except (ValueError, RecursionError) as error:
+        raise _damaged(name, "text that is not JSON", "what a run has written") from error
+    if not isinstance(content, kind):
+        raise _damaged(name, f"JSON {type(content).__name__}", f"JSON {kind.__name__}")
+    return content
+
+
+def checked_history(state: State) -> tuple[list[dict[str, float]], float]:
+    """The convergence record so far and its seconds, each line of the record an iteration's numbers."""
+    lines = parsed(state, "record", list)
+    (seconds,) = state_arrays(state, ["seconds"])
+    check_array("seconds", seconds, (), np.float64)
+    assert isinstance(lines, list)
+    for line in lines:
+        if not isinstance(line, dict) or not all(isinstance(v, (int, float)) for v in line.values()):
+            raise _damaged("record", "a line that is no table of numbers", "what a run has written")
+    return lines, float(seconds)
+
+
+def restore_generator(rng: np.random.Generator, state: State) -> None:
+    """Puts a random generator where it was."""
+    content = parsed(state, "rng", dict)
+    try:
+        rng.bit_generator.state = content
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise _damaged("rng", "no state of a random generator", "what a run has written") from error
+
+
+def _damaged(name: str, found: str, expected: str) -> InputError:
+    return InputError(f"checkpoint, array {name}", found, expected, _REMEDY)

@@ -1,0 +1,144 @@
+"""Device memory: how much of it may be taken, how much is, and what happens when there is too little."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import pyopencl as cl
+
+from phyradgs_cl.errors import InputError, OutOfMemoryError
+from phyradgs_cl.runtime.device import DeviceInfo
+
+MEMORY_VARIABLE = "PHYRADGS_MEMORY"
+_SMALLER = 0.25
+_PLANNED = 0.9  # of what is free
+_UNITS = {"": 1, "B": 1}
+for _power, _letter in enumerate("KMGT", start=1):
+    _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class MemoryShortage(OutOfMemoryError):
+    """A buffer that the device, or the limit, has no room for; smaller bricks may do."""
+
+
+@dataclass(eq=False)
+class DeviceArray:
+    """A typed, shaped piece of device memory."""
+
+    buffer: cl.Buffer
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def nbytes(self) -> int:
+        return self.size * self.dtype.itemsize
+
+
+@dataclass(frozen=True)
+class Room:
+    """What an operator may plan with: bytes that are free in all, and the most for one buffer."""
+
+    free_bytes: int
+    largest_bytes: int
+
+    def holds(self, *sizes_bytes: int) -> bool:
+        """Whether buffers of these sizes fit beside each other."""
+        return sum(sizes_bytes) <= self.free_bytes and max(sizes_bytes, default=0) <= self.largest_bytes
+
+    def scaled(self, share: float) -> Room:
+        return Room(int(share * self.free_bytes), int(share * self.largest_bytes))
+
+
+class MemoryLedger:
+    """What is held of a device's memory, against a limit."""
+
+    def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
+        self.device = device
+        self.is_asked = limit_bytes is not None
+        self.limit_bytes = reported_bytes(device) if limit_bytes is None else limit_bytes
+        self.held_bytes = 0
+        self.peak_bytes = 0
+
+    def count(self, nbytes: int) -> None:
+        self.held_bytes += nbytes
+        self.peak_bytes = max(self.peak_bytes, self.held_bytes)
+
+    def room(self, largest_bytes: int) -> Room:
+        """What is left of the limit, but for a little that small tables take; buffers of ``largest_bytes`` at most."""
+        free_bytes = max(self.limit_bytes - self.held_bytes, 0)
+        return Room(int(_PLANNED * free_bytes), min(largest_bytes, self.limit_bytes))
+
+    def check(self, nbytes: int, largest_bytes: int) -> None:
+        """Raises MemoryShortage for a buffer that is too large, or that would pass the limit."""
+        culprit, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
+        remedy = "use a smaller problem"
+        if nbytes > largest_bytes:
+            raise MemoryShortage(culprit, found, f"at most {mebibytes(largest_bytes)}", remedy)
+        if self.held_bytes + nbytes > self.limit_bytes:
+            rest = mebibytes(max(self.limit_bytes - self.held_bytes, 0))
+            expected = f"at most {rest}, what is left of {mebibytes(self.limit_bytes)}"
+            if self.is_asked:
+                remedy = f"allow more with --memory or {MEMORY_VARIABLE}, or {remedy}"
+            raise MemoryShortage(culprit, found, expected, remedy)
+
+    def refused(self, what: str, error: Exception) -> MemoryShortage:
+        """What a driver's refusal is to the rest of the program."""
+        expected = "enough free memory"
+        remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
+        return MemoryShortage(f"memory of {self.device.name}", f"{what} refused ({error})", expected, remedy)
+
+
+def reported_bytes(device: DeviceInfo) -> int:
+    """Free memory where the device tells (AMD's extension), else all of it."""
+    with suppress(cl.Error, AttributeError):
+        if "cl_amd_device_attribute_query" in device.handle.extensions:
+            return int(device.handle.global_free_memory_amd[0]) * 1024
+    return device.memory_bytes
+
+
+def memory_limit(wish: str | int | None) -> int | None:
+    """Bytes that ``wish`` or, without one, the environment variable PHYRADGS_MEMORY allows; None: no limit is asked."""
+    if wish is not None:
+        return bytes_of(wish, "--memory")
+    text = os.environ.get(MEMORY_VARIABLE)
+    return bytes_of(text, MEMORY_VARIABLE) if text else None
+
+
+def bytes_of(wish: str | int, culprit: str) -> int:
+    """2GiB, 1.5 GB, 512M or a plain number of bytes; K, M, G and T alone are powers of 1024, as with iB."""
+    text = "" if isinstance(wish, bool) else str(wish)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
+    factor = _UNITS.get(match.group(2).upper()) if match else None
+    if match is None or factor is None or not 0 < float(match.group(1)) * factor < 2**63:
+        expected, remedy = "a size above 0 with a unit", "write for example 2GiB, 1.5GB or 512M"
+        raise InputError(culprit, repr(wish), expected, remedy)
+    return max(int(float(match.group(1)) * factor), 1)
+
+
+def mebibytes(nbytes: int) -> str:
+    """A size for people: 12 MiB, 0.3 MiB."""
+    size = nbytes / 2**20
+    return f"{size:.0f} MiB" if size >= 10 else f"{size:.2g} MiB"
+
+
+def with_smaller_bricks(what: str, attempt: Callable[[float], T]) -> T:
+    """``attempt(share)`` with all of the room; once more with a quarter of it, and a warning, if there was a shortage."""
+    try:
+        return attempt(1.0)
+    except MemoryShortage as error:
+        said = str(error)  # a log that kept the error itself would keep the buffers of the attempt
+    log.warning("%s: %s; trying again with smaller bricks", what, said)
+    return attempt(_SMALLER)

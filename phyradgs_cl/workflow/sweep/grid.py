@@ -1,0 +1,215 @@
+"""What a sweep's file asks for: scans by pattern, settings by product and one by one, seeds; checked whole."""
+
+from __future__ import annotations
+
+import glob
+import itertools
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError, PhyradgsError
+from phyradgs_cl.io.hdf5 import open_hdf5
+from phyradgs_cl.io.scan_header import read_header
+from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_options
+from phyradgs_cl.runtime import MEMORY_VARIABLE
+from phyradgs_cl.workflow.files import expecting
+
+MOST_RUNS = 100_000
+_LARGEST_SEED = 2**63
+_KEYS = ("scans", "seeds", "options", "grid", "runs")
+_ELSEWHERE = {
+    "seed": "write seeds = [0, 1] at the top",
+    "device": "say it as --device, or in the environment of the workers",
+    "memory": f"say it as {MEMORY_VARIABLE} in the environment of the workers",
+}
+_DEFAULT_METHOD = "phyradgs"
+Table = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A method with its preset and the options that differ from it; ``before`` is done to the frames first."""
+
+    method: str
+    preset: str
+    changes: Table
+    before: Table
+
+    def options(self) -> Any:
+        """The method's options, checked."""
+        return method_options(self.method, self.preset, self.changes)
+
+    @property
+    def label(self) -> str:
+        """The setting in a line: the preset where it is not the method's first, options with dotted names."""
+        usual = next(iter(METHODS[self.method].presets))
+        named = [] if self.preset == usual else [f"preset={self.preset}"]
+        named += [f"{name}={_shown(value)}" for name, value in flat({**self.before, **self.changes})]
+        return " ".join([self.method, *named])
+
+
+@dataclass(frozen=True)
+class SweepGrid:
+    """Every scan is reconstructed with every setting and every seed."""
+
+    scans: tuple[Path, ...]
+    settings: tuple[Setting, ...]
+    seeds: tuple[int, ...]
+
+
+def read_grid(document: Table, path: Path) -> SweepGrid:
+    """The content of GRID.toml as scans, settings and seeds; patterns start at the folder of ``path``.
+
+    Raises InputError for whatever a run would stumble over: unknown keys and options, values out of range, patterns
+    that match nothing, files that are no scans.
+    """
+    for key in document:
+        if key not in _KEYS:
+            close = get_close_matches(key, _KEYS, n=1)
+            remedy = f"did you mean {close[0]!r}?" if close else "leave it out"
+            raise InputError(f"{path}: {key}", "no such key", f"one of {', '.join(_KEYS)}", remedy)
+    settings = _settings(document, path)
+    seeds = _seeds(document.get("seeds", [0]), path)
+    scans = _scans(document.get("scans"), path)
+    if (count := len(scans) * len(settings) * len(seeds)) > MOST_RUNS:
+        raise InputError(str(path), f"{count} runs", f"at most {MOST_RUNS}", "make several files of it")
+    for scan in scans:
+        with expecting(scan, "scan"), open_hdf5(scan) as source:
+            read_header(source)
+    return SweepGrid(scans, settings, seeds)
+
+
+def flat(table: Table, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted name, value) of everything in nested tables."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def _nested(pairs: Iterator[tuple[str, Any]]) -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    for name, value in pairs:
+        *groups, last = name.split(".")
+        inside = table
+        for group in groups:
+            inside = inside.setdefault(group, {})
+        inside[last] = value
+    return table
+
+
+def _shown(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+# --- scans and seeds --------------------------------------------------------------------------------------
+
+
+def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
+    if not _is_list_of(str, patterns):
+        expected = 'a list of file names or patterns, as scans = ["scans/*.h5"]'
+        raise InputError(f"{path}: scans", checks.shown(patterns), expected)
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        start = path.resolve().parent
+        names = sorted(glob.glob(pattern, root_dir=start, recursive=True))
+        if not names:
+            remedy = f"patterns start at the folder of the file, {start}"
+            raise InputError(f"{path}: scans", f"no file for {pattern!r}", "at least one scan file", remedy)
+        found.update((Path(os.path.abspath(start / name)), None) for name in names)
+    return tuple(found)
+
+
+def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
+    fits = _is_list_of(int, seeds) and all(
+        not isinstance(seed, bool) and 0 <= seed <= _LARGEST_SEED for seed in seeds
+    )
+    if not fits:
+        raise InputError(
+            f"{path}: seeds", checks.shown(seeds), f"a list of whole numbers from 0 to {_LARGEST_SEED}"
+        )
+    return tuple(dict.fromkeys(seeds))
+
+
+def _is_list_of(kind: type, values: Any) -> bool:
+    return isinstance(values, list) and bool(values) and all(isinstance(value, kind) for value in values)
+
+
+# --- settings ---------------------------------------------------------------------------------------------
+
+
+def _settings(document: Table, path: Path) -> tuple[Setting, ...]:
+    shared = dict(flat(_table(document.get("options", {}), f"{path}: [options]")))
+    chosen: dict[str, Setting] = {}
+    for where, table in _tables(document, "grid", path):
+        for combination in _product(table, where):
+            setting = _setting({**shared, **combination}, where)
+            chosen.setdefault(repr(setting), setting)
+    for where, table in _tables(document, "runs", path):
+        setting = _setting({**shared, **dict(flat(table))}, where)
+        chosen.setdefault(repr(setting), setting)
+    if not chosen:
+        remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"
+        raise InputError(str(path), "neither [[grid]] nor [[runs]]", "at least one of them", remedy)
+    return tuple(chosen.values())
+
+
+def _tables(document: Table, key: str, path: Path) -> Iterator[tuple[str, Table]]:
+    tables = document.get(key, [])
+    if not isinstance(tables, list):
+        raise InputError(f"{path}: {key}", checks.shown(tables), f"tables that begin with [[{key}]]")
+    for number, table in enumerate(tables, 1):
+        where = f"{path}: [[{key}]] {number}"
+        yield where, _table(table, where)
+
+
+def _table(table: Any, where: str) -> Table:
+    if not isinstance(table, Mapping):
+        raise InputError(where, checks.shown(table), "a table")
+    return table
+
+
+def _product(table: Table, where: str) -> Iterator[dict[str, Any]]:
+    """Every combination of the lists; a value that is no list is a list of one."""
+    axes = {name: values if isinstance(values, list) else [values] for name, values in flat(table)}
+    for name, values in axes.items():
+        if not values:
+            raise InputError(f"{where}: {name}", "an empty list", "the values to try")
+    if (count := math.prod(map(len, axes.values()))) > MOST_RUNS:
+        raise InputError(where, f"{count} combinations", f"at most {MOST_RUNS}")
+    for values in itertools.product(*axes.values()):
+        yield dict(zip(axes, values, strict=True))
+
+
+def _setting(values: dict[str, Any], where: str) -> Setting:
+    """A setting whose options exist and are in range; an error says which table, and which values of it."""
+    try:
+        return _checked(values)
+    except PhyradgsError as error:
+        told = ", ".join(f"{name}={checks.shown(value)}" for name, value in values.items())
+        culprit = f"{where} ({told}): {error.culprit}"
+        raise type(error)(culprit, error.found, error.expected, error.remedy) from error
+
+
+def _checked(values: dict[str, Any]) -> Setting:
+    changes = dict(values)
+    method, preset = changes.pop("method", _DEFAULT_METHOD), changes.pop("preset", None)
+    for name, remedy in _ELSEWHERE.items():
+        if name in changes:
+            raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
+    before = {f.name: changes.pop(f.name) for f in fields(InputOptions) if f.name in changes}
+    input_options(before)
+    nested = _nested(iter(changes.items()))
+    method_options(method, preset, nested)
+    return Setting(method, _preset(method, preset), nested, before)
+
+
+def _preset(method: str, preset: str | None) -> str:
+    return next(iter(METHODS[method].presets)) if preset is None else preset

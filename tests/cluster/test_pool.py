@@ -1,0 +1,122 @@
+"""The workers: one device each, what they raise, what is said where they are missing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from cluster.processes import free_port, wait_until
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.bench import RESULTS, BenchJob, BenchSize, run_bench, run_bench_at_workers
+from phyradgs_cl.bench.results import read_lines
+from phyradgs_cl.cluster import Lost, Pool, Workers
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime
+
+TINY = BenchSize("T", 12, 16, 8)
+
+
+def device_of(number: int) -> tuple[int, str, int]:
+    time.sleep(0.3)
+    return number, os.environ[DEVICE_VARIABLE], os.getpid()
+
+
+def die(number: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def refuse(number: int) -> int:
+    raise InputError("--option", str(number), "another")
+
+
+def test_each_worker_has_a_device_and_gets_one_run_at_a_time() -> None:
+    with Pool(Workers(count=2, device="cpu,0")) as pool:
+        assert pool.dashboard.startswith("http://127.0.0.1:")
+        states = []
+        found = dict(pool.results(device_of, {f"run-{n}": n for n in range(8)}, states.append))
+    assert [found[f"run-{n}"][0] for n in range(8)] == list(range(8))
+    assert {device for _, device, _ in found.values()} == {"cpu", "0"}
+    assert len({pid for _, _, pid in found.values()}) == 2  # processes that stay
+    assert max(state.running for state in states) <= 2 and states[-1].waiting == 0
+
+
+def test_a_run_that_kills_every_worker_is_given_up_and_the_others_are_made() -> None:
+    with Pool(Workers(count=1, device="cpu")) as pool:
+        found = dict(pool.results(die, {"deadly": 1}))
+        assert isinstance(found["deadly"], Lost) and "4 workers died" in found["deadly"].reason
+        assert [pair[1][0] for pair in pool.results(device_of, {"harmless": 3})] == [3]
+
+
+def test_an_error_of_a_run_is_raised_as_it_is() -> None:
+    with Pool(Workers(count=1, device="cpu")) as pool, pytest.raises(InputError, match="--option: found 7"):
+        list(pool.results(refuse, {"run": 7}))
+
+
+def test_no_scheduler_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out")]
+    for where in (f"tcp://127.0.0.1:{free_port()}", str(tmp_path / "none.json"), "nonsense://x"):
+        assert load_cli().run(["bench", "quick", *options, "--scheduler", where]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and f"--scheduler {where}: found no answer" in error
+
+
+def test_a_benchmark_at_workers_gives_the_lines_and_tables_of_one_without(
+    tmp_path: Path, rt: Runtime
+) -> None:
+    job = BenchJob(
+        "table1", tmp_path / "here", size=TINY, names=["jaw"], protocols=["rapid"], rows=["FDK", "SIRT"]
+    )
+    run_bench(job, lambda: Runtime("cpu"))
+    there = replace(job, output=tmp_path / "there")
+    told: list[str] = []
+    run_bench_at_workers(there, Workers(count=2, device="cpu"), told=told.append)
+    volatile = {"seconds", "finished"}
+
+    def lines(where: BenchJob) -> dict[tuple[str, str], dict]:
+        found = read_lines(where.output / RESULTS)
+        kept = {
+            (x["run"], x["acquisition"]): {k: v for k, v in x.items() if k not in volatile} for x in found
+        }
+        assert len(kept) == len(found)
+        return kept
+
+    alone, shared = lines(job), lines(there)
+    assert alone.keys() == shared.keys() and told[0].startswith("http://")
+    for name, line in alone.items():  # Dask gives BLAS one thread: its sums round otherwise
+        assert shared[name].pop("metrics") == pytest.approx(line.pop("metrics"), rel=1e-6)
+        assert shared[name] == line
+    assert sorted(p.name for p in there.output.rglob("*")) == sorted(p.name for p in job.output.rglob("*"))
+    before = (there.output / RESULTS).read_bytes()
+    run_bench_at_workers(there, Workers(count=1, device="cpu"))
+    assert (there.output / RESULTS).read_bytes() == before
+
+
+def test_the_phantoms_pseudo_truth_is_made_by_one_worker(tmp_path: Path) -> None:
+    job = BenchJob("phantom", tmp_path / "out", size=BenchSize("T", 40, 32, 8), rows=["FDK", "PhyRadGS"])
+    run_bench_at_workers(job, Workers(count=2, device="cpu"))
+    found = [(line["label"], line["acquisition"]) for line in read_lines(job.output / RESULTS)]
+    assert len(found) == 6 == len(set(found)) and len(list(job.output.glob("pseudo_truth_*.h5"))) == 1
+
+
+def test_workers_without_the_resource_are_waited_for(sweep_folder, start, tmp_path) -> None:
+    port, log = free_port(), tmp_path / "log.txt"
+    options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+    start("-m", "dask", "scheduler", *options, log=tmp_path / "scheduler.txt")
+    address = f"tcp://127.0.0.1:{port}"
+    worker = ["-m", "dask", "worker", address, "--nthreads", "1", "--no-dashboard"]
+    start(*worker, log=tmp_path / "workers.txt", cwd=tmp_path)
+    (sweep_folder / "grid.toml").write_text('scans = ["a.h5"]\n[[runs]]\nmethod = "fdk"\n')
+    command = ["-m", "phyradgs_cl", "sweep", str(sweep_folder / "grid.toml"), "-o", str(tmp_path / "out")]
+    sweep = start(*command, "--scheduler", address, log=log)
+    wait_until(lambda: "no worker with the resource device" in log.read_text(), 60, log.read_text)
+    start(*worker, "--resources", "device=1", log=tmp_path / "workers.txt", cwd=tmp_path)
+    wait_until(lambda: sweep.poll() is not None, 90, log.read_text)
+    assert sweep.returncode == 0, log.read_text()
+    shutil.rmtree(tmp_path / "out")

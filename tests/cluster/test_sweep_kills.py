@@ -1,0 +1,123 @@
+"""Forty runs while workers are killed at random and the scheduler is restarted: forty results, each once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+from cluster.processes import free_port, stop, wait_until
+
+from phyradgs_cl.io import read_volume
+from phyradgs_cl.io.json_lines import Line, read_lines
+from phyradgs_cl.settings import read_config
+from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, read_grid, run_sweep
+
+RUNS = 40
+
+
+def command(folder: Path, *more: str) -> list[str]:
+    where = [str(folder / "grid.toml"), "-o", str(folder / "out"), "--checkpoint-every", "0.2"]
+    return ["-m", "phyradgs_cl", "sweep", *where, *more]
+
+
+def lines_of(folder: Path) -> list[Line]:
+    path = folder / "out" / RESULTS
+    return read_lines(path) if path.exists() else []
+
+
+def workers_of(process: subprocess.Popen) -> list[psutil.Process]:
+    """The worker processes that a sweep, or a `dask worker`, has started."""
+    try:
+        children = psutil.Process(process.pid).children(recursive=True)
+        return [child for child in children if any("spawn_main" in word for word in child.cmdline())]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def kill_a_worker(process: subprocess.Popen, rng: np.random.Generator) -> bool:
+    found = workers_of(process)
+    if not found:
+        return False
+    os.kill(found[int(rng.integers(len(found)))].pid, signal.SIGKILL)
+    return True
+
+
+def check_all(folder: Path, tmp: Path) -> None:
+    """Forty lines, none twice, none an error; the volumes are those of a sweep that nobody disturbed."""
+    lines = lines_of(folder)
+    assert len(lines) == RUNS == len({line["run"] for line in lines})
+    assert not [line for line in lines if "error" in line]
+    grid = read_grid(read_config(folder / "grid.toml"), folder / "grid.toml")
+    run_sweep(SweepJob(grid, tmp / "alone"))
+    for line in lines:
+        made, expected = (
+            read_volume(root / line["volume"]).volume for root in (folder / "out", tmp / "alone")
+        )
+        np.testing.assert_array_equal(made, expected)
+    assert "40 of 40 runs, 0 failed" in (folder / "out" / "results.md").read_text()
+
+
+def test_workers_killed_at_random_and_the_sweep_itself_once(sweep_folder, start, tmp_path) -> None:
+    """Local workers: their scheduler lives in the sweep's own process, and is killed and started with it."""
+    rng, log = np.random.default_rng(0), tmp_path / "log.txt"
+    run = command(sweep_folder, "--workers", "2", "--device", "cpu")
+    sweep = start(*run, log=log)
+    kills, restarted = 0, False
+    deadline = time.monotonic() + 500
+    while sweep.poll() is None:
+        assert time.monotonic() < deadline, log.read_text()
+        time.sleep(float(rng.uniform(1.0, 4.0)))
+        done = len(lines_of(sweep_folder))
+        if done and kills < 10:
+            kills += kill_a_worker(sweep, rng)
+        if done > RUNS // 2 and not restarted:
+            restarted = True
+            workers = workers_of(sweep)
+            sweep.kill()  # its workers see that it has gone
+            sweep.wait()
+            _, alive = psutil.wait_procs(workers, timeout=30)
+            assert not alive
+            sweep = start(*run, log=log)
+    assert sweep.returncode == 0, log.read_text()
+    assert restarted and kills >= 3
+    check_all(sweep_folder, tmp_path)
+
+
+def test_a_schedulers_restart_is_survived(sweep_folder, start, tmp_path) -> None:
+    """A scheduler and workers of their own: the sweep waits for the scheduler and goes on with what is missing."""
+    rng, log, port = np.random.default_rng(1), tmp_path / "log.txt", free_port()
+    address = f"tcp://127.0.0.1:{port}"
+
+    def scheduler() -> subprocess.Popen:
+        options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+        return start("-m", "dask", "scheduler", *options, log=tmp_path / "scheduler.txt")
+
+    def workers() -> subprocess.Popen:
+        options = ["--nworkers", "2", "--nthreads", "1", "--resources", "device=1", "--no-dashboard"]
+        environment = {**os.environ, "PHYRADGS_DEVICE": "cpu"}
+        dask = ["-m", "dask", "worker", address, *options]
+        return start(*dask, log=tmp_path / "workers.txt", env=environment, cwd=tmp_path)
+
+    first, crew = scheduler(), workers()
+    sweep = start(*command(sweep_folder, "--scheduler", address), log=log)
+
+    def said() -> str:
+        return log.read_text()
+
+    wait_until(lambda: len(lines_of(sweep_folder)) > 5, 200, said)
+    assert kill_a_worker(crew, rng)
+    wait_until(lambda: len(lines_of(sweep_folder)) > 15, 200, said)
+    stop(first)
+    stop(crew)
+    time.sleep(2)
+    assert sweep.poll() is None, said()
+    scheduler(), workers()
+    wait_until(lambda: sweep.poll() is not None, 300, said)
+    assert sweep.returncode == 0, said()
+    assert "is gone: waiting for it" in said() and "is back: going on" in said()
+    check_all(sweep_folder, tmp_path)

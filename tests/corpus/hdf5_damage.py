@@ -1,0 +1,205 @@
+"""Damage to one object of an HDF5 file: every way in which a field may be missing, wrong, boundless or elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+from corpus.case import Damage
+
+Change = Callable[[h5py.File, str], object]
+
+
+def on(address: str, change: Change) -> Damage:
+    """The change of one object as damage of a file."""
+
+    def damage(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            change(file, address)
+
+    return damage
+
+
+def _put(file: h5py.File, address: str, value: object, **how: object) -> None:
+    """Another dataset with the attributes of the old one."""
+    attributes = dict(file[address].attrs)
+    del file[address]
+    file.create_dataset(address, data=value, **how).attrs.update(attributes)
+
+
+def _changed(change: Callable[[np.ndarray], object]) -> Change:
+    return lambda file, address: _put(file, address, change(np.asarray(file[address][()])))
+
+
+def _first(value: float) -> Change:
+    """One number of it, as float64 whatever it was."""
+
+    def change(array: np.ndarray) -> np.ndarray:
+        array = array.astype(np.float64)
+        array.reshape(-1)[:1] = value
+        return array
+
+    return _changed(change)
+
+
+def removed(file: h5py.File, address: str) -> None:
+    del file[address]
+
+
+def _misspelt(file: h5py.File, address: str) -> None:
+    file.move(address, f"{address}s")
+
+
+def _group(file: h5py.File, address: str) -> None:
+    del file[address]
+    file.create_group(address)
+
+
+def _dataset(file: h5py.File, address: str) -> None:
+    del file[address]
+    file[address] = 1.0
+
+
+def _external_link(file: h5py.File, address: str) -> None:
+    """To a good dataset of the same name in a good file beside this one."""
+    outside = Path(file.filename).with_name("outside.h5")
+    with h5py.File(outside, "w") as other:
+        file.copy(address, other, name="there")
+    del file[address]
+    file[address] = h5py.ExternalLink("outside.h5", "/there")
+
+
+def _soft_loop(file: h5py.File, address: str) -> None:
+    del file[address]
+    file[address] = h5py.SoftLink("/loop")
+    file["/loop"] = h5py.SoftLink(address)
+
+
+def _dangling(file: h5py.File, address: str) -> None:
+    del file[address]
+    file[address] = h5py.SoftLink("/nowhere")
+
+
+def _virtual(file: h5py.File, address: str) -> None:
+    shape, dtype = file[address].shape, file[address].dtype
+    outside = Path(file.filename).with_name("outside.h5")
+    with h5py.File(outside, "w") as other:
+        other["there"] = file[address][()]
+    attributes = dict(file[address].attrs)
+    del file[address]
+    layout = h5py.VirtualLayout(shape, dtype)
+    layout[...] = h5py.VirtualSource("outside.h5", "there", shape)
+    file.create_virtual_dataset(address, layout).attrs.update(attributes)
+
+
+def _stored_outside(file: h5py.File, address: str) -> None:
+    values, attributes = np.atleast_1d(file[address][()]), dict(file[address].attrs)
+    raw = Path(file.filename).with_suffix(".raw")
+    values.tofile(raw)
+    del file[address]
+    made = file.create_dataset(
+        address, values.shape, values.dtype, external=[(str(raw), 0, h5py.h5f.UNLIMITED)]
+    )
+    made.attrs.update(attributes)
+
+
+def _null(file: h5py.File, address: str) -> None:
+    _put(file, address, h5py.Empty("f8"))
+
+
+def _references(file: h5py.File, address: str) -> None:
+    shape = file[address].shape
+    values = np.full(shape, file["/"].ref, h5py.ref_dtype) if shape else file["/"].ref
+    _put(file, address, values, dtype=h5py.ref_dtype)
+
+
+def _huge(chunks: bool) -> Change:
+    """Far more declared than stored, in the same number of axes."""
+
+    def change(file: h5py.File, address: str) -> None:
+        axes, attributes = max(file[address].ndim, 1), dict(file[address].attrs)
+        del file[address]
+        shape = (int(1e12 ** (1 / axes)),) * axes
+        made = file.create_dataset(address, shape, "f8", chunks=(64,) * axes if chunks else None)
+        made.attrs.update(attributes)
+
+    return change
+
+
+def _bomb(file: h5py.File, address: str) -> None:
+    """Half a gigabyte of zeros that deflate has shrunk to half a megabyte."""
+    axes, attributes = max(file[address].ndim, 1), dict(file[address].attrs)
+    del file[address]
+    shape = {1: (1 << 27,), 2: (1 << 14, 1 << 13), 3: (512, 512, 512)}[axes]
+    made = file.create_dataset(address, shape, "f4", compression="gzip", compression_opts=1)
+    piece = np.zeros((1 << 22,) if axes == 1 else (512, 512) if axes == 3 else (512, 1 << 13), np.float32)
+    for start in range(0, shape[0], len(piece) if axes < 3 else 1):
+        made[start : start + len(piece) if axes < 3 else start + 1] = piece
+    made.attrs.update(attributes)
+
+
+def _many_times_one_text(file: h5py.File, address: str) -> None:
+    """A hundred thousand entries that are all one text of a megabyte: 100 GB out of a file of 3 MB."""
+    attributes = dict(file[address].attrs)
+    del file[address]
+    made = file.create_dataset(address, (100_000,), h5py.string_dtype(), chunks=(100_000,))
+    made[0] = "a" * (1 << 20)
+    made.attrs.update(attributes)
+    one = made.id.read_direct_chunk((0,))[1][:16]
+    made.id.write_direct_chunk((0,), one * 100_000)
+
+
+FIELD: dict[str, Change] = {
+    "removed": removed,
+    "misspelt": _misspelt,
+    "a group": _group,
+    "a text": lambda f, a: _put(f, a, "text"),
+    "texts": lambda f, a: _put(f, a, ["a", "b"]),
+    "an axis more": _changed(lambda v: np.stack([v, v])),
+    "nothing in it": _changed(lambda v: np.zeros((0, *v.shape[1:]), v.dtype)),
+    "complex": _changed(lambda v: v.astype(np.complex64)),
+    "a compound": _changed(lambda v: np.zeros(v.shape, "f4,f4")),
+    "null": _null,
+    "references": _references,
+    "NaN": _first(np.nan),
+    "infinite": _first(np.inf),
+    "minus infinite": _first(-np.inf),
+    "extreme": _first(1e300),
+    "minus extreme": _first(-1e300),
+    "an external link": _external_link,
+    "a loop of links": _soft_loop,
+    "a dangling link": _dangling,
+    "virtual": _virtual,
+    "stored outside": _stored_outside,
+    "declared huge": _huge(False),
+    "declared huge in chunks": _huge(True),
+}
+TEXT: dict[str, Change] = {
+    **{
+        name: FIELD[name]
+        for name in ("removed", "a group", "texts", "null", "an external link", "a loop of links", "virtual")
+    },
+    "a number": lambda f, a: _put(f, a, 3.5),
+    "another word": lambda f, a: _put(f, a, "whatever"),
+    "not UTF-8": lambda f, a: _put(f, a, np.bytes_(b"\xff\xfe\xfd")),
+    "one text many times": _many_times_one_text,
+}
+GROUP: dict[str, Change] = {
+    "removed": removed,
+    "a dataset": _dataset,
+    "an external link": _external_link,
+    "a loop of links": _soft_loop,
+    "a dangling link": _dangling,
+}
+BOMB: Change = _bomb
+
+
+def attribute(name: str, value: object) -> Change:
+    """One attribute of an object."""
+
+    def change(file: h5py.File, address: str) -> None:
+        file[address].attrs[name] = value
+
+    return change

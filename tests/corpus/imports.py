@@ -1,0 +1,73 @@
+"""Other programs' scans: every damage of tests/importers/hostile.py through the command itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from corpus.case import Case
+
+# format: (good file, its options, table of hostile.py)
+FORMS: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "r2": ("r2", (), "R2"),
+    "phyradgs": ("phyradgs", (), "PHYRADGS"),
+    "phyradgs-real": ("real", ("--pixel-size-mm", "3.0,2.5"), "REAL"),
+    "naf": ("chest.pickle", (), "NAF"),
+    "rtk": ("rtk", (), "RTK"),
+    "data-exchange": (
+        "dx.h5",
+        ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800"),
+        "EXCHANGE",
+    ),
+    "nxtomo": ("nx.h5", (), "NXTOMO"),
+    "tiff": ("tiff", (), "TIFF"),
+}
+
+
+def helpers(name: str) -> ModuleType:
+    """A module of tests/importers, under the name that its own tests have for it."""
+    known = f"{name}_of_importers"
+    if known not in sys.modules:
+        path = Path(__file__).parents[1] / "importers" / f"{name}.py"
+        spec = importlib.util.spec_from_file_location(known, path)
+        assert spec is not None and spec.loader is not None
+        sys.modules[known] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[known])
+    return sys.modules[known]
+
+
+def write_good(folder: Path) -> None:
+    """A good file, or folder, of every format."""
+    writers, truth_of = helpers("writers"), helpers("conftest").truth
+    writer: dict[str, Any] = {
+        "r2": writers.write_r2,
+        "phyradgs": writers.write_phyradgs,
+        "phyradgs-real": writers.write_phyradgs_real,
+        "naf": writers.write_naf,
+        "rtk": writers.write_rtk,
+        "data-exchange": writers.write_data_exchange,
+        "nxtomo": writers.write_nxtomo,
+        "tiff": writers.write_tiff,
+    }
+    geometry = helpers("conftest").GEOMETRY
+    centred = replace(geometry, detector_offset_mm=(4.0, 0.0))
+    for form, (name, _, _) in FORMS.items():
+        truth = truth_of(
+            fly=form.startswith("phyradgs"), geometry=centred if form == "phyradgs-real" else geometry
+        )
+        writer[form](folder / name, truth)
+
+
+def cases() -> Iterator[Case]:
+    """Every format, as it is and damaged."""
+    hostile = helpers("hostile")
+    for form, (name, options, table) in FORMS.items():
+        command = ("import", "{file}", "--format", form, *options, "-o", "{out}")
+        yield Case(f"import of {form}: nothing wrong", name, lambda path: None, command, refused=False)
+        for what, (damage, words) in getattr(hostile, table).items():
+            yield Case(f"import of {form}: {what}", name, damage, command, words=words)

@@ -1,0 +1,83 @@
+"""Every reader of the package on one file or folder: what `fuzz_worker` calls, by name."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from corpus.imports import FORMS
+
+from phyradgs_cl.importers import ImportOptions, import_scan
+from phyradgs_cl.io import checkpoint_path, load_scanner, load_volume, read_checkpoint, read_volume
+from phyradgs_cl.io.json_lines import read_lines
+from phyradgs_cl.settings import read_config
+from phyradgs_cl.workflow.files import load_scan, summary
+
+DATA = Path("/nowhere")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """``read`` is called on a copy of the good file ``of``, of which the file ``inside`` has been changed."""
+
+    of: str
+    read: Callable[[Path], object]
+    inside: str = ""
+
+
+def _fingerprint(good: Path) -> str:
+    with np.load(good) as archive:
+        return str(archive["fingerprint"])
+
+
+def _import(form: str) -> Callable[[Path], object]:
+    options = {
+        "data-exchange": ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0),
+        "phyradgs-real": ImportOptions(pixel_size_mm=(3.0, 2.5)),
+    }
+    return lambda path: import_scan(path, options.get(form), form)
+
+
+def _checkpoint(path: Path) -> object:
+    good = checkpoint_path(path.parents[1] / "good" / "phyradgs")
+    return read_checkpoint(path, _fingerprint(good))
+
+
+READERS: dict[str, Reader] = {
+    "scan": Reader("fly.h5", load_scan),
+    "raw counts": Reader("counts.h5", load_scan),
+    "facts of a scan": Reader("fly.h5", summary),
+    "volume": Reader("volume.h5", read_volume),
+    "facts of a volume": Reader("volume.h5", summary),
+    "bare volume": Reader("bare.h5", load_volume),
+    "scanner": Reader("scanner.toml", lambda path: load_scanner(path, DATA)),
+    "configuration": Reader("run.toml", read_config),
+    "checkpoint": Reader("phyradgs.checkpoint.npz", _checkpoint),
+    "results": Reader("results.jsonl", read_lines),
+    "import of r2, JSON": Reader("r2", _import("r2"), "meta_data.json"),
+    "import of r2, npy": Reader("r2", _import("r2"), "proj_train/0000.npy"),
+    "import of real": Reader("real", _import("phyradgs-real"), "geometric_motion_rs.json"),
+    "import of rtk, XML": Reader("rtk", _import("rtk"), "geometry.xml"),
+    "import of rtk, MHA": Reader("rtk", _import("rtk"), "projections.mha"),
+    "import of tiff, TIFF": Reader("tiff", _import("tiff"), "proj_1.tif"),
+    "import of tiff, TOML": Reader("tiff", _import("tiff"), "scan.toml"),
+    "import of naf": Reader("chest.pickle", _import("naf")),
+    "import of data-exchange": Reader("dx.h5", _import("data-exchange")),
+    "import of nxtomo": Reader("nx.h5", _import("nxtomo")),
+}
+SLOW = ("import of data-exchange", "import of nxtomo")
+"""Each begins with a process of its own."""
+assert {reader.of for reader in READERS.values()} >= {name for name, _, _ in FORMS.values()} - {"phyradgs"}
+
+
+def changed_copy(reader: Reader, good: Path, folder: Path, content: bytes) -> Path:
+    """The good file with ``content`` in place of what is changed, in ``folder``, which is emptied first."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    path = folder / reader.of
+    (shutil.copytree if (good / reader.of).is_dir() else shutil.copy)(good / reader.of, path)
+    (path / reader.inside if reader.inside else path).write_bytes(content)
+    return path

@@ -1,0 +1,150 @@
+"""Changed bytes under every reader: what comes is a value or an error of ours, soon and in little memory.
+
+Hypothesis draws the changes and, where one is wrong, shrinks it; its bytes are to be kept in ``kept/``, which is read
+first. `make stress` goes on for STRESS × 36 s, half an hour at STRESS=50.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from pathlib import Path
+
+import pytest
+from corpus.good import write_good
+from corpus.readers import READERS, SLOW, changed_copy
+from corpus.runner import Runner
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+STRESS = int(os.environ.get("STRESS", "1"))
+SECONDS_OF_STRESS = 36.0
+FEW = 12
+SECONDS, MEGABYTES = 10.0, 1000.0
+KEPT = Path(__file__).with_name("kept")
+CHANGE = st.tuples(
+    st.sampled_from(["set", "set", "flip", "insert", "delete", "cut", "number", "copy"]),
+    st.floats(0, 1),
+    st.booleans(),
+    st.binary(min_size=1, max_size=8),
+)
+NUMBERS = [
+    b"\xff" * 8,
+    b"\0" * 8,
+    b"\xff" * 4,
+    b"\x7f\xff\xff\xff",
+    b"\0\0\0\x80",
+    b"nan",
+    b"1e400",
+    b"-1",
+    b"9" * 30,
+]
+
+
+def changed(data: bytes, changes: list[tuple[str, float, bool, bytes]]) -> bytes:
+    """``data`` after some changes, each at a share of its length, or of its first 2 kB."""
+    new = bytearray(data)
+    for kind, share, early, some in changes:
+        at = int(share * (min(len(new), 2048) if early else len(new)))
+        if kind == "set":
+            new[at : at + len(some)] = some
+        elif kind == "flip" and at < len(new):
+            new[at] ^= 1 << (some[0] % 8)
+        elif kind == "insert":
+            new[at:at] = some
+        elif kind == "delete":
+            del new[at : at + some[0] + 1]
+        elif kind == "cut":
+            del new[at:]
+        elif kind == "number":
+            number = NUMBERS[some[0] % len(NUMBERS)]
+            new[at : at + len(number)] = number
+        elif kind == "copy":
+            new[at:at] = new[max(0, at - 4 * some[0]) : at]
+    return bytes(new)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Path:
+    folder = write_good(tmp_path_factory.mktemp("fuzz") / "good")
+    lines = [json.dumps({"run": name, "options": {"a": [1, 2.5]}}) for name in ("one", "two", "three")]
+    (folder / "results.jsonl").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def worker():
+    runner = Runner("fuzz_worker.py")
+    yield runner
+    runner.close()
+
+
+def check(worker: Runner, good: Path, name: str, content: bytes) -> None:
+    """AssertionError unless the reader bears ``content``."""
+    path = changed_copy(READERS[name], good, good.parent / "try", content)
+    answer = worker.answer([name, str(path)])
+    assert answer is not None, f"{name}: the process died, or did not answer"
+    said, seconds, megabytes = answer
+    assert said in ("value", "refused"), f"{name}: {said}"
+    assert seconds < SECONDS and megabytes < MEGABYTES, f"{name}: {seconds} s, {megabytes} MB"
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_good_files_are_read(good, worker, name) -> None:
+    """What follows would prove nothing if the readers refused everything."""
+    reader = READERS[name]
+    path = changed_copy(reader, good, good.parent / "try", _content(good, name))
+    assert worker.answer([name, str(path)])[0] == "value"
+
+
+@pytest.mark.parametrize("path", sorted(KEPT.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_what_once_went_wrong(good, worker, path) -> None:
+    check(worker, good, path.parent.name.replace("_", " "), path.read_bytes())
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_changed_bytes(good, worker, name) -> None:
+    content = _content(good, name)
+    until_s = time.monotonic() + (STRESS - 1) * SECONDS_OF_STRESS / len(READERS)
+    examples = FEW // 4 if name in SLOW else FEW
+    while True:
+        _fuzz(worker, good, name, content, examples if STRESS == 1 else 200)
+        if time.monotonic() >= until_s:
+            break
+
+
+def _fuzz(worker: Runner, good: Path, name: str, content: bytes, examples: int) -> None:
+    phases = [Phase.explicit, Phase.generate] + ([Phase.shrink] if STRESS > 1 else [])
+
+    @settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        derandomize=STRESS == 1,
+        phases=phases,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.lists(CHANGE, min_size=1, max_size=6))
+    def bears(changes: list[tuple[str, float, bool, bytes]]) -> None:
+        new = changed(content, changes)
+        try:
+            check(worker, good, name, new)
+        except AssertionError:
+            _keep(good, name, new)
+            raise
+
+    bears()
+
+
+def _keep(good: Path, name: str, content: bytes) -> None:
+    """The bytes, where whoever runs this finds them: move them to kept/READER/ once they are understood."""
+    folder = good.parent / "wrong" / name.replace(" ", "_")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / hashlib.sha256(content).hexdigest()[:16]).write_bytes(content)
+
+
+def _content(good: Path, name: str) -> bytes:
+    reader = READERS[name]
+    return (good / reader.of / reader.inside if reader.inside else good / reader.of).read_bytes()

@@ -1,0 +1,120 @@
+"""A device that fails at any launch: one line, its own status, outputs as they were, runs that go on to the same bits."""
+
+from __future__ import annotations
+
+import os
+
+import faults_kit as kit
+import numpy as np
+import pytest
+
+from phyradgs_cl.io import checkpoint_path
+from phyradgs_cl.runtime import context
+
+# STRESS is what `make stress` sets: there every launch of a run fails once
+MOST = 3 if int(os.environ.get("STRESS", "1")) == 1 else 100_000
+RUNS = {
+    "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
+    "cgls": ["--method", "cgls", "--iterations", "5", "--set", "noise_stop=0"],
+    "fista-tv": ["--method", "fista-tv", "--iterations", "4"],
+    "os-sart": ["--method", "os-sart", "--iterations", "4"],
+    "asd-pocs": ["--method", "asd-pocs", "--iterations", "4"],
+    "phyradgs": ["--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],
+}
+
+
+def command(scan, output, options) -> list[object]:
+    return ["reconstruct", scan, "-o", output, *options, "--checkpoint-every", "1e-6"]
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_device_that_fails_at_any_launch(run, scan, tmp_path, capfd, launches, name) -> None:
+    whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
+    launches.arm(None)
+    assert run(*command(scan, whole, RUNS[name])) == 0
+    kept = 0
+    for at in np.unique(np.linspace(1, launches.calls, MOST).astype(int)):
+        output.write_bytes(kit.OLD)
+        capfd.readouterr()
+        launches.arm(int(at))
+        assert run(*command(scan, output, RUNS[name])) == 5
+        line = capfd.readouterr().err.splitlines()[-1]
+        assert (
+            line.startswith("phyradgs: device ") and "a launch of" in line and "INVALID_COMMAND_QUEUE" in line
+        )
+        assert output.read_bytes() == kit.OLD
+        left = kit.names(tmp_path)
+        assert left in (["v.h5", "whole.h5"], ["v.h5", "v.h5.checkpoint.npz", "whole.h5"])
+        assert ("--resume goes on from iteration" in line) == (len(left) == 3)
+        kept += len(left) == 3
+        launches.arm(None)
+        assert run(*command(scan, output, RUNS[name]), *kit.resume_if_kept(output)) == 0
+        kit.same_bits(output, whole)
+        assert kit.names(tmp_path) == ["v.h5", "whole.h5"]
+    assert kept > 0
+
+
+@pytest.mark.parametrize("method", ["fdk", "sirt"])
+def test_a_copy_that_fails_is_named(run, scan, tmp_path, capfd, copies, method) -> None:
+    copies.arm(2)
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", method) == 5
+    assert "failed (injected" in capfd.readouterr().err.splitlines()[-1]
+    assert kit.names(tmp_path) == []
+
+
+@pytest.mark.parametrize("code", [-4, -5, -6])
+def test_memory_that_the_driver_misses_at_a_launch(run, scan, tmp_path, capfd, launches, code) -> None:
+    launches.arm(1, code)
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", "sirt") == 6
+    assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: memory of ")
+    assert kit.names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["sirt", "phyradgs"])
+def test_memory_that_is_missed_late_leaves_the_checkpoint(
+    run, scan, tmp_path, capfd, launches, copies, name
+) -> None:
+    """The launch went well, and whatever waits for it next is told."""
+    whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
+    assert run(*command(scan, whole, RUNS[name])) == 0
+    copies.arm(int(0.95 * copies.calls), -5)
+    capfd.readouterr()
+    assert run(*command(scan, output, RUNS[name])) == 6
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith("phyradgs: memory of ") and "--resume goes on from iteration" in line
+    assert checkpoint_path(output).exists() and not output.exists()
+    copies.arm(None)
+    assert run(*command(scan, output, RUNS[name]), "--resume") == 0
+    kit.same_bits(output, whole)
+
+
+@pytest.mark.parametrize("method", ["fdk", "sirt", "cgls", "fista-tv", "phyradgs"])
+def test_a_memory_that_is_too_small(run, scan, tmp_path, capfd, monkeypatch, method) -> None:
+    """An allocator that refuses above a limit, as a device does that somebody else uses too."""
+    real, limit_bytes, held = kit.cl.Buffer, 3_000, []
+
+    def small(context: object, flags: object, size: int) -> object:
+        if sum(held) + size > limit_bytes:
+            raise kit.cl_error(-4)
+        held.append(size)
+        return real(context, flags, size)
+
+    monkeypatch.setattr(context.cl, "Buffer", small)
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", method) == 6
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith("phyradgs: memory of ") and "MEM_OBJECT_ALLOCATION_FAILURE" in line
+    assert kit.names(tmp_path) == []
+
+
+def test_a_kernel_that_does_not_build_is_named(run, scan, tmp_path, capfd, monkeypatch) -> None:
+    real = context.kernel_source
+    broken = lambda name: real(name) + "\nkernel void broken(global float *x) { x[0] = y; }\n"  # noqa: E731
+    monkeypatch.setattr(context, "kernel_source", broken)
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", "sirt") == 5
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert (
+        line.startswith("phyradgs: kernel ")
+        and ".cl on " in line
+        and "expected a program that builds" in line
+    )
+    assert kit.names(tmp_path) == []

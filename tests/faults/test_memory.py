@@ -1,0 +1,118 @@
+"""A machine whose memory runs out: one line, status 6, nothing half written."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import faults_kit as kit
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import OutOfMemoryError
+from phyradgs_cl.reconstructors import sirt
+
+# In a process of its own that may map no more than so many MiB beyond what it has at the start.
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.runtime import Runtime
+cli = load_cli()
+Runtime()
+pages = int(Path("/proc/self/statm").read_text().split()[0])
+limit = pages * resource.getpagesize() + (int(sys.argv[1]) << 20)
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+sys.exit(cli.run(sys.argv[2:]))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="address space limits of POSIX")
+@pytest.mark.parametrize("source", ["phantom", "scan"])
+def test_a_machine_without_memory_is_said(scan, tmp_path, source) -> None:
+    output = tmp_path / "v.h5"
+    output.write_bytes(kit.OLD)
+    words = ["simulate", "--phantom", "jaw", "--size", "512", "--detector", "16", "--views", "2"]
+    if source == "scan":
+        words = ["reconstruct", str(_large_grid(scan, tmp_path)), "--method", "sirt"]
+    command = [sys.executable, "-c", LIMITED, "256", *words, "-o", str(output)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("phyradgs:")]
+    assert (done.returncode, len(lines)) == (6, 1), done.stderr
+    assert lines[0].startswith("phyradgs: memory of ") and "Traceback" not in done.stderr
+    assert output.read_bytes() == kit.OLD
+    assert set(kit.names(tmp_path)) <= {"large.h5", "v.h5"}
+
+
+def _large_grid(scan, folder):
+    """The scan with half a gigabyte of voxels to reconstruct."""
+    import h5py
+
+    path = folder / "large.h5"
+    path.write_bytes(scan.read_bytes())
+    with h5py.File(path, "r+") as file:
+        extra = file["entry/phyradgs"]
+        extra["grid/shape"][...] = 512
+        del extra["reference"]
+    return path
+
+
+def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(
+    run, scan, tmp_path, capfd, monkeypatch
+) -> None:
+    whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
+    words = ["--method", "sirt", "--iterations", "6", "--checkpoint-every", "1e-6"]
+    assert run("reconstruct", scan, "-o", whole, *words) == 0
+    steps: list[int] = []
+    step = sirt.Sirt.step
+
+    def failing(self: sirt.Sirt) -> float:
+        steps.append(1)
+        if len(steps) == 4:
+            raise MemoryError("Unable to allocate 9.0 GiB")
+        return step(self)
+
+    monkeypatch.setattr(sirt.Sirt, "step", failing)
+    capfd.readouterr()
+    assert run("reconstruct", scan, "-o", output, *words) == OutOfMemoryError.exit_code
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line == (
+        "phyradgs: memory of this machine: found too little (Unable to allocate 9.0 GiB); expected enough; "
+        "use a smaller problem, or a machine with more; --resume goes on from iteration 3"
+    )
+    monkeypatch.setattr(sirt.Sirt, "step", step)
+    assert run("reconstruct", scan, "-o", output, *words, "--resume") == 0
+    kit.same_bits(output, whole)
+
+
+@pytest.mark.parametrize("method", ["sirt", "os-sart", "cgls", "fista-tv", "asd-pocs"])
+def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch, method) -> None:
+    from phyradgs_cl.reconstructors import iterative
+
+    iterate = iterative._Loop._iterate
+
+    def poisoned(self: iterative._Loop) -> None:
+        if self.iteration == 2:
+            self.measured_norm = float("nan")
+        iterate(self)
+
+    monkeypatch.setattr(iterative._Loop, "_iterate", poisoned)
+    words = ["--method", method, "--iterations", "5", "--checkpoint-every", "1e-6"]
+    words += ["--set", "noise_stop=0"] if method == "cgls" else []
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith("phyradgs: residual: found nan at iteration 3; expected a finite number")
+    assert line.endswith("--resume goes on from iteration 2")
+    assert kit.names(tmp_path) == ["v.h5.checkpoint.npz"]
+
+
+def test_a_loss_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch) -> None:
+    from phyradgs_cl.objective import ImageLoss
+
+    value = ImageLoss.value
+    monkeypatch.setattr(ImageLoss, "value", lambda self: value(self) * np.float32("nan"))
+    words = ["--iterations", "60", "--gaussians", "20"]
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
+    assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: loss: found nan at iteration 50")
+    assert os.listdir(tmp_path) == []

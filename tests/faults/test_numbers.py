@@ -1,0 +1,161 @@
+"""Numbers at the edge of what may be asked: results are finite, or an error of ours says which number is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import faults_kit as kit
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, static_cells
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import NumericalError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.gaussians import DENSITY, MEAN, SCALE
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, RayOperator, SplatProjector, voxelise
+from phyradgs_cl.operators.layout import pad_rows
+from phyradgs_cl.optim import DeviceAdam
+from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.workflow.files import load_scan
+
+SHAPE = (6, 7)
+GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (0.6, 0.6))
+GRID = Grid.cube(8, 2.0)
+
+
+def one_cell(geometry: ConeGeometry, angle_rad: float = 0.3) -> TimeCells:
+    orbit = CircularOrbit(geometry, ConstantSpeed(angle_rad, 0.0))
+    return static_cells(orbit, Shutter(0.1), 0, 0.0, geometry.detector_shape[0])
+
+
+def drawn_and_pulled(
+    rt, rows: np.ndarray, cells: TimeCells, **options: object
+) -> tuple[np.ndarray, np.ndarray]:
+    """The frame (6, 7) and the gradient (13, G) of its sum."""
+    projector = SplatProjector(rt, *SHAPE, **options)
+    on_device, gaussians = DeviceCells.upload(rt, cells), DeviceGaussians.upload(rt, rows)
+    frame = projector.project(rows, on_device)
+    projector.forward(gaussians, on_device)
+    gradients = rt.zeros((13, gaussians.stride))
+    ones = rt.upload(pad_rows(np.ones(SHAPE, np.float32)))
+    projector.backward(gaussians, on_device, ones, gradients)
+    return frame, rt.download(gradients)[:, : gaussians.count]
+
+
+@pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
+@pytest.mark.parametrize("footprint", [False, True], ids=["points", "areas"])
+def test_gaussians_at_the_bounds_of_their_parameters(rt, make_cloud, affine, footprint) -> None:
+    """Raw parameters as large as float32 lets an optimiser drive them: the activation keeps everything in bounds."""
+    activation = SplatOptions().activation(GRID)
+    raw = np.random.default_rng(0).choice([-1e4, -50.0, 0.0, 50.0, 1e4], (11, 64)).astype(np.float32)
+    raw[MEAN] = np.random.default_rng(1).uniform(-1, 1, (3, 64))
+    rows = activation.apply(raw.astype(np.float64))
+    assert np.isfinite(rows).all() and rows[SCALE].min() > 0
+    frame, gradients = drawn_and_pulled(
+        rt, rows, one_cell(GEOMETRY), affine=affine, pixel_footprint=footprint
+    )
+    assert np.isfinite(frame).all() and np.isfinite(gradients).all()
+    assert np.isfinite(voxelise(rt, rows, GRID)).all()
+
+
+def test_the_activation_on_the_device_stays_finite_too(rt) -> None:
+    activation, count = SplatOptions().activation(GRID), 64
+    raw = np.random.default_rng(2).choice([-1e4, -60.0, -1.0, 60.0, 1e4], (11, count)).astype(np.float32)
+    rows = rt.zeros((11, count))
+    DeviceAdam(rt, activation).activate(rt.upload(raw), rows, count, count)
+    found = rt.download(rows)
+    assert np.isfinite(found).all() and found[SCALE].min() > 0 and found[DENSITY].min() >= 0
+
+
+@pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
+def test_gaussians_at_the_source_behind_it_and_in_its_plane(rt, make_cloud, affine) -> None:
+    cells = one_cell(GEOMETRY)
+    source, to_detector = cells.pose[0, :3], -cells.pose[0, :3] / np.linalg.norm(cells.pose[0, :3])
+    across = np.cross(to_detector, [0.0, 0.0, 1.0])
+    rows = make_cloud(12, 5)
+    for index, place in enumerate((0.0, 1e-7, -1e-7, 1e-3, -1e-3, -0.5, 0.05)):
+        rows[MEAN, index] = source + place * to_detector
+    for index, place in enumerate((1e-3, 0.1, 1.0, -3.0, 100.0), start=7):
+        rows[MEAN, index] = source + place * across
+    for cutoff_sigma in (0.0, 3.0):
+        frame, gradients = drawn_and_pulled(rt, rows, cells, affine=affine, cutoff_sigma=cutoff_sigma)
+        assert np.isfinite(frame).all() and np.isfinite(gradients).all()
+
+
+@pytest.mark.parametrize("distance", [1e-3, 0.25, 0.5, 0.999, 1.0])
+def test_a_source_inside_the_volume(rt, make_cloud, distance) -> None:
+    geometry = ConeGeometry(distance, distance + 3.0, SHAPE, (0.6, 0.6))
+    cells = one_cell(geometry)
+    operator = RayOperator(rt, GRID, SHAPE, [cells])
+    assert np.isfinite(operator.forward(np.ones(GRID.shape, np.float32))).all()
+    assert np.isfinite(operator.adjoint(np.ones(operator.frames_shape, np.float32))).all()
+    frame, gradients = drawn_and_pulled(rt, make_cloud(20, 6), cells)
+    assert np.isfinite(frame).all() and np.isfinite(gradients).all()
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi / 4, np.pi / 2])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 5), (4, 4)])
+def test_rays_through_vertices_and_along_faces(rt, turn, shape) -> None:
+    """The central ray of odd detectors runs in planes of voxels' faces or through corners; a voxel counts once."""
+    geometry = ConeGeometry(1e6, 1e6 + 2.0, shape, (0.5, 0.5))  # all but parallel
+    operator = RayOperator(rt, Grid.cube(4, 2.0), shape, [one_cell(geometry, turn)])
+    frame = operator.forward(np.ones((4, 4, 4), np.float32))
+    assert np.isfinite(frame).all() and frame.max() <= 2 * np.sqrt(2) * 1.01
+    if shape == (1, 1):
+        assert frame.item() == pytest.approx(2 / max(abs(np.cos(turn)), abs(np.sin(turn))), rel=0.26)
+    assert np.isfinite(operator.adjoint(np.ones((1, *shape), np.float32))).all()
+
+
+@pytest.mark.parametrize("counts", ["no light at all", "one photon here and there", "saturated"])
+def test_any_dose(counts) -> None:
+    """Line integrals are finite wherever the mask says that they may be used; no light is said."""
+    rng = np.random.default_rng(0)
+    light = {
+        "no light at all": np.zeros((4, 6, 7), np.uint16),
+        "one photon here and there": rng.binomial(1, 0.05, (4, 6, 7)).astype(np.uint16),
+        "saturated": np.full((4, 6, 7), 65535, np.uint16),
+    }[counts]
+    data = np.concatenate([np.full((1, 6, 7), 100, np.uint16), light])
+    integrals, bad = counts_to_attenuation(data, np.array([1, 0, 0, 0, 0]), "counts")
+    assert np.isfinite(integrals).all()
+    if counts == "no light at all":
+        assert bad is not None and bad.all()
+
+
+@pytest.mark.parametrize("noise", ["tigre", "beer"])
+@pytest.mark.parametrize("dose", ["1e-3", "1", "1e12"])
+def test_scans_of_any_dose(run, tmp_path, noise, dose) -> None:
+    path = tmp_path / "scan.h5"
+    words = ["simulate", *kit.TINY, "--noise", noise, "--dose", dose, "--electronic-noise", "20"]
+    assert run(*words, "-o", path) == 0
+    assert np.isfinite(load_scan(path).projections).all()
+
+
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in ("naf", "sax-nerf")])
+@pytest.mark.parametrize("values", ["zero", "tiny", "huge", "negative", "one pixel", "alternating"])
+def test_any_finite_scan(rt, scan, method, values) -> None:
+    """Whatever numbers are measured: a finite volume, or an error that names what is not."""
+    loaded = load_scan(scan)
+    frames = {
+        "zero": np.zeros_like(loaded.projections),
+        "tiny": np.full_like(loaded.projections, 1e-30),
+        "huge": np.full_like(loaded.projections, 1e6),
+        "negative": np.full_like(loaded.projections, -1.0),
+        "one pixel": np.where(np.arange(loaded.projections.size) == 70, 50.0, 0.0),
+        "alternating": np.where(np.arange(loaded.projections.size) % 2, 1e5, -1e5),
+    }[values]
+    frames = frames.reshape(loaded.projections.shape).astype(np.float32)
+    changes = {} if method == "fdk" else {"iterations": 3}
+    if method in ("phyradgs", "r2"):
+        changes = {"iterations": 6, "gaussians": 20}
+    options = method_options(method, None, changes)
+    with np.errstate(all="ignore"):
+        try:
+            result = reconstruct(replace(loaded, projections=frames), method, rt, options, seed=0)
+        except NumericalError as error:
+            assert values in ("huge", "alternating") and error.found
+            return
+    assert np.isfinite(result.volume).all()

@@ -1,0 +1,181 @@
+"""The parts of the fields against plain twins: hash encoding, attention in segments, pixels, voxels in bricks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tolerances import FLOAT32
+
+from phyradgs_cl.errors import DeviceError, InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural import LineOptions, NeuralOptions
+from phyradgs_cl.neural.fields import first_field
+from phyradgs_cl.neural.hash_encoding import HashEncoding, corners
+from phyradgs_cl.neural.line_attention import LineAttention
+from phyradgs_cl.neural.neural_field import voxel_values
+from phyradgs_cl.neural.pixel_choice import chosen_times, scattered_pixels, windows_and_scattered_pixels
+from phyradgs_cl.neural.torch_device import torch_device
+
+CPU = torch.device("cpu")
+
+
+def plain_encoding(encoding: HashEncoding, position: np.ndarray) -> np.ndarray:
+    """Features of one position (3,), a corner at a time, with 64-bit whole numbers for the hash."""
+    table = np.array(encoding.table.tolist())
+    features, start = [], 0
+    for cells, size in zip(encoding.resolutions, encoding.sizes, strict=True):
+        low = np.minimum(np.floor(position * cells), cells - 1).astype(int)
+        rest = position * cells - low
+        total = np.zeros(encoding.features)
+        for corner in np.ndindex(2, 2, 2):
+            x, y, z = (int(n) for n in low + corner)
+            if (cells + 1) ** 3 <= size:
+                entry = x + y * (cells + 1) + z * (cells + 1) ** 2
+            else:
+                entry = (x ^ (y * 2654435761) ^ (z * 805459861)) % size
+            total += table[start + entry] * np.prod(np.where(corner, rest, 1 - rest))
+        features.append(total)
+        start += size
+    return np.concatenate(features)
+
+
+def test_the_encoding_is_its_definition_and_so_is_its_gradient() -> None:
+    encoding = HashEncoding(4, 2, 3, 2.0, 9).double()  # 4³ and 7³ entries, then two hashed levels
+    assert encoding.sizes == [64, 343, 512, 512]
+    with torch.no_grad():
+        encoding.table.uniform_(-1, 1)
+    rng = np.random.default_rng(0)
+    positions = np.concatenate([rng.random((20, 3)), [[0, 0, 0], [1, 1, 1], [0.5, 1, 0]]])
+    found = encoding(torch.tensor(positions))
+    expected = [plain_encoding(encoding, x) for x in positions]
+    assert np.allclose(found.tolist(), expected, atol=1e-12)
+    # linear in the table: the gradient of <y, E(table)> is the transpose of E
+    weights = torch.tensor(rng.normal(size=found.shape))
+    (found * weights).sum().backward()
+    direction = torch.tensor(rng.normal(size=encoding.table.shape))
+    by_gradient = float((encoding.table.grad * direction).sum())
+    with torch.no_grad():
+        encoding.table.copy_(direction)
+        assert float((encoding(torch.tensor(positions)) * weights).sum()) == pytest.approx(
+            by_gradient, rel=1e-9
+        )
+
+
+def test_corner_weights_sum_to_one_and_entries_are_in_the_table() -> None:
+    positions = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+    for cells, size in ((5, 216), (64, 1000)):
+        entry, weight = corners(positions, cells, size)
+        assert int(entry.min()) >= 0 and int(entry.max()) < size
+        assert torch.allclose(weight.sum(0), torch.ones(1000)) and float(weight.min()) >= 0
+
+
+def test_attention_stays_within_segments_and_is_its_definition() -> None:
+    torch.manual_seed(0)
+    segment, heads, head_width, width = 3, 2, 4, 6
+    layer = LineAttention(width, segment, heads, head_width).double()
+    values = torch.randn(4 * segment, width, dtype=torch.float64)
+    found = layer(values)
+    q, kv = layer.to_query(values), layer.to_key_value(values)
+    expected = torch.empty(len(values), heads * head_width, dtype=torch.float64)
+    for first in range(0, len(values), segment):
+        rows = slice(first, first + segment)
+        for head in range(heads):
+            part = slice(head * head_width, (head + 1) * head_width)
+            key, value = kv[rows, : heads * head_width][:, part], kv[rows, heads * head_width :][:, part]
+            likeness = q[rows, part] @ key.T / head_width**0.5 + layer.position[head]
+            expected[rows, part] = torch.softmax(likeness, 1) @ value
+    assert torch.allclose(found, layer.to_output(expected), atol=1e-12)
+    values[0] += 1.0
+    changed = (layer(values) != found).any(1)
+    assert changed[:segment].all() and not changed[segment:].any()
+
+
+@pytest.mark.parametrize("options", [NeuralOptions(), LineOptions(segment=4)], ids=["naf", "sax-nerf"])
+def test_bricks_of_voxels_do_not_matter_and_voxels_lie_where_the_grid_says(options) -> None:
+    field = first_field(options, 16, 0)
+    grid = Grid((3, 5, 6), (0.2, 0.2, 0.3))  # half the longest side is 0.9
+    grid = grid.scaled(1 / grid.half_longest_mm)
+    whole = voxel_values(field, grid, CPU, 10**6)
+    assert whole.shape == grid.shape and whole.dtype == np.float32
+    assert np.allclose(whole, voxel_values(field, grid, CPU, 1), rtol=FLOAT32)
+
+    class Position(torch.nn.Module):
+        segment = options.__dict__.get("segment", 1)
+
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return x[:, 0] + 10 * x[:, 1] + 100 * x[:, 2]
+
+    z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    assert np.allclose(voxel_values(Position(), grid, CPU, 20), x + 10 * y + 100 * z, atol=1e-4)
+
+
+def test_the_field_starts_at_its_share_of_the_bound() -> None:
+    positions = torch.rand(100, 3) * 2 - 1
+    for share in (0.05, 0.5):
+        options = NeuralOptions(first_share=share, density_bound=4.0)
+        values = first_field(options, 16, 1)(positions)
+        assert float(values.mean()) == pytest.approx(4 * share, rel=0.5) and float(values.max()) < 4
+    assert float(first_field(NeuralOptions(last_activation="leaky-relu"), 16, 1)(positions).min()) > -1
+
+
+def test_the_same_seed_draws_the_same_field_and_leaves_others_draws_alone() -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    one, two, other = (first_field(LineOptions(), 16, seed) for seed in (1, 1, 2))
+    assert torch.equal(torch.rand(3), expected)
+    pairs = list(zip(one.parameters(), two.parameters(), other.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b, _ in pairs)
+    assert not all(torch.equal(a, c) for a, _, c in pairs)
+
+
+def test_scattered_pixels_are_usable_and_each_drawn_once() -> None:
+    rng = np.random.default_rng(0)
+    usable = rng.random((9, 7)) < 0.5
+    pixels = scattered_pixels(usable, 20, rng)
+    assert len(np.unique(pixels, axis=0)) == len(pixels) == 20
+    assert usable[tuple(pixels.T)].all()
+    assert len(scattered_pixels(usable, 1000, rng)) == usable.sum()
+    assert scattered_pixels(np.zeros((3, 3), bool), 4, rng).shape == (0, 2)
+
+
+def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
+    rng = np.random.default_rng(0)
+    usable = np.ones((17, 14), bool)
+    usable[5, 5] = False
+    pixels = windows_and_scattered_pixels(usable, 30, 3, 4, rng)
+    assert len(pixels) == 3 * 16 + 30 == len(np.unique(pixels, axis=0))
+    local = pixels[:48].reshape(3, 16, 2)
+    for window in local:
+        low = window.min(0)
+        assert np.all(low % 4 == 0) and np.all(window.max(0) == low + 3)
+    assert usable[tuple(pixels.T)].all()
+    every = windows_and_scattered_pixels(usable, 10_000, 100, 4, rng)
+    assert len(every) == usable.sum()
+
+
+def test_times_are_drawn_evenly_and_without_repeats() -> None:
+    times = chosen_times(20_000, 5, 2, np.random.default_rng(0))
+    assert np.all(times[:, 0] != times[:, 1])
+    assert np.allclose(np.bincount(times.ravel(), minlength=5) / times.size, 0.2, atol=0.01)
+    assert np.array_equal(chosen_times(2, 3, 3, np.random.default_rng(0)), [[0, 1, 2]] * 2)
+
+
+def test_a_device_that_pytorch_lacks_is_refused() -> None:
+    assert torch_device("cpu") == CPU
+    missing = [name for name in ("cuda", "mps") if not getattr(torch, name).is_available()]
+    for name in missing:
+        with pytest.raises(DeviceError, match=f"torch_device: found no {name} in PyTorch"):
+            torch_device(name)
+    assert torch_device("auto").type in {"cuda", "mps", "cpu"}
+
+
+def test_options_that_do_not_go_together_are_refused() -> None:
+    with pytest.raises(InputError, match="levels: found a finest level"):
+        NeuralOptions(levels=32)
+    assert NeuralOptions().samples_for(64) == 96
+    assert [NeuralOptions().levels_for(n) for n in (4, 64, 100, 128)] == [1, 4, 5, 5]
+    assert NeuralOptions(levels=3).levels_for(64) == 3 and NeuralOptions(level_growth=1.0).levels_for(64) == 1
+    assert NeuralOptions().samples_for(128) == 192
+    assert LineOptions(segment=5).samples_for(64) == 100

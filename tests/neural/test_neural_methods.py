@@ -1,0 +1,189 @@
+"""naf and sax-nerf as methods: better than FDK, motion known better than not, repeatable, resumed to the same bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.api import Scan, compare, reconstruct, save_scan
+from phyradgs_cl.errors import InputError, NumericalError
+from phyradgs_cl.io import checkpoint_path, read_volume
+from phyradgs_cl.neural.fields import first_field
+from phyradgs_cl.neural.trainer import Trainer
+from phyradgs_cl.reconstructors import METHODS, method_options
+from phyradgs_cl.reconstructors import reconstruct as run_method
+from phyradgs_cl.reconstructors.neural_run import _Run
+from phyradgs_cl.reconstructors.result import Progress
+
+NEURAL = ("naf", "sax-nerf")
+SMALL = {"rays": 96, "levels": 2, "base_resolution": 8, "torch_device": "cpu"}
+SHORT = {
+    "naf": {**SMALL, "iterations": 3},
+    "sax-nerf": {**SMALL, "iterations": 3, "window": 4, "windows": 3, "rays": 48},
+}
+
+
+def psnr(result, scan: Scan) -> float:
+    return compare(result.volume, scan.reference)["psnr_db"]
+
+
+def test_the_field_beats_fdk_and_knowing_the_motion_beats_not_knowing_it(rt, scan) -> None:
+    fdk = psnr(reconstruct(scan, "fdk", device=rt), scan)
+    same = {"rays": 256, "iterations": 40, "levels": 2, "torch_device": "cpu"}
+    static = psnr(reconstruct(scan, "naf", device=rt, **same), scan)
+    moving = psnr(reconstruct(scan, "naf", device=rt, motion="per-row", **same), scan)
+    strips = psnr(reconstruct(scan, "naf", device=rt, motion="micro-views", **same), scan)
+    assert static > fdk + 2
+    assert min(moving, strips) > static + 0.5
+
+
+def test_attention_along_lines_beats_fdk(rt, scan) -> None:
+    fdk = psnr(reconstruct(scan, "fdk", device=rt), scan)
+    same = {"rays": 96, "window": 4, "windows": 4, "iterations": 30, "levels": 2, "torch_device": "cpu"}
+    assert psnr(reconstruct(scan, "sax-nerf", device=rt, motion="per-row", **same), scan) > fdk + 2
+
+
+@pytest.mark.parametrize("method", NEURAL)
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(rt, scan, method) -> None:
+    one, two, other = (reconstruct(scan, method, device=rt, seed=s, **SHORT[method]) for s in (1, 1, 2))
+    assert np.array_equal(one.volume, two.volume)
+    assert not np.array_equal(one.volume, other.volume)
+    assert [line["loss"] for line in one.record] == [line["loss"] for line in two.record]
+    assert one.facts["torch_device"] == "cpu" and one.facts["iterations"] == 3
+
+
+@pytest.mark.parametrize("method", NEURAL)
+@pytest.mark.parametrize("stop", [1, 2])
+def test_a_run_goes_on_from_any_report_to_the_same_bits(rt, scan, method, stop) -> None:
+    options = method_options(method, None, {**SHORT[method], "motion": "per-row"})
+    whole = run_method(scan, method, rt, options)
+
+    def interrupt(progress: Progress) -> None:
+        if progress.iteration == stop:
+            raise KeyboardInterrupt
+
+    part = run_method(scan, method, rt, options, report=interrupt)
+    assert part.facts["interrupted_at"] == stop and part.state is not None
+    rest = run_method(scan, method, rt, options, resume=part.state)
+    assert np.array_equal(rest.volume, whole.volume)
+    assert [x["loss"] for x in rest.record] == [x["loss"] for x in whole.record]
+
+
+def small_run(scan: Scan) -> _Run:
+    """Three passes of naf, not begun yet."""
+    options = method_options("naf", None, SHORT["naf"])
+    trainer = Trainer(scan, options, first_field(options, 16, 0), torch.device("cpu"), 1.0, 0)
+    return _Run(trainer, 3, lambda progress: None, 0.0)
+
+
+def test_a_run_goes_on_from_the_middle_of_a_pass(scan) -> None:
+    """The state between two steps, as a signal leaves it."""
+    whole, part, rest = small_run(scan), small_run(scan), small_run(scan)
+    whole.loop()
+    for _ in range(scan.frames + 4):
+        part.trainer.step()
+    rest.restore(part.state())
+    rest.loop()
+    assert np.array_equal(rest.trainer.volume(scan.grid), whole.trainer.volume(scan.grid))
+    assert rest.record[-1]["loss"] == whole.record[-1]["loss"]
+
+
+def test_a_damaged_state_is_refused(rt, scan) -> None:
+    options = method_options("naf", None, SHORT["naf"])
+    states = []
+    run_method(scan, "naf", rt, options, report=lambda p: states.append(dict(p.state())))
+    wrong = {
+        "parameters": np.zeros(3, np.float32),
+        "moments": np.full_like(states[0]["moments"], np.nan),
+        "steps": np.array(10**6),
+        "updates": np.array(-1),
+        "queue": states[0]["queue"] + 100,
+        "losses": np.zeros(3),
+        "rng": np.array("{}"),
+    }
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=f"checkpoint, array {name}"):
+            run_method(scan, "naf", rt, options, resume={**states[0], name: value})
+    with pytest.raises(InputError, match="checkpoint"):
+        run_method(scan, "naf", rt, options, resume={})
+
+
+@pytest.mark.parametrize("method", NEURAL)
+def test_masked_pixels_do_not_matter(rt, scan, method) -> None:
+    mask = np.zeros(scan.geometry.detector_shape, np.uint8)
+    mask[3:9, 10:13] = 1
+    spoiled = scan.projections.copy()
+    spoiled[:, mask != 0] = 5.0
+    one = reconstruct(replace(scan, pixel_mask=mask), method, device=rt, **SHORT[method])
+    two = reconstruct(replace(scan, pixel_mask=mask, projections=spoiled), method, device=rt, **SHORT[method])
+    assert np.array_equal(one.volume, two.volume)
+
+
+def test_lengths_and_attenuation_may_have_any_unit(rt, scan) -> None:
+    """Lengths × 50 with attenuation ÷ 50: the same line integrals, the same picture."""
+    geometry = scan.geometry.scaled(50.0)
+    trajectory = replace(scan.trajectory, geometry=geometry)
+    grid = scan.grid.scaled(50.0)
+    far = replace(scan, geometry=geometry, trajectory=trajectory, grid=grid, reference=None)
+    near = reconstruct(scan, "naf", device=rt, **SHORT["naf"])
+    scaled = reconstruct(far, "naf", device=rt, **SHORT["naf"])
+    assert np.allclose(50 * scaled.volume, near.volume, rtol=0.05, atol=0.01 * near.volume.max())
+
+
+def test_the_intensity_model_takes_all_times(rt, scan) -> None:
+    changes = {**SHORT["naf"], "motion": "per-row", "detector_model": "intensity"}
+    result = reconstruct(scan, "naf", device=rt, **changes)
+    assert result.facts["detector_model"] == "intensity" and result.facts["times"] == 5
+    changed = {**changes, "detector_model": "log", "times": 2}
+    assert reconstruct(scan, "naf", device=rt, **changed).facts["times"] == 2
+    with pytest.raises(InputError, match="option times.*biased"):
+        reconstruct(scan, "naf", device=rt, times=2, **changes)
+
+
+@pytest.mark.parametrize("method", NEURAL)
+def test_the_published_constants_run(rt, scan, method) -> None:
+    """One pass of the published configuration, its tables cut down to what a test can hold."""
+    options = method_options(method, "published", {"iterations": 1, "table_log2": 12, "rays": 16})
+    assert (options.rate, options.levels, options.jitter, options.positive_only) == (1e-3, 16, "sample", True)
+    volume = run_method(scan, method, rt, options).volume
+    assert np.isfinite(volume).all() and volume.min() >= 0
+
+
+def test_a_field_that_is_lost_is_told_in_one_line(scan) -> None:
+    run = small_run(scan)
+    with torch.no_grad():
+        run.trainer.field.encoding.table.fill_(float("nan"))
+    with pytest.raises(NumericalError, match="loss: found nan at iteration 1"):
+        run.loop()
+
+
+@pytest.mark.parametrize("method", NEURAL)
+def test_from_file_to_file(rt, scan, method, tmp_path, capsys) -> None:
+    save_scan(tmp_path / "scan.h5", scan)
+    settings = [f"--set={name}={value}" for name, value in SHORT[method].items() if name != "iterations"]
+    command = [
+        "reconstruct",
+        str(tmp_path / "scan.h5"),
+        "-o",
+        str(tmp_path / "volume.h5"),
+        "--method",
+        method,
+    ]
+    assert load_cli().run([*command, *settings, "--iterations", "2", "--motion", "per-row"]) == 0
+    assert "PSNR" in capsys.readouterr().out
+    stored = read_volume(tmp_path / "volume.h5")
+    assert stored.volume.shape == scan.grid.shape
+    assert stored.provenance["method"] == method
+    assert not checkpoint_path(tmp_path / "volume.h5").exists()
+    assert load_cli().run(["report", str(tmp_path / "volume.h5"), "-o", str(tmp_path / "page.html")]) == 0
+    assert load_cli().run(["info", str(tmp_path / "volume.h5")]) == 0
+
+
+def test_both_are_in_the_registry() -> None:
+    for method in NEURAL:
+        assert METHODS[method].is_resumable
+        assert list(METHODS[method].presets) == ["default", "published"]

@@ -1,0 +1,143 @@
+"""Line integrals of known fields in the network's place, against closed forms along the scan's own rays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tolerances import FLOAT32, RAY_SAMPLES, RAY_SAMPLES_SHARP
+
+from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.geometry import pixel_centres
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural import NeuralOptions
+from phyradgs_cl.neural.exposure_rays import ExposureRays
+from phyradgs_cl.neural.ray_integral import box_span, line_integrals, sample_shifts
+
+VOXELS = 64  # of the longest side; 96 samples a ray by default
+CENTRE, AXES = np.array([0.1, -0.2, 0.05]), np.array([0.45, 0.3, 0.5])
+
+
+@pytest.fixture(scope="module")
+def rays(scan) -> tuple[np.ndarray, np.ndarray]:
+    """Sources and directions (R, 3) of pixels of a frame at five times of their lines, in half-sides."""
+    table = Motion("per-row").cells(scan, 3)
+    exposure = ExposureRays.of_cells(table, scan.grid)
+    rows, columns = scan.geometry.detector_shape
+    pixels = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), -1).reshape(-1, 2)
+    source, direction = exposure(pixels, np.tile(np.arange(exposure.times), (len(pixels), 1)))
+    return source.reshape(-1, 3), direction.reshape(-1, 3)
+
+
+def integrals(field, rays, jitter: str, seed: int = 0) -> np.ndarray:
+    samples = NeuralOptions().samples_for(VOXELS)
+    shifts = sample_shifts(len(rays[0]), samples, jitter, np.random.default_rng(seed))
+    source, direction = (torch.tensor(a.astype(np.float32)) for a in rays)
+    box = torch.ones(3)
+    return np.array(line_integrals(field, source, direction, box, samples, torch.tensor(shifts)).tolist())
+
+
+def quadratic(rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """a, b, c (R,) of |(s + t d − centre) / axes|² = a t² + 2 b t + c."""
+    from_, along = (rays[0] - CENTRE) / AXES, rays[1] / AXES
+    return (along**2).sum(1), (from_ * along).sum(1), (from_**2).sum(1)
+
+
+def distance(x: torch.Tensor) -> torch.Tensor:
+    """The square of a position's distance from the centre, in axes."""
+    return (((x - torch.tensor(CENTRE.astype(np.float32))) / torch.tensor(AXES.astype(np.float32))) ** 2).sum(
+        1
+    )
+
+
+@pytest.mark.parametrize("jitter", ["ray", "none"])
+def test_a_gaussian(rays, jitter) -> None:
+    shrink = 9.0  # σ is a third of the axes
+    a, b, c = quadratic(rays)
+    expected = np.sqrt(2 * np.pi / (shrink * a)) * np.exp(-shrink * (c - b * b / a) / 2)
+    found = integrals(lambda x: torch.exp(-shrink * distance(x) / 2), rays, jitter)
+    assert expected.max() > 0.2
+    assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
+
+
+def test_a_gaussian_with_a_shift_a_sample_is_noisier_and_right_on_average(rays) -> None:
+    a, b, c = quadratic(rays)
+    expected = np.sqrt(2 * np.pi / (9 * a)) * np.exp(-9 * (c - b * b / a) / 2)
+    draws = [integrals(lambda x: torch.exp(-9 * distance(x) / 2), rays, "sample", seed) for seed in range(64)]
+    assert np.abs(draws[0] - expected).max() > RAY_SAMPLES * expected.max()
+    assert np.linalg.norm(np.mean(draws, 0) - expected) <= RAY_SAMPLES * np.linalg.norm(expected)
+
+
+def test_an_ellipsoid_that_fades_towards_its_edge(rays) -> None:
+    """Density 1 − q inside q < 1: the chord's ends are kinks, not steps."""
+    a, b, c = quadratic(rays)
+    half = np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)
+    expected = 4 / 3 * a * half**3
+    found = integrals(lambda x: (1 - distance(x)).clamp(min=0), rays, "ray")
+    assert expected.max() > 0.3
+    assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
+
+
+@pytest.mark.parametrize("jitter", ["ray", "sample"])
+def test_an_ellipsoid_with_a_sharp_edge(rays, jitter) -> None:
+    """A step costs a share of a sample in one draw; the average over draws has no such error."""
+    a, b, c = quadratic(rays)
+    expected = 2 * np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)
+    draws = [integrals(lambda x: (distance(x) < 1).float(), rays, jitter, seed) for seed in range(256)]
+    size = np.linalg.norm(expected)
+    assert np.linalg.norm(draws[0] - expected) <= RAY_SAMPLES_SHARP * size
+    assert np.linalg.norm(np.mean(draws, 0) - expected) <= RAY_SAMPLES * size
+
+
+def test_rays_are_those_of_the_cells(scan) -> None:
+    """Every pixel's ray goes from the source of its line's cell to its own centre; columns too, and grids off centre."""
+    table = Motion("micro-views", 3, 2).cells(scan, 1)
+    grid = Grid(scan.grid.shape, scan.grid.voxel_size_mm, (0.1, -0.2, 0.3))
+    for axis in ("rows", "columns"):
+        turned = TimeCells(
+            table.pose, table.time_s, table.line_start, table.line_stop, table.weight, table.lines, axis
+        )
+        exposure = ExposureRays.of_cells(turned, grid)
+        pixels = np.array([[0, 5], [7, 23], [23, 0], [12, 12]])
+        times = np.tile([[0, 1]], (4, 1))
+        source, direction = exposure(pixels, times)
+        for number, (row, column) in enumerate(pixels):
+            line = row if axis == "rows" else column
+            serving = np.flatnonzero((table.line_start <= line) & (line < table.line_stop))
+            centre = np.array(grid.offset_mm[::-1])
+            expected = {
+                tuple(np.round((table.pose[cell, :3] - centre) / grid.half_longest_mm, 6)) for cell in serving
+            }
+            assert {tuple(np.round(s, 6)) for s in source[number]} == expected
+            for s, d in zip(source[number], direction[number], strict=True):
+                cell = next(
+                    c for c in serving if np.allclose((table.pose[c, :3] - centre) / grid.half_longest_mm, s)
+                )
+                pixel = pixel_centres(table.pose[cell], scan.geometry.detector_shape)[row, column]
+                wanted = pixel - table.pose[cell, :3]
+                assert np.allclose(d, wanted / np.linalg.norm(wanted), atol=1e-12)
+
+
+def test_the_way_through_the_box() -> None:
+    source = torch.tensor([[5.0, 0, 0], [5, 0, 0], [5, 3, 0], [0, 0, 0], [5, 0, 0]])
+    direction = torch.tensor([[-1.0, 0, 0], [-0.8, 0.6, 0], [-1, 0, 0], [0, 0, 1], [1, 0, 0]])
+    first, length = box_span(source, direction, torch.tensor([1.0, 1.0, 0.5]))
+    assert np.allclose(first[[0, 3]].tolist(), [4, 0])
+    assert np.allclose(length.tolist(), [2, 0, 0, 0.5, 0], atol=FLOAT32)
+
+
+def test_the_shadow_of_the_volume_holds_every_ray_that_meets_it(scan) -> None:
+    exposure = ExposureRays.of_cells(Motion("per-row").cells(scan, 2), scan.grid)
+    shape = scan.geometry.detector_shape
+    half = np.array([0.6, 0.5, 0.3])
+    rows, columns = exposure.shadow(half, shape)
+    pixels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
+    source, direction = exposure(pixels, np.tile(np.arange(exposure.times), (len(pixels), 1)))
+    spans = box_span(*(torch.tensor(a.reshape(-1, 3)) for a in (source, direction)), torch.tensor(half))
+    meets = np.array(spans[1].tolist()).reshape(len(pixels), -1).any(axis=1).reshape(shape)
+    inside = np.zeros(shape, bool)
+    inside[rows, columns] = True
+    assert meets.any() and not np.any(meets & ~inside)
+    assert inside.sum() < 0.5 * inside.size
+    assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))

@@ -1,0 +1,211 @@
+"""Volumes that do not fit the device are taken in bricks: the same result, within the limit, in every direction of a cut."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from memory_limits import refuse_large, room_for
+from ray_tables import noise, tables
+from tolerances import BRICKS
+
+from phyradgs_cl.errors import OutOfMemoryError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import (
+    RayOperator,
+    RayProjector,
+    Voxeliser,
+    backproject,
+    backproject_lines,
+    binning,
+    rays,
+    voxelise,
+)
+from phyradgs_cl.operators.bricks import cut
+from phyradgs_cl.runtime import Room
+
+SHAPE = (7, 37)
+TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
+Z_ONLY, Z_AND_Y = 320_000, 130_000  # bytes of room for TALL: cuts along z, and along both
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 7, 3), (33, 65, 9), (8, 32, 4)])
+@pytest.mark.parametrize("steps", [(1, 1), (4, 4), (8, 32)])
+@pytest.mark.parametrize("floats", [10**9, 2000, 320])
+def test_bricks_are_the_volume_once(shape, steps, floats) -> None:
+    def needs(brick: tuple[int, int, int]) -> tuple[int, int]:
+        return 3 * int(np.prod(brick)), int(np.prod(brick))
+
+    if min(steps[0], shape[0]) * min(steps[1], shape[1]) * shape[2] * 4 > 4 * floats:
+        with pytest.raises(OutOfMemoryError, match="smallest part"):
+            cut(shape, steps, needs, Room(4 * floats, 4 * floats))
+        return
+    bricks = cut(shape, steps, needs, Room(4 * floats, 4 * floats))
+    count = np.zeros(shape, int)
+    for brick in bricks:
+        assert sum(needs(brick.shape)) <= 4 * floats
+        assert brick.start[0] % steps[0] == 0 and brick.start[1] % steps[1] == 0
+        count[brick.box] += 1
+    assert (count == 1).all()
+    assert (len(bricks) == 1) == (4 * np.prod(shape) <= 4 * floats)
+
+
+def test_the_largest_buffer_counts_too() -> None:
+    assert len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+@pytest.mark.parametrize("motion", ["static", "per line"])
+@pytest.mark.parametrize("nbytes", [Z_ONLY, Z_AND_Y])
+def test_rays(any_rt, motion, axis, nbytes) -> None:
+    cells = tables(motion, SHAPE, axis, frames=5)
+    operator = RayOperator(any_rt, TALL, SHAPE, cells)
+    x, y = noise(TALL.shape, 91), noise(operator.frames_shape, 92)
+    expected = {name: operator.project(x, name) for name in rays.AVERAGES}
+    back = operator.adjoint(y)
+    parts = RayOperator(any_rt, TALL, SHAPE, cells)
+    part = parts.subset([3, 1])
+    with room_for(any_rt, nbytes):
+        bricks = parts.memory.plan()
+        assert len({b.start[0] for b in bricks}) > 1
+        assert (len({b.start[1] for b in bricks}) > 1) == (nbytes == Z_AND_Y)
+        np.testing.assert_array_equal(parts.adjoint(y), back)
+        assert np.abs(parts.forward(x) - expected["log"]).max() <= BRICKS * expected["log"].max()
+        few = part.forward(x)
+    assert np.abs(few - expected["log"][[3, 1]]).max() <= BRICKS * expected["log"].max()
+    if motion == "per line":  # layers bring tables of their own
+        with room_for(any_rt, nbytes + 120_000):
+            for name in ("intensity", "gap"):
+                error = np.abs(
+                    RayOperator(any_rt, TALL, SHAPE, cells).project(x, name) - expected[name]
+                ).max()
+                assert error <= 2 * BRICKS * expected["log"].max()
+        assert expected["gap"].max() > 1e-4
+
+
+def test_a_projector_of_frames(any_rt, monkeypatch) -> None:
+    """What a simulation uses; 64-bit indices change nothing in bricks either."""
+    table, volume = tables("per line", SHAPE, frames=1)[0], noise(TALL.shape, 93)
+    projector = RayProjector(any_rt, TALL, SHAPE)
+    on_device = projector.upload_volume(volume)
+    expected = [projector.forward(on_device, table, model) for model in ("log", "intensity")]
+    back = projector.backproject(expected[0], table)
+    small = RayProjector(any_rt, TALL, SHAPE)
+    monkeypatch.setattr(rays, "_LONG_FROM", 0)
+    with room_for(any_rt, Z_AND_Y + 120_000):
+        held = small.upload_volume(volume)
+        assert isinstance(held, np.ndarray)
+        for model, image in zip(("log", "intensity"), expected, strict=True):
+            assert np.abs(small.forward(held, table, model) - image).max() <= 2 * BRICKS * image.max()
+        np.testing.assert_allclose(
+            small.backproject(expected[0], table), back, rtol=0, atol=BRICKS * back.max()
+        )
+
+
+@pytest.mark.parametrize(
+    ("pixels", "tilt"),
+    [((13, 18), 0.0), ((13, 18), 0.05), ((700, 7), 0.0)],
+    ids=["upright", "tilted", "blocks along z"],
+)
+def test_backprojection_of_frames(any_rt, make_geometry, pixels, tilt) -> None:
+    grid = Grid((11, 9, 19), (0.12, 0.2, 0.1))
+    rng = np.random.default_rng(94)
+    views, weight = rng.uniform(-1, 1, (67, *pixels)).astype(np.float32), rng.uniform(0.5, 1, 67)
+    pose = make_geometry(*pixels, offset=(0.1, 0.2)).pose(rng.uniform(0, 6, 67))
+    pose[:, 9:12] += tilt * pose[:, 6:9]
+    expected = backproject(any_rt, views, pose, weight, grid)
+    assert np.count_nonzero(expected) > 100
+    image_bytes = 4 * (pixels[0] + 32) * 64 if pixels[0] < 100 else 4 * 32 * 800
+    for nbytes in (12_000 + image_bytes, 9_000 + 4 * image_bytes):
+        with room_for(any_rt, nbytes):
+            np.testing.assert_array_equal(backproject(any_rt, views, pose, weight, grid), expected)
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_backprojection_of_lines(any_rt, make_geometry, axis) -> None:
+    grid, pixels = Grid((11, 9, 19), (0.12, 0.2, 0.1)), (13, 18)
+    rng = np.random.default_rng(95)
+    views, weight = rng.uniform(-1, 1, (9, *pixels)).astype(np.float32), rng.uniform(0.5, 1, 9)
+    lines = pixels[axis == "columns"]
+    angles = rng.uniform(0, 6, (9, 1)) + np.linspace(-0.1, 0.1, lines)
+    pose = make_geometry(*pixels).pose(angles.ravel()).reshape(9, lines, 12)
+    expected = backproject_lines(any_rt, views, pose, weight, grid, axis)
+    assert np.count_nonzero(expected) > 100
+    for nbytes in (9_000, 14_000):
+        with room_for(any_rt, nbytes):
+            np.testing.assert_array_equal(
+                backproject_lines(any_rt, views, pose, weight, grid, axis), expected
+            )
+
+
+@pytest.mark.parametrize("nbytes", [30_000, 16_000])
+def test_voxels(any_rt, make_cloud, nbytes) -> None:
+    rows, grid = make_cloud(30, 96), Grid((9, 25, 21), (0.2, 0.08, 0.09), (0.1, -0.2, 0.05))
+    expected = voxelise(any_rt, rows, grid)
+    with room_for(any_rt, nbytes):
+        np.testing.assert_array_equal(voxelise(any_rt, rows, grid), expected)
+    assert expected.max() > 0.5
+
+
+def test_what_does_not_fit_at_all_is_said(rt, make_cloud) -> None:
+    grid = Grid.cube(32, 2.0)
+    operator = RayOperator(rt, grid, SHAPE, tables("static", SHAPE))
+    with room_for(rt, 20_000):
+        with pytest.raises(OutOfMemoryError, match="32×32×32 voxels.*--memory"):
+            operator.adjoint(noise(operator.frames_shape, 97))
+        with pytest.raises(OutOfMemoryError):
+            voxelise(rt, make_cloud(300, 98), grid)
+
+
+def warned(caplog: pytest.LogCaptureFixture) -> int:
+    return sum("smaller bricks" in r.message for r in caplog.records if r.levelno == logging.WARNING)
+
+
+def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
+    rt, make_cloud, make_geometry, monkeypatch, caplog
+) -> None:
+    """Free memory can be less than the device said."""
+    cells = tables("static", SHAPE, frames=3)
+    operator = RayOperator(rt, TALL, SHAPE, cells)
+    x, y = noise(TALL.shape, 99), noise(operator.frames_shape, 100)
+    pose = make_geometry(*SHAPE).pose(np.arange(3.0))
+    cloud = make_cloud(30, 101)
+    calls = {
+        "forward": lambda: RayOperator(rt, TALL, SHAPE, cells).forward(x),
+        "adjoint": lambda: RayOperator(rt, TALL, SHAPE, cells).adjoint(y),
+        "fdk": lambda: backproject(rt, y, pose, np.ones(3), TALL),
+        "voxels": lambda: voxelise(rt, cloud, TALL),
+    }
+    for call in calls.values():
+        expected = call()
+        caplog.clear()
+        with room_for(rt, 2_000_000), monkeypatch.context() as patch:
+            refuse_large(patch, rt, 50_000, times=1)
+            found = call()
+        assert warned(caplog) == 1
+        np.testing.assert_allclose(found, expected, rtol=0, atol=BRICKS * np.abs(expected).max())
+    for call in calls.values():
+        with room_for(rt, 2_000_000), monkeypatch.context() as patch:
+            refuse_large(patch, rt, 500, times=9)
+            with pytest.raises(OutOfMemoryError, match="memory of a test"):
+                call()
+
+
+def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, monkeypatch, caplog) -> None:
+    rows = make_cloud(200, 102)
+    whole = Voxeliser(rt, TALL.shape)
+    expected = whole.voxelise(rows, TALL)
+    monkeypatch.setattr(binning, "_MOST_ENTRIES", int(rt.download(whole.lists.starts)[-1]))
+    del whole
+    with room_for(rt, 1_200_000):
+        np.testing.assert_array_equal(voxelise(rt, rows, TALL), expected)
+    assert warned(caplog) == 1
+
+
+def test_sums_of_entries_stay_at_the_largest_int(rt) -> None:
+    """Three tiles of 2^30 entries each: the sum is past 2^31, and must not turn negative."""
+    starts = rt.upload(np.array([0, 2**30, 2**30, 2**30, 5]), np.int32)
+    rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(4), starts)
+    largest = 2**31 - 1
+    np.testing.assert_array_equal(rt.download(starts), [0, 2**30, largest, largest, largest])

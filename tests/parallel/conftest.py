@@ -1,0 +1,104 @@
+"""Ranks without MPI: threads of this process that exchange arrays. What needs MPI itself is collected where it is there."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+collect_ignore = [] if importlib.util.find_spec("mpi4py") and shutil.which("mpiexec") else ["test_mpi.py"]
+
+
+_WORK = threading.Lock()  # drivers are not asked to do with several threads
+
+
+class Threads:
+    """A ``Communicator`` whose ranks are threads, one at work at a time; slots hold what each has brought to a call."""
+
+    exchanged_bytes, exchange_s, idle_s = 0, 0.0, 0.0
+
+    def __init__(self, rank: int, slots: list[Any], barrier: threading.Barrier, teams: dict) -> None:
+        self.rank, self.size = rank, len(slots)
+        self.local_rank, self.local_size = rank, len(slots)
+        self._slots, self._barrier, self._teams = slots, barrier, teams
+
+    def _all(self, value: Any) -> list[Any]:
+        self._slots[self.rank] = value
+        _WORK.release()
+        try:
+            self._barrier.wait(60)
+            everyone = list(self._slots)
+            self._barrier.wait(60)
+        finally:
+            _WORK.acquire()
+        return everyone
+
+    def add(self, values: np.ndarray) -> None:
+        everyone = self._all(values.copy())
+        values[...] = 0
+        for other in everyone[self.rank :] + everyone[: self.rank]:  # another order on every rank
+            values += other
+
+    def largest(self, values: np.ndarray) -> None:
+        values[...] = np.maximum.reduce(self._all(values.copy()))
+
+    def any(self, flag: bool) -> bool:
+        return any(self._all(flag))
+
+    def tell(self, value: Any) -> Any:
+        return self._all(value)[0]
+
+    def join(self, values: np.ndarray) -> np.ndarray:
+        return np.concatenate(self._all(values))
+
+    def gather(self, values: np.ndarray) -> np.ndarray:
+        return np.concatenate(self._all(values), axis=-1)
+
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [given[self.rank] for given in self._all(list(parts))]
+
+    def team(self, number: int) -> Threads:
+        numbers = self._all(number)
+        members = [rank for rank, other in enumerate(numbers) if other == number]
+        key = (number, len(self._teams.setdefault(self.rank, [])))
+        self._teams[self.rank].append(number)
+        shared = self._all((key, [None] * len(members), threading.Barrier(len(members)), {}))[members[0]]
+        return Threads(members.index(self.rank), *shared[1:])
+
+    def all_fail(self) -> bool:
+        return False
+
+    def abort(self, status: int) -> None:
+        self._barrier.abort()
+        raise SystemExit(status)
+
+
+def on_ranks(size: int, work: Callable[[Threads], Any]) -> list[Any]:
+    """What ``work`` returns on each of ``size`` ranks; the first exception of any of them."""
+    slots, barrier, teams = [None] * size, threading.Barrier(size), {}
+
+    def one(rank: int) -> Any:
+        try:
+            with _WORK:
+                return work(Threads(rank, slots, barrier, teams))
+        except BaseException:
+            barrier.abort()
+            raise
+
+    with ThreadPoolExecutor(size) as pool:
+        futures = [pool.submit(one, rank) for rank in range(size)]
+    errors = [error for future in futures if (error := future.exception())]
+    for error in sorted(errors, key=lambda e: isinstance(e, threading.BrokenBarrierError)):
+        raise error
+    return [future.result() for future in futures]
+
+
+@pytest.fixture(scope="session")
+def ranks_of() -> Callable[[int, Callable[[Threads], Any]], list[Any]]:
+    return on_ranks

@@ -1,0 +1,140 @@
+"""How launchers are recognised, who takes which share, and what is said where the extra is missing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.commands import ranks as commands
+from phyradgs_cl.parallel import Launch, Shares, launched, sorted_columns, span
+from phyradgs_cl.runtime import device as devices
+
+LAUNCHERS = {
+    "MPICH": (
+        {"PMI_RANK": "3", "PMI_SIZE": "8", "MPI_LOCALRANKID": "1", "MPI_LOCALNRANKS": "2"},
+        (3, 8, 1, 2),
+    ),
+    "Open MPI": (
+        {
+            "OMPI_COMM_WORLD_RANK": "5",
+            "OMPI_COMM_WORLD_SIZE": "6",
+            "OMPI_COMM_WORLD_LOCAL_RANK": "2",
+            "OMPI_COMM_WORLD_LOCAL_SIZE": "3",
+        },
+        (5, 6, 2, 3),
+    ),
+    "srun, PMI-2": (
+        {"PMI_RANK": "3", "PMI_SIZE": "4", "SLURM_LOCALID": "1", "SLURM_STEP_TASKS_PER_NODE": "2(x2)"},
+        (3, 4, 1, 2),
+    ),
+    "srun, PMIx": (
+        {
+            "PMIX_RANK": "2",
+            "SLURM_STEP_NUM_TASKS": "4",
+            "SLURM_LOCALID": "0",
+            "SLURM_STEP_TASKS_PER_NODE": "2(x2)",
+        },
+        (2, 4, 0, 2),
+    ),
+    "one rank": ({"PMI_RANK": "0", "PMI_SIZE": "1"}, (0, 1, 0, 1)),
+    "a job of four tasks, no step": ({"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}, (0, 1, 0, 1)),
+    "nobody": ({}, (0, 1, 0, 1)),
+}
+
+
+@pytest.mark.parametrize("name", LAUNCHERS)
+def test_launchers(name) -> None:
+    environment, expected = LAUNCHERS[name]
+    assert launched(environment) == Launch(*expected)
+
+
+@pytest.mark.parametrize(("count", "parts"), [(0, 3), (1, 4), (7, 3), (12, 4), (5, 5)])
+def test_runs_cover_all_and_differ_by_one_at_most(count, parts) -> None:
+    runs = [span(count, parts, part) for part in range(parts)]
+    assert [i for run in runs for i in run] == list(range(count))
+    assert max(map(len, runs)) - min(map(len, runs)) <= 1
+
+
+@pytest.mark.parametrize(("size", "frames"), [(1, 1), (2, 5), (4, 4), (3, 1), (5, 2), (7, 3)])
+def test_every_frame_has_its_ranks(ranks_of, size, frames) -> None:
+    shares = ranks_of(size, lambda ranks: Shares.of(ranks, frames))
+    by_frame = {place: [s.team for s in shares if place in s.places] for place in range(frames)}
+    for teams in by_frame.values():
+        assert sorted(team.rank for team in teams) == list(range(teams[0].size))
+    assert max(len(s.places) for s in shares) == -(-frames // size)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_columns_are_sorted_over_ranks(ranks_of, size) -> None:
+    rng = np.random.default_rng(1)
+    key = rng.integers(0, 9, 23).astype(float)  # with equals
+    columns = np.stack([key, np.arange(23.0)])
+    expected = columns[:, np.argsort(key, kind="stable")]
+    ends = [0, 5, 16, 23] if size == 3 else [23 * r // size for r in range(size + 1)]
+
+    def work(ranks) -> np.ndarray:
+        mine = slice(ends[ranks.rank], ends[ranks.rank + 1])
+        return sorted_columns(ranks, key[mine], columns[:, mine], lambda n, rank: span(n, size, rank))
+
+    found = ranks_of(size, work)
+    np.testing.assert_array_equal(np.concatenate(found, axis=1), expected)
+    assert [part.shape[1] for part in found] == [len(span(23, size, r)) for r in range(size)]
+
+
+def _device(index: int, name: str, rank: int) -> SimpleNamespace:
+    return SimpleNamespace(index=index, name=name, platform="P", kind="gpu", by_default=True, rank=(rank,))
+
+
+@pytest.mark.parametrize(
+    ("wish", "expected"),
+    [
+        (None, [1, 3, 1, 3]),  # the best two are alike, the CPU is not taken
+        ("gpu", [1, 3, 1, 3]),
+        ("0,3", [0, 3, 0, 3]),
+        ("3,1,0", [3, 1, 0, 3]),
+        ("3", [3, 3, 3, 3]),  # what is named by its index is meant
+        ("small", [0, 2, 0, 2]),
+    ],
+)
+def test_ranks_of_a_machine_take_devices_in_turns(monkeypatch, wish, expected) -> None:
+    found = [_device(0, "small", 1), _device(1, "large", 2), _device(2, "small", 1), _device(3, "large", 2)]
+    monkeypatch.setattr(devices, "list_devices", lambda: found)
+    monkeypatch.delenv(devices.DEVICE_VARIABLE, raising=False)
+    assert [devices.choose_device(wish, turn)[0].index for turn in range(4)] == expected
+
+
+def test_other_commands_are_rank_0_s(monkeypatch) -> None:
+    monkeypatch.setattr(commands, "launched", lambda: Launch(0, 2))
+    assert commands.takes_part(["info", "x"])
+    monkeypatch.setattr(commands, "launched", lambda: Launch(1, 2))
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # put back afterwards
+    monkeypatch.setattr(sys, "stderr", sys.stderr)
+    assert not commands.takes_part(["info", "x"])
+    assert commands.takes_part(["reconstruct", "x"])
+    assert sys.stdout is None
+
+
+HIDDEN = """
+import sys
+sys.modules["mpi4py"] = None  # as where it is not installed
+from phyradgs_cl.__main__ import load_cli
+sys.exit(load_cli().run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_without_mpi4py_one_line_says_what_to_install(tmp_path, rank) -> None:
+    environment = {**os.environ, "PMI_RANK": str(rank), "PMI_SIZE": "2"}
+    run = [sys.executable, "-c", HIDDEN, "reconstruct", "scan.h5", "-o", str(tmp_path / "v.h5")]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2
+    said = [
+        "phyradgs: rank 0 of 2: found no package mpi4py; expected the extra mpi; "
+        'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
+    ]
+    assert done.stderr.splitlines() == (said if rank == 0 else [])

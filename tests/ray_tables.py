@@ -1,0 +1,39 @@
+"""Time cells of a few frames, and noise, for the tests of ray-driven operators."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+
+SHAPE = (13, 18)
+
+
+def noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
+
+
+def tables(
+    motion: str,
+    shape: tuple[int, int] = SHAPE,
+    axis: str = "rows",
+    direction: int = 1,
+    frames: int = 3,
+    source_mm: float = 5.0,
+) -> list[TimeCells]:
+    """Frames around a turn of a detector with an offset that sees a volume of side 2."""
+    pixels_mm = (3.9 / shape[0], 4.1 / shape[1])
+    geometry = ConeGeometry(source_mm, source_mm + 2.5, shape, pixels_mm, (0.1, 0.3))
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.4, 0.9))
+    shutter = Shutter(0.5, 0.4, axis, direction)
+    made = []
+    for frame in range(frames):
+        where = (orbit, shutter, frame, 0.1 + 2.1 * frame, shutter.lines(shape))
+        if motion == "static":
+            made.append(static_cells(*where))
+        elif motion == "micro-views":
+            made.append(micro_view_cells(*where, 5, 2))
+        else:
+            made.append(per_line_cells(*where, 1 if motion == "per line at one time" else 3))
+    return made

@@ -1,0 +1,46 @@
+"""The neural methods where PyTorch is not installed: known, checked, and refused with what to install."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.api import save_scan, simulate
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.neural import has_accelerator, requirement
+from phyradgs_cl.reconstructors import method_options, reconstruct
+
+NEURAL = ("naf", "sax-nerf")
+
+
+@pytest.fixture
+def without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(requirement, "has_torch", lambda: False)
+
+
+@pytest.mark.usefixtures("without_pytorch")
+@pytest.mark.parametrize("method", NEURAL)
+def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys) -> None:
+    scan = simulate("jaw", size=8, detector=12, views=3, device=rt)
+    with pytest.raises(InputError, match=f"--method {method}: found no PyTorch"):
+        reconstruct(scan, method, rt)
+    save_scan(tmp_path / "scan.h5", scan)
+    command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out.h5"), "--method", method]
+    assert load_cli().run(command) == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if "PyTorch" in line]
+    assert len(said) == 1 and 'pip install "phyradgs-cl[neural]"' in said[0]
+    assert not (tmp_path / "out.h5").exists()
+
+
+@pytest.mark.usefixtures("without_pytorch")
+def test_options_are_checked_all_the_same() -> None:
+    assert method_options("naf", None, {"motion": "per-row"}).motion.name == "per-row"
+    with pytest.raises(InputError, match="--motion"):
+        method_options("naf", None, {"motion": "exact"})
+    assert not has_accelerator()
+
+
+def test_pytorch_is_there_where_it_is_found() -> None:
+    assert requirement.has_torch() == (importlib.util.find_spec("torch") is not None)

@@ -1,0 +1,92 @@
+"""Limits of device memory: how they are written, that they hold, and what is said where they do not suffice."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError, OutOfMemoryError
+from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Runtime, bytes_of, with_smaller_bricks
+
+
+@pytest.mark.parametrize(
+    ("text", "nbytes"),
+    [
+        ("2GiB", 2 << 30),
+        ("2gb", 2 * 10**9),
+        ("1.5 G", 3 << 29),
+        ("512M", 512 << 20),
+        (" 64 kib ", 65_536),
+        ("100B", 100),
+        ("4096", 4096),
+        (4096, 4096),
+    ],
+)
+def test_sizes(text, nbytes) -> None:
+    assert bytes_of(text, "--memory") == nbytes
+
+
+@pytest.mark.parametrize(
+    "text", ["", "GiB", "-1G", "0", "0.0MiB", "2 GiBs", "two", "1e3", "nan", "1" * 40, True, "2,5G"]
+)
+def test_what_is_no_size(text) -> None:
+    with pytest.raises(InputError, match="--memory.*2GiB"):
+        bytes_of(text, "--memory")
+
+
+def test_the_limit_holds_for_all_buffers_together() -> None:
+    rt = Runtime(memory="64KiB")
+    first = rt.empty(10_000)
+    with pytest.raises(MemoryShortage, match=r"what is left of.*--memory or PHYRADGS_MEMORY"):
+        rt.empty(10_000)
+    assert rt.ledger.held_bytes == 40_000
+    del first
+    gc.collect()
+    assert rt.empty(16_384).nbytes == rt.ledger.held_bytes == 65_536
+    with pytest.raises(MemoryShortage):
+        rt.empty(16_385)
+    assert rt.peak_bytes == 65_536
+
+
+def test_the_environment_limits_what_no_option_does(monkeypatch) -> None:
+    monkeypatch.setenv(MEMORY_VARIABLE, "1MiB")
+    assert Runtime().ledger.limit_bytes == 1 << 20
+    assert Runtime(memory="2MiB").ledger.limit_bytes == 2 << 20
+    monkeypatch.setenv(MEMORY_VARIABLE, "much")
+    with pytest.raises(InputError, match=MEMORY_VARIABLE):
+        Runtime()
+
+
+def test_without_a_limit_it_is_what_the_device_reports(rt) -> None:
+    room = rt.room()
+    assert 0 < room.free_bytes < rt.device.memory_bytes
+    assert room.largest_bytes <= rt.device.largest_allocation_bytes
+    assert room.holds(room.free_bytes) == (room.free_bytes <= room.largest_bytes)
+    assert not room.holds(room.free_bytes, 1)
+
+
+def test_a_shortage_is_met_once(caplog) -> None:
+    asked: list[float] = []
+
+    def attempt(share: float) -> str:
+        asked.append(share)
+        if share == 1:
+            raise MemoryShortage("memory", "much", "less")
+        return "done"
+
+    assert with_smaller_bricks("work", attempt) == "done"
+    assert asked == [1.0, 0.25] and "work: memory: found much" in caplog.text
+    assert not any(isinstance(argument, Exception) for record in caplog.records for argument in record.args)
+
+    def never(share: float) -> None:
+        raise MemoryShortage("memory", f"{share}", "less")
+
+    with pytest.raises(OutOfMemoryError, match=r"found 0\.25"):
+        with_smaller_bricks("work", never)
+
+
+def test_a_buffer_of_nothing_takes_one_element(rt) -> None:
+    assert rt.download(rt.empty((0, 7))).shape == (0, 7)
+    assert rt.upload(np.zeros((3, 0), np.float32)).nbytes == 0

@@ -1,0 +1,79 @@
+"""Benchmarks run, at their smallest; no figure of theirs is looked at but for being there."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+def run(name: str, *words: str) -> str:
+    env = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
+    command = [sys.executable, str(FOLDER / name), *words]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def facts_of(tmp_path: Path, name: str, *words: str) -> dict:
+    path = tmp_path / "facts.json"
+    run(name, "--quick", "--json", str(path), *words)
+    facts = json.loads(path.read_text())
+    assert facts["device"] and facts["load_before"] >= 0
+    return facts
+
+
+def test_scaling(tmp_path) -> None:
+    figure = tmp_path / "figure.png"
+    facts = facts_of(tmp_path, "scaling.py", "--figure", str(figure))
+    assert set(facts["exponents"]) == {"gaussians", "voxeliser", "pixels"}
+    assert all(cost["all_ms"] > 0 for cost in facts["pixels"].values())
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_iteration(tmp_path) -> None:
+    facts = facts_of(tmp_path, "iteration.py")
+    for found in facts["ms"].values():
+        stages = [
+            found[name]
+            for name in ("prepare", "binning", "forward", "loss", "backward", "tv", "adam", "gaps")
+        ]
+        assert sum(stages) + found["other kernels"] == pytest.approx(found["iteration"], rel=0.01)
+        assert found["other kernels"] < 0.05 * found["iteration"]
+
+
+def test_bricks_of_large_problems(tmp_path) -> None:
+    runs = facts_of(tmp_path, "large.py")["runs"]
+    assert len(runs) == 4
+    for name, found in runs.items():
+        assert found["bricks"]["device_bytes"] <= 1 << 20 < found["whole"]["device_bytes"], name
+        assert found["relative_difference"] <= (1e-5 if name == "ray-driven forward" else 0), name
+
+
+def test_time_to_a_psnr_is_resumed(tmp_path) -> None:
+    import h5py
+    import numpy as np
+
+    x = np.linspace(-1, 1, 32)
+    ball = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < 0.5).astype(np.float32)
+    with h5py.File(tmp_path / "ball_32.h5", "w") as file:
+        file["volume"] = ball
+    lines = tmp_path / "lines.jsonl"
+    words = (str(tmp_path), str(lines), "--quick", "--names", "ball")
+    assert "| ball | 16 | exact |" in run("time_to_psnr.py", *words)
+    first = lines.read_text()
+    run("time_to_psnr.py", *words)
+    assert lines.read_text() == first and first.count("\n") == 2
+
+
+def test_estimates_are_checked(tmp_path) -> None:
+    facts = facts_of(tmp_path, "estimate_check.py", "--methods", "fdk", "--iterations", "2")
+    (line,) = facts["runs"]
+    assert line["ratio"]["device_bytes"] == pytest.approx(1, rel=0.3)
+    assert line["happened"]["host_bytes"] > 10_000_000

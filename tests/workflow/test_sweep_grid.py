@@ -1,0 +1,108 @@
+"""A sweep's file: what it expands to, and that everything wrong in it is named before any run."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.settings import read_config
+from phyradgs_cl.workflow.sweep import SweepGrid, plan_sweep, read_grid
+
+GRID = 'scans = ["*.h5"]\n'
+
+
+@pytest.fixture
+def read(tmp_path: Path, tiny_scan: Path):
+    """A function from the text of GRID.toml, beside two scans, to what it asks for."""
+    for name in ("a.h5", "b.h5"):
+        shutil.copy(tiny_scan, tmp_path / name)
+
+    def reading(text: str) -> SweepGrid:
+        path = tmp_path / "grid.toml"
+        path.write_text(text)
+        return read_grid(read_config(path, "GRID"), path)
+
+    return reading
+
+
+def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
+    grid = read(
+        GRID
+        + """
+        seeds = [0, 3, 0]
+        [options]
+        median_filter = 3
+        [[grid]]
+        method = ["sirt", "cgls"]
+        motion = ["static", "per-row"]
+        iterations = [5, 20]
+        [[grid]]
+        method = "phyradgs"
+        control.every = [50, 100]
+        rates.position = [[2e-4, 2e-5]]
+        [[runs]]
+        method = "fdk"
+        preset = "hann"
+        """
+    )
+    assert [scan.name for scan in grid.scans] == ["a.h5", "b.h5"] and grid.seeds == (0, 3)
+    assert len(grid.settings) == 8 + 2 + 1
+    first, splats, fdk = grid.settings[0], grid.settings[8], grid.settings[10]
+    assert first.label == "sirt median_filter=3 motion=static iterations=5"
+    assert (first.options().iterations, first.options().motion.name) == (5, "static")
+    assert first.before == {"median_filter": 3}
+    assert splats.options().control.every == 50 and splats.options().rates.position == (2e-4, 2e-5)
+    assert (fdk.method, fdk.preset) == ("fdk", "hann")
+
+
+def test_what_is_asked_for_twice_is_run_once_and_names_differ(read, tmp_path) -> None:
+    grid = read(
+        GRID
+        + '[[grid]]\nmethod = "sirt"\niterations = [5, 6, 5]\n[[runs]]\nmethod = "sirt"\niterations = 6\n'
+    )
+    plan = plan_sweep(grid, tmp_path / "out")
+    assert len(grid.settings) == 2 and len(plan) == 4 == len({run.name for run in plan})
+    assert len({run.job.output for run in plan}) == 4
+    again = plan_sweep(grid, tmp_path / "elsewhere")
+    assert [run.name for run in again] == [run.name for run in plan]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('scnas = ["*.h5"]\n', "scnas: found no such key.*did you mean 'scans'"),
+        ("[[runs]]\n", "scans: found None; expected a list"),
+        ('scans = "a.h5"\n[[runs]]\n', "scans: found 'a.h5'"),
+        (GRID, r"neither \[\[grid\]\] nor \[\[runs\]\]"),
+        (GRID + "grid = 3\n", "grid: found 3"),
+        (GRID + "seeds = [-1]\n[[runs]]\n", r"seeds: found \[-1\]"),
+        (GRID + "seeds = [true]\n[[runs]]\n", "seeds: found"),
+        ('scans = ["none/*.h5"]\n[[runs]]\n', "no file for 'none/"),
+        ('scans = ["grid.toml"]\n[[runs]]\n', "grid.toml: found a file that is not HDF5"),
+        (GRID + '[[grid]]\nmethod = ["sirt", "sitr"]\n', r"\[\[grid\]\] 1 \(method='sitr'\): --method"),
+        (GRID + "[[runs]]\ntv_wieght = 0.1\n", r"\[\[runs\]\] 1 .*tv_wieght.*did you mean 'tv_weight'"),
+        (GRID + "[[grid]]\ncontrol.evrey = [1]\n", "evrey.*did you mean 'every'"),
+        (
+            GRID + '[[grid]]\nmethod = "fdk"\npreset = ["hann", "ham"]\n',
+            "preset='ham'.*--preset: found 'ham'",
+        ),
+        (GRID + "[[grid]]\niterations = [10, -1]\n", "iterations=-1"),
+        (GRID + "[[grid]]\niterations = []\n", "iterations: found an empty list"),
+        (GRID + "[[grid]]\nmedian_filter = [0, 4]\n", "median_filter=4"),
+        (GRID + "[[runs]]\nseed = 1\n", "seed: found 1; expected no option of a run; write seeds"),
+        (GRID + '[[runs]]\ndevice = "gpu"\n', "device.*say it as --device"),
+        (GRID + "[[runs]]\n[options]\niteratoins = 5\n", "iteratoins.*did you mean 'iterations'"),
+    ],
+)
+def test_what_is_wrong_is_named_at_once(read, text, message) -> None:
+    with pytest.raises(InputError, match=message):
+        read(text)
+
+
+def test_a_product_beyond_all_measure_is_refused(read) -> None:
+    values = ", ".join(map(str, range(1, 400)))
+    with pytest.raises(InputError, match="combinations; expected at most"):
+        read(GRID + f'[[grid]]\nmethod = "sirt"\niterations = [{values}]\nrelaxation = [{values}]\n')

@@ -1,0 +1,241 @@
+"""Sweeps in one process: resumed, failures noted and tried again, results and tables; without Dask they say so."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.cluster import Workers
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import only_run, read_volume
+from phyradgs_cl.io.json_lines import read_lines
+from phyradgs_cl.io.lock import BusyError
+from phyradgs_cl.settings import read_config
+from phyradgs_cl.workflow.sweep import (
+    RESULTS,
+    SweepJob,
+    SweepProgress,
+    plan_sweep,
+    read_grid,
+    run_sweep,
+    task,
+)
+
+TEXT = """
+scans = ["*.h5"]
+seeds = [0, 1]
+[[grid]]
+method = "sirt"
+iterations = [2, 4]
+[[runs]]
+method = "fdk"
+"""
+RUNS = 2 * 3 * 2
+
+
+@pytest.fixture
+def job(tmp_path: Path, tiny_scan: Path) -> SweepJob:
+    for name in ("a.h5", "b.h5"):
+        shutil.copy(tiny_scan, tmp_path / name)
+    path = tmp_path / "grid.toml"
+    path.write_text(TEXT)
+    return SweepJob(read_grid(read_config(path, "GRID"), path), tmp_path / "out")
+
+
+@pytest.fixture
+def no_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    from phyradgs_cl.commands import sweep
+
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setattr(sweep, "has_dask", lambda: False)
+
+
+def lines_of(job: SweepJob) -> list[dict]:
+    return read_lines(job.folder / RESULTS)
+
+
+def test_every_run_is_in_the_file_once_with_what_it_depends_on(job) -> None:
+    told: list[SweepProgress] = []
+    written, failed = run_sweep(job, told.append)
+    lines = lines_of(job)
+    assert failed == 0 and [path.name for path in written] == ["results.jsonl", "results.md", "results.csv"]
+    assert len(lines) == RUNS == len({line["run"] for line in lines})
+    needed = {"version", "device", "seed", "options", "seconds", "metrics", "numpy", "python", "scan", "host"}
+    assert all(needed <= line.keys() for line in lines)
+    assert all({"psnr_db", "ssim"} <= line["metrics"].keys() for line in lines)
+    stored = read_volume(job.folder / lines[0]["volume"])
+    assert stored.metrics["psnr_db"] == pytest.approx(lines[0]["metrics"]["psnr_db"])
+    assert [p.done for p in told if p.line is not None] == list(range(1, RUNS + 1))
+    assert any(p.progress is not None for p in told)
+
+
+def test_a_sweep_goes_on_where_it_was_stopped(job) -> None:
+    def stop_after_five(p: SweepProgress) -> None:
+        if p.line is not None and p.done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(job, stop_after_five)
+    assert len(lines_of(job)) == 5
+    whole = (job.folder / RESULTS).read_bytes()
+    (job.folder / RESULTS).write_bytes(whole[:-30])  # killed while the last line was written
+    told: list[SweepProgress] = []
+    run_sweep(job, told.append)
+    lines = lines_of(job)
+    assert len(lines) == RUNS == len({line["run"] for line in lines})
+    assert [p.done for p in told if p.line is not None] == list(range(5, RUNS + 1))
+    run_sweep(job, told.append)
+    assert len(lines_of(job)) == RUNS
+
+
+def test_a_result_that_was_lost_on_its_way_is_not_made_again(job) -> None:
+    run = plan_sweep(job.grid, job.folder)[0]
+    run.job.output.parent.mkdir(parents=True)
+    first = task.make_run(run)
+    made_ns = run.job.output.stat().st_mtime_ns
+    assert task.make_run(run) == first and run.job.output.stat().st_mtime_ns == made_ns
+    run.job.output.unlink()  # whoever removes a volume wants it anew
+    assert task.make_run(run)["finished"] >= first["finished"] and run.job.output.exists()
+
+
+def test_a_scan_that_was_replaced_is_run_again(job) -> None:
+    run_sweep(job)
+    scan = job.grid.scans[0]
+    os.utime(scan, ns=(1, 1))
+    run_sweep(job)
+    lines = lines_of(job)
+    assert len(lines) == RUNS + RUNS // 2
+    assert {line["scan"] for line in lines[RUNS:]} == {str(scan)}
+    with open(job.folder / "results.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == RUNS
+
+
+def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
+    original = task.go_on
+
+    def failing(given, *rest):
+        if given.method == "fdk" and given.seed == 1:
+            raise InputError("scan", "no good | at all")
+        if given.method == "fdk":
+            raise ZeroDivisionError("a defect")
+        return original(given, *rest)
+
+    monkeypatch.setattr(task, "go_on", failing)
+    _, failed = run_sweep(job)
+    errors = [line["error"] for line in lines_of(job) if "error" in line]
+    assert failed == 4 and sorted(set(errors)) == [
+        "ZeroDivisionError: a defect",
+        "scan: found no good | at all",
+    ]
+    text = (job.folder / "results.md").read_text()
+    assert f"{RUNS - 4} of {RUNS} runs, 4 failed" in text and "no good \\| at all" in text
+    monkeypatch.undo()
+    _, failed = run_sweep(job)
+    assert failed == 0 and len([line for line in lines_of(job) if "error" not in line]) == RUNS
+    assert "failed run" not in (job.folder / "results.md").read_text()
+
+
+def test_a_run_waits_for_one_that_its_scheduler_lost_sight_of(job, monkeypatch) -> None:
+    run = plan_sweep(job.grid, job.folder)[0]
+    run.job.output.parent.mkdir(parents=True)
+    monkeypatch.setattr(task, "_BUSY_EVERY_S", 0.01)
+    monkeypatch.setattr(task, "_BUSY_S", 0.03)
+    with only_run(run.job.output):
+        assert "another run" in task.make_run(run)["error"]
+    original, asked = task.go_on, []
+
+    def busy_at_first(*arguments):
+        asked.append(1)
+        if len(asked) == 1:
+            raise BusyError("volume", "another run is at work on it")
+        return original(*arguments)
+
+    monkeypatch.setattr(task, "go_on", busy_at_first)
+    assert "error" not in task.make_run(run) and len(asked) == 2
+
+
+def test_two_sweeps_of_one_folder_refuse_each_other(job) -> None:
+    job.folder.mkdir()
+    with only_run(job.folder / RESULTS), pytest.raises(BusyError, match="another run"):
+        run_sweep(job)
+
+
+def test_tables_have_settings_and_options(job) -> None:
+    run_sweep(job)
+    text = (job.folder / "results.md").read_text()
+    (row,) = [line for line in text.splitlines() if line.startswith("| sirt iterations=4 |")]
+    scores = [line["metrics"]["psnr_db"] for line in lines_of(job) if line["label"] == "sirt iterations=4"]
+    assert row.split("|")[2].strip() == "4" and f"{sum(scores) / 4:.2f} ±" in row
+    with open(job.folder / "results.csv", newline="") as file:
+        records = list(csv.DictReader(file))
+    assert {record["iterations"] for record in records} == {"2", "4", ""}
+    assert all((job.folder / record["volume"]).is_file() for record in records)
+
+
+def test_the_command_needs_no_dask_for_one_run_after_the_other(job, no_dask, capsys) -> None:
+    command = ["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]
+    assert load_cli().run(command) == 0
+    said = capsys.readouterr()
+    assert f"{RUNS}/{RUNS} " in said.out and "pip install 'phyradgs-cl[cluster]'" in said.err
+    for more in (["--workers", "2"], ["--scheduler", "local"], ["--scheduler", "tcp://host:1"]):
+        (job.folder / RESULTS).unlink()
+        assert load_cli().run([*command, *more]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and "pip install 'phyradgs-cl[cluster]'" in error
+    assert load_cli().run([*command, "--device", "cpu,cpu"]) == 2
+    assert "one device" in capsys.readouterr().err
+
+
+def test_bench_says_what_to_install(tmp_path, no_dask, capsys) -> None:
+    options = ["--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out"), "--scheduler", "local"]
+    assert load_cli().run(["bench", "quick", *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "pip install 'phyradgs-cl[cluster]'" in error
+
+
+def test_failed_runs_show_in_the_status(job, no_dask, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(task, "go_on", lambda *_: 1 / 0)
+    assert load_cli().run(["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]) == 2
+    assert f"{RUNS} runs failed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scheduler": "tcp://a:1", "count": 2}, "--workers: found 2 beside --scheduler"),
+        ({"scheduler": "tcp://a:1", "device": "0"}, "--device: found '0' beside --scheduler"),
+        ({"count": 0}, "--workers"),
+        ({"scheduler": " "}, "--scheduler"),
+    ],
+)
+def test_contradicting_options_are_refused(options, message) -> None:
+    with pytest.raises(InputError, match=message):
+        Workers(**options)
+
+
+def test_devices_are_given_out_in_turn() -> None:
+    assert Workers(device="cpu,0", count=3).devices() == ["cpu", "0", "cpu"]
+    assert len(Workers(device="cpu").devices()) == 1
+    with pytest.raises(InputError, match="--device"):
+        Workers(device="cpu,").devices()
+
+
+def test_lines_are_json_without_nan(job, monkeypatch) -> None:
+    original = task.go_on
+
+    def perfect(*arguments):
+        result, metrics = original(*arguments)
+        return result, {**metrics, "psnr_db": float("inf")}
+
+    monkeypatch.setattr(task, "go_on", perfect)
+    run_sweep(job)
+    rows = (job.folder / RESULTS).read_text().splitlines()
+    lines = [json.loads(row, parse_constant=pytest.fail) for row in rows]
+    assert {line["metrics"]["psnr_db"] for line in lines} == {None}

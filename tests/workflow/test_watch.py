@@ -1,0 +1,256 @@
+"""A watched folder: every scan once, failures set aside, half-written files left alone, signals answered."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError
+from phyradgs_cl.io import only_run, read_volume
+from phyradgs_cl.io.lock import BusyError
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.workflow import ReconstructionJob
+from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch, service
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> WatchJob:
+    (tmp_path / "in").mkdir()
+    template = ReconstructionJob(Path(), Path(), method="fdk")
+    return WatchJob(tmp_path / "in", tmp_path / "out", template, poll_s=0.01, settle_s=0.0, once=True)
+
+
+@pytest.fixture
+def drop(job: WatchJob, tiny_scan: Path):
+    """A function that puts a whole scan into the watched folder."""
+
+    def dropping(name: str) -> Path:
+        part = job.folder / f".{name}.part"
+        shutil.copy(tiny_scan, part)
+        part.rename(job.folder / name)
+        return job.folder / name
+
+    return dropping
+
+
+def watched(job: WatchJob, rt: Runtime) -> list[WatchEvent]:
+    """What a watch that ends when nothing is left has told."""
+    told: list[WatchEvent] = []
+    run_watch(job, lambda: rt, told.append)
+    return told
+
+
+def outputs(job: WatchJob) -> list[str]:
+    return sorted(path.name for path in job.output.iterdir() if not path.name.startswith("."))
+
+
+def test_every_scan_becomes_a_volume_once(job, drop, rt) -> None:
+    drop("a.h5"), drop("b.h5")
+    told = watched(job, rt)
+    assert [event.scan.name for event in told] == ["a.h5", "b.h5"] and told[0].metrics["psnr_db"] > 5
+    assert outputs(job) == ["a.h5", "b.h5"] and list((job.output / ".work").iterdir()) == []
+    assert read_volume(job.output / "a.h5").provenance["scan"] == str(job.folder / "a.h5")
+    drop("c.h5")
+    assert [event.scan.name for event in watched(job, rt)] == ["c.h5"]
+    assert watched(job, rt) == []
+
+
+def test_a_failure_is_set_aside_until_its_file_changes(job, drop, rt) -> None:
+    scan = drop("bad.h5")
+    with h5py.File(scan, "r+") as file:
+        del file["entry/instrument/detector/data"]
+    drop("good.h5")
+    told = {event.scan.name: event for event in watched(job, rt)}
+    assert "data" in told["bad.h5"].error and told["good.h5"].result is not None
+    assert outputs(job) == ["bad.error.txt", "good.h5"]
+    assert (job.output / "bad.error.txt").read_text().startswith(told["bad.h5"].error)
+    assert watched(job, rt) == []
+    drop("bad.h5")  # written again, and whole
+    assert [event.error for event in watched(job, rt)] == [""]
+    assert outputs(job) == ["bad.h5", "good.h5"]
+
+
+def test_removing_the_error_tries_again(job, rt) -> None:
+    (job.folder / "text.h5").write_text("no HDF5")
+    assert len(watched(job, rt)) == 1 and watched(job, rt) == []
+    (job.output / "text.error.txt").unlink()
+    assert "not HDF5" in watched(job, rt)[0].error
+
+
+def test_a_file_that_another_program_has_open_for_writing_waits(job, drop, rt) -> None:
+    scan = drop("open.h5")
+    text = (
+        f"import h5py, sys; f = h5py.File({str(scan)!r}, 'r+'); print('open', flush=True); sys.stdin.read()"
+    )
+    environment = {**os.environ, "HDF5_USE_FILE_LOCKING": "TRUE"}
+    writer = subprocess.Popen(
+        [sys.executable, "-c", text],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    try:
+        assert writer.stdout.readline() == "open\n"
+        assert watched(job, rt) == [] and outputs(job) == []
+    finally:
+        writer.communicate("")
+    assert [event.error for event in watched(job, rt)] == [""]
+
+
+def test_half_a_file_is_set_aside_and_the_whole_taken(job, drop, rt, tiny_scan) -> None:
+    whole = tiny_scan.read_bytes()
+    scan = job.folder / "slow.h5"
+    scan.write_bytes(whole[: len(whole) // 2])  # its copying has stopped for longer than the settle time
+    assert "truncated" in watched(job, rt)[0].error
+    with open(scan, "ab") as file:
+        file.write(whole[len(whole) // 2 :])
+    assert [event.error for event in watched(job, rt)] == [""] and outputs(job) == ["slow.h5"]
+
+
+def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeypatch) -> None:
+    scan = drop("a.h5")
+    original, runs = service.go_on, []
+
+    def touching(*arguments):
+        found = original(*arguments)
+        runs.append(1)
+        if len(runs) == 1:
+            os.utime(scan, (1, 1))
+        return found
+
+    monkeypatch.setattr(service, "go_on", touching)
+    assert len(watched(job, rt)) == 1 and len(runs) == 2
+
+
+def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt, monkeypatch) -> None:
+    for name in ("a.h5", "b.h5", "c.h5", "d.h5"):
+        drop(name)
+    original = service.go_on
+    failures = {
+        "a.h5": ZeroDivisionError("a defect"),
+        "b.h5": OutOfMemoryError("memory of it"),
+        "c.h5": MemoryError(),
+    }
+
+    def failing(given, *rest):
+        if given.scan.name in failures:
+            raise failures[given.scan.name]
+        return original(given, *rest)
+
+    monkeypatch.setattr(service, "go_on", failing)
+    assert len(watched(job, rt)) == 4
+    assert outputs(job) == ["a.error.txt", "b.error.txt", "c.error.txt", "d.h5"]
+
+
+def test_a_device_that_fails_is_opened_anew_and_one_that_is_gone_ends_the_watch(
+    job, drop, rt, monkeypatch
+) -> None:
+    drop("a.h5")
+    original, opened = service.go_on, []
+
+    def failing_at_first(*arguments):
+        if len(opened) < 2:
+            raise DeviceError("device", "lost")
+        return original(*arguments)
+
+    def opening():
+        opened.append(1)
+        if len(opened) > 2:
+            raise DeviceError("OpenCL", "no device")
+        return rt
+
+    monkeypatch.setattr(service, "go_on", failing_at_first)
+    told: list[WatchEvent] = []
+    run_watch(job, opening, told.append)
+    assert len(told) == 1 and len(opened) == 2 and outputs(job) == ["a.h5"]
+    drop("b.h5")
+    opened[:] = [1]
+    monkeypatch.setattr(service, "go_on", lambda *_: (_ for _ in ()).throw(DeviceError("device", "lost")))
+    with pytest.raises(DeviceError, match="no device"):
+        run_watch(job, opening, told.append)
+    assert outputs(job) == ["a.h5"]
+
+
+def test_a_full_disk_is_no_fault_of_a_scan(job, drop, rt, monkeypatch) -> None:
+    drop("a.h5")
+    monkeypatch.setattr(
+        service, "go_on", lambda *_: (_ for _ in ()).throw(OutputError("out", "no room left"))
+    )
+    with pytest.raises(OutputError, match="no room left"):
+        watched(job, rt)
+    assert outputs(job) == []
+
+
+def test_folders_and_locks_are_checked_first(job, rt, tmp_path, capsys) -> None:
+    with pytest.raises(InputError, match="no folder"):
+        watched(WatchJob(tmp_path / "none", job.output, job.template, once=True), rt)
+    with pytest.raises(InputError, match="the watched folder itself"):
+        watched(WatchJob(job.folder, job.folder, job.template, once=True), rt)
+    job.output.mkdir()
+    with only_run(job.output / "watch"), pytest.raises(BusyError, match="another run"):
+        watched(job, rt)
+    assert load_cli().run(["watch", str(job.folder), "-o", str(job.output), "--poll-s", "0"]) == 2
+    assert "--poll-s" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_away_for_a_while_is_waited_for(job, drop, rt, monkeypatch, caplog) -> None:
+    drop("a.h5")
+    original, looks = service.Arrivals.look, []
+
+    def away(self):
+        looks.append(1)
+        if len(looks) < 4:
+            raise OSError(5, "Input/output error")
+        return original(self)
+
+    def stop(event: WatchEvent) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(service.Arrivals, "look", away)
+    with pytest.raises(KeyboardInterrupt):
+        run_watch(WatchJob(job.folder, job.output, job.template, 0.01, 0.0), lambda: rt, stop)
+    assert caplog.text.count("cannot be read") == 1 and outputs(job) == ["a.h5"]
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_keeps_a_checkpoint_that_the_next_start_goes_on_from(job, drop, number, status) -> None:
+    drop("long.h5")
+    start = [sys.executable, "-m", "phyradgs_cl", "watch", str(job.folder), "-o", str(job.output)]
+    options = [
+        "--method",
+        "sirt",
+        "--iterations",
+        "1000000",
+        "--poll-s",
+        "0.05",
+        "--checkpoint-every",
+        "0.01",
+    ]
+    process = subprocess.Popen([*start, *options], stderr=subprocess.PIPE, text=True)
+    checkpoint = job.output / ".work" / "long.h5.checkpoint.npz"
+    deadline = time.monotonic() + 60
+    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert said.splitlines()[-1].startswith("phyradgs: interrupted: finished volumes are in")
+    assert outputs(job) == [] and checkpoint.exists()
+    assert [path.name for path in job.output.iterdir()] == [".work"]  # no lock is left
+    again = subprocess.Popen([*start, *options], stderr=subprocess.DEVNULL)
+    before = checkpoint.stat().st_mtime_ns
+    while checkpoint.stat().st_mtime_ns == before and time.monotonic() < deadline + 60:
+        time.sleep(0.02)
+    again.kill()
+    again.wait()
+    assert not list(checkpoint.parent.glob("*.bak"))  # it was gone on from, not set aside
