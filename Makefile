@@ -4,6 +4,7 @@
 # make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB)
 # make test-neural    the tests of naf and sax-nerf, with PyTorch in an environment of its own
+# make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
 # make clean   remove what the two have made
 #
@@ -17,7 +18,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test docs stress test-intel test-neural test-oclgrind clean
+.PHONY: demo test docs stress test-cluster test-intel test-neural test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -62,7 +63,7 @@ docs: $(VENV)/.installed-test
 	$(BIN)/mkdocs build --strict --site-dir site
 
 stress: $(VENV)/.installed-test
-	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/faults tests/corpus tests/laws
+	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/workflow/test_watch_kills.py tests/faults tests/corpus tests/laws
 
 # Wheels do not register with the OpenCL loader: a file that names the library does.
 $(VENV)-intel/.installed: pyproject.toml
@@ -88,6 +89,16 @@ test-neural: $(VENV)-neural/.installed
 	$(VENV)-neural/bin/python -m pytest tests/neural --junit-xml=$(VENV)-neural/junit.xml
 	@$(VENV)-neural/bin/python .ci/no_skips.py $(VENV)-neural/junit.xml
 
+$(VENV)-cluster/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)-cluster
+	$(VENV)-cluster/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-cluster/bin/python -m pip install --quiet --editable ".[cpu,test,cluster]"
+	@touch $@
+
+test-cluster: $(VENV)-cluster/.installed
+	$(VENV)-cluster/bin/python -m pytest tests/cluster --junit-xml=$(VENV)-cluster/junit.xml
+	@$(VENV)-cluster/bin/python .ci/no_skips.py $(VENV)-cluster/junit.xml
+
 $(VENV)-oclgrind/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-oclgrind
 	$(VENV)-oclgrind/bin/python -m pip install --quiet --upgrade pip
@@ -98,4 +109,4 @@ test-oclgrind: $(VENV)-oclgrind/.installed
 	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-intel $(VENV)-neural $(VENV)-oclgrind $(OUT) build dist site
+	rm -rf $(VENV) $(VENV)-cluster $(VENV)-intel $(VENV)-neural $(VENV)-oclgrind $(OUT) build dist site

@@ -126,7 +126,9 @@ def run_all(arguments: argparse.Namespace) -> None:
                 if (protocol, away) not in scans:
                     path = file_for(folder, name, arguments.size)
                     scans[protocol, away] = make_scan(rt, path, arguments.size, protocol, away, seed)
-                scan = plant(scans[protocol, away], np.random.default_rng([seed, len(fault)]))
+                scan = plant(
+                    scans[protocol, away], np.random.default_rng([seed, *f"{name} {fault}".encode()])
+                )
                 append(results, {**facts, **run_one(rt, scan)})
 
 

@@ -17,11 +17,11 @@ NAME = PACKAGE.name
 # A scan holds the grid that it asks for, so the fields lie under the acquisition.
 FLOORS: tuple[frozenset[str], ...] = (
     frozenset({"__init__", "errors", "checks", "resources", "signals"}),
-    frozenset({"fields"}),
+    frozenset({"fields", "parallel"}),
     frozenset({"acquisition"}),
     frozenset({"phantoms", "detector", "metrics", "io", "runtime"}),
     frozenset({"operators", "objective", "optim", "neural"}),
-    frozenset({"simulation", "reconstructors", "importers", "exporters"}),
+    frozenset({"simulation", "reconstructors", "importers", "exporters", "cluster"}),
     frozenset({"check", "estimate", "workflow", "bench", "settings", "progress", "api", "report"}),
     frozenset({"commands"}),
     frozenset({"cli"}),

@@ -33,14 +33,18 @@ class Offset:
     residuals: np.ndarray
 
 
-def best_offset(rt: Runtime, scan: Scan) -> Offset:
-    """The shift of the panel along u, within two coarse pixels, that explains a coarse ``scan`` best.
+def rough_offset(rt: Runtime, scan: Scan) -> Offset:
+    """The best of five shifts of the panel along u, a coarse pixel apart, after a few iterations; no deviation (NaN)."""
+    block = block_of(scan)
+    trials = [fitted(rt, shifted(scan, block * s), _SEARCH_ITERATIONS) for s in _SEARCH]
+    best = int(np.argmin([t.sum() for t in trials]))
+    return Offset(block * _SEARCH[best], float("nan"), trials[best])
 
-    A coarse search, then a parabola through three neighbouring shifts; ``spread`` is NaN where there is no minimum.
-    """
-    block = scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
-    coarse = [float(fitted(rt, shifted(scan, block * s), _SEARCH_ITERATIONS).sum()) for s in _SEARCH]
-    centre = _SEARCH[int(np.argmin(coarse))]
+
+def best_offset(rt: Runtime, scan: Scan, rough: Offset) -> Offset:
+    """The shift near ``rough`` that explains a coarse ``scan`` best, by a parabola through three neighbouring shifts."""
+    block = block_of(scan)
+    centre = rough.pixels / block
     known: dict[float, np.ndarray] = {}
 
     def at(shift: float) -> np.ndarray:
@@ -57,6 +61,11 @@ def best_offset(rt: Runtime, scan: Scan) -> Offset:
     around = np.array([centre - _STEP, centre, centre + _STEP])
     found, spread = vertex(around, np.stack([at(s) for s in around]))
     return Offset(block * found, block * spread, at(centre))
+
+
+def block_of(scan: Scan) -> int:
+    """How many pixels a side make one of the coarse ``scan``."""
+    return scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
 
 
 def check_offset(offset: Offset, block: int, pitch_mm: float) -> Finding:

@@ -7,8 +7,14 @@ from phyradgs_cl.check.offset import Offset
 from phyradgs_cl.check.statistics import gain, standing
 
 _ERRORS = 3.0
-_LEAST_GAIN = 1.02
+_LEAST_GAIN, _CLEAR_GAIN = 1.02, 3.0
 _QUESTION = "sign of rotation"
+
+
+def is_clear(stated: Offset, other: Offset) -> bool:
+    """Whether one of two rough offsets explains the frames so much better that the other needs no second look."""
+    ratio = gain(stated.residuals, other.residuals)
+    return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_GAIN
 
 
 def check_rotation(stated: Offset, other: Offset) -> Finding:

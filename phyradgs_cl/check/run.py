@@ -16,12 +16,12 @@ from phyradgs_cl.check.dead_pixels import check_dead_pixels
 from phyradgs_cl.check.exposure import check_exposure
 from phyradgs_cl.check.finding import SUSPICIOUS, Finding
 from phyradgs_cl.check.gain import best_level, check_gain, without_drift
-from phyradgs_cl.check.offset import Offset, best_offset, check_offset
+from phyradgs_cl.check.offset import Offset, best_offset, block_of, check_offset, rough_offset
 from phyradgs_cl.check.readout import check_readout
-from phyradgs_cl.check.rotation import check_rotation
+from phyradgs_cl.check.rotation import check_rotation, is_clear
 from phyradgs_cl.check.saturation import CountReader, check_saturation
 from phyradgs_cl.check.timing import check_timing
-from phyradgs_cl.check.variants import Path, reversed_rotation, shifted
+from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
@@ -63,11 +63,17 @@ def check(
     scan = _without(scan, dead)
     add(check_coverage(scan))
     quick = coarse(scan, QUICK)
-    stated, other = best_offset(rt, quick), best_offset(rt, reversed_rotation(quick))
+    turned = reversed_rotation(quick)
+    stated, other = rough_offset(rt, quick), rough_offset(rt, turned)
+    was_clear = is_clear(stated, other)
+    if not was_clear:
+        stated, other = best_offset(rt, quick, stated), best_offset(rt, turned, other)
     is_reversed = add(check_rotation(stated, other)).verdict == SUSPICIOUS
     offset = other if is_reversed else stated
-    block, pitch_mm = _block(quick), scan.geometry.pixel_size_mm[1]
-    centre = add(check_offset(offset, block, pitch_mm))
+    if was_clear:
+        offset = best_offset(rt, turned if is_reversed else quick, offset)
+    pitch_mm = scan.geometry.pixel_size_mm[1]
+    centre = add(check_offset(offset, block_of(quick), pitch_mm))
     quick = _under(quick, is_reversed, offset, centre)
     drift, level = _gain(rt, quick, add)
     if scan.is_fly and scan.shutter.readout_s > 0:
@@ -93,10 +99,6 @@ def _without(scan: Scan, dead: np.ndarray) -> Scan:
         return scan
     mask = dead if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | dead
     return replace(scan, pixel_mask=mask)
-
-
-def _block(scan: Scan) -> int:
-    return scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
 
 
 def _under(scan: Scan, is_reversed: bool, offset: Offset, centre: Finding) -> Scan:

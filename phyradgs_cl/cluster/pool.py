@@ -21,10 +21,11 @@ from typing import Any
 from phyradgs_cl.cluster.library import distributed
 from phyradgs_cl.cluster.local import RESOURCE, local_cluster
 from phyradgs_cl.cluster.workers import Workers
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import DeviceError, InputError
 
 _LOOK_EVERY_S, _COUNT_EVERY_S, _SAY_EVERY_S = 0.05, 0.5, 60.0
 _CONNECT_S, _RECONNECT_S, _GATHER_S = 10.0, 600.0, 30.0
+_REVIVE_S, _STARTS = 20.0, 3
 _TEMPORARY = (
     TimeoutError,
     asyncio.TimeoutError,
@@ -60,12 +61,12 @@ class Pool:
         self._numbers = count()
         self._addresses: set[str] = set()
         self._devices = 0
-        self._counted_s = self._said_s = 0.0
+        self._counted_s, self._said_s, self._seen_s = 0.0, -_SAY_EVERY_S, time.monotonic()
 
     def __enter__(self) -> Pool:
         distributed()
         if self.workers.is_local:
-            self._cluster = local_cluster(self.workers)
+            self._cluster = self._started()
         try:
             self._client = self._connected()
         except _TEMPORARY as error:
@@ -76,6 +77,9 @@ class Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def _close(self) -> None:
         for part in (self._client, self._cluster):
             if part is not None:
                 part.close(timeout=_CONNECT_S)
@@ -105,7 +109,8 @@ class Pool:
                     name = waiting.popleft()
                     running[name] = self._submitted(function, arguments[name], name)
                 for name, future in list(running.items()):
-                    if future.status in ("cancelled", "lost"):  # the scheduler went away, not the run's fault
+                    if future.client is not self._client or future.status in ("cancelled", "lost"):
+                        # the scheduler went away, which is not the run's fault
                         del running[name]
                         waiting.appendleft(name)
                     elif future.done() and (found := self._outcome(future)) is not None:
@@ -138,6 +143,23 @@ class Pool:
             return None
 
     # --- the scheduler --------------------------------------------------------------------------------
+
+    def _started(self) -> Any:
+        """Local workers; a process that ends while it starts ends them all, and they are started again."""
+        for _ in range(_STARTS):
+            try:
+                return local_cluster(self.workers)
+            except (RuntimeError, *_TEMPORARY) as error:
+                reason = _reason(error)
+        remedy = "try fewer --workers"
+        raise DeviceError("local workers", f"that do not start ({reason})", "processes that stay", remedy)
+
+    def _revive(self) -> None:
+        """A nanny whose worker was killed as it started does not try again."""
+        log.warning("no local worker is left: starting them anew")
+        self._close()
+        self._cluster = self._started()
+        self._client = self._connected()
 
     def _connected(self) -> Any:
         package, scheduler = distributed(), self.workers.scheduler
@@ -184,7 +206,13 @@ class Pool:
         for gone in sorted(self._addresses - addresses) if is_busy else ():
             log.warning("worker %s is gone: its run is made again", gone)
         self._addresses, self._devices = addresses, sum(able.values())
-        if self._devices == 0 and now - self._said_s > _SAY_EVERY_S and not self.workers.is_local:
+        if self._devices > 0:
+            self._seen_s = now
+        elif self.workers.is_local:
+            if now - self._seen_s > _REVIVE_S:
+                self._revive()
+                self._seen_s = time.monotonic()
+        elif now - self._said_s > _SAY_EVERY_S:
             self._said_s = now
             start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
             log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)

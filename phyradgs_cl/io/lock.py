@@ -43,14 +43,24 @@ def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
     descriptor = _locked(path, output, time.monotonic() + wait_s)
     signals.unfinished.add(str(path))
     try:
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"{os.getpid()}\n".encode())
+        _sign(descriptor, output)
         yield
     finally:
         with suppress(OSError):
             path.unlink()  # still locked: whoever waits for this file will see that it is not there any more
         signals.unfinished.discard(str(path))
         os.close(descriptor)
+
+
+def _sign(descriptor: int, output: str | Path) -> None:
+    """Writes whose lock it is."""
+    try:
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"{os.getpid()}\n".encode())
+    except OSError as error:
+        found = f"{error.strerror or error} for its lock"
+        remedy = "free some space or choose another folder"
+        raise OutputError(str(output), found, "a folder that can be written", remedy) from error
 
 
 def _locked(path: Path, output: str | Path, deadline_s: float) -> int:

@@ -188,8 +188,8 @@ class _Table:
             raise InputError(self.culprit(key), "nothing", "a number", "add the key")
         number = _finite(value)
         if number is None or number < minimum or abs(number) > LENGTH.largest:
-            lowest = minimum if math.isfinite(minimum) else -LENGTH.largest
-            expected = f"a finite number from {lowest:g} to {LENGTH.largest:g}"
+            least = f" of at least {minimum:g}" if math.isfinite(minimum) else ""
+            expected = f"a finite number{least}, no larger than {LENGTH.largest:g}"
             raise InputError(self.culprit(key), checks.shown(value), expected)
         return number
 

@@ -30,7 +30,9 @@ class SharedFrames(Undivided):
         if parts and ranks.size > batch * parts:
             found = f"{parts} parts of {batch} frames a step for {ranks.size} ranks"
             raise InputError("--parts", found, "a part for every rank", "raise it, or take fewer ranks")
-        self.ranks, self.parts = ranks, parts
+        self.ranks = ranks
+        self.parts = parts or -(-ranks.size // batch)
+        """Of every frame, whether a step has all of its frames or is the last."""
         self._shares: dict[int, Shares] = {}
         self._losses = np.zeros(1)
 
@@ -58,22 +60,22 @@ class SharedFrames(Undivided):
     ) -> None:
         """dL/draw of one frame of the batch into the cloud's gradients, and its statistics; the same on the whole team."""
         cloud, objective, frame = run.clouds[0], run.objective, batch.frames[place]
-        parts = self.parts or team.size
-        if parts == 1:
+        if self.parts == 1:
             cells = run.frames.cells(frame)
             by_image = objective.evaluate(frame, objective.projector.forward(cloud.gaussians, cells))
             objective.projector.backward(cloud.gaussians, cells, by_image, cloud.gradients)
         else:
-            self._differentiate_parts(run, frame, team, parts)
+            self._differentiate_parts(run, frame, team)
         if batch.corners:
             volume = objective.crop.forward(cloud.gaussians, run.grid, batch.corners[place])
             objective.add_variation(cloud, objective.tv.evaluate(volume))
         objective.chain(cloud, statistics, late=batch.late)
 
-    def _differentiate_parts(self, run: SplatRun, frame: int, team: Communicator, parts: int) -> None:
+    def _differentiate_parts(self, run: SplatRun, frame: int, team: Communicator) -> None:
         """The image terms of a frame whose lines are cut into parts, of which each of the team has a run."""
         cloud, projector = run.clouds[0], run.objective.projector
-        mine = [span(run.frames.lines, parts, part) for part in span(parts, team.size, team.rank)]
+        of_team = span(self.parts, team.size, team.rank)
+        mine = [span(run.frames.lines, self.parts, part) for part in of_team]
         image = np.zeros(projector.image.size, np.float32)
         for lines in mine:
             drawn = run.rt.download(projector.forward(cloud.gaussians, run.frames.part(frame, lines)))
@@ -89,7 +91,7 @@ class SharedFrames(Undivided):
             projector.backward(cloud.gaussians, cells, by_image, cloud.gradients)
             gradients.append(run.rt.download(cloud.gradients))
         shape = (_DERIVED, cloud.gaussians.stride)
-        run.rt.write(cloud.gradients, exact_sum(team, gradients, shape, parts))
+        run.rt.write(cloud.gradients, exact_sum(team, gradients, shape, self.parts))
 
     def _restore(self, run: SplatRun, frame: int, lines: range, mine: list[range]) -> None:
         """What ``backward`` needs of these lines, layers included, which those drawn after them have overwritten."""

@@ -129,10 +129,10 @@ def _huge(chunks: bool) -> Change:
 
 
 def _bomb(file: h5py.File, address: str) -> None:
-    """Half a gigabyte of zeros that deflate has shrunk to half a megabyte."""
+    """128 MiB of zeros that deflate has shrunk to a thousandth."""
     axes, attributes = max(file[address].ndim, 1), dict(file[address].attrs)
     del file[address]
-    shape = {1: (1 << 27,), 2: (1 << 14, 1 << 13), 3: (512, 512, 512)}[axes]
+    shape = {1: (1 << 25,), 2: (1 << 12, 1 << 13), 3: (128, 512, 512)}[axes]
     made = file.create_dataset(address, shape, "f4", compression="gzip", compression_opts=1)
     piece = np.zeros((1 << 22,) if axes == 1 else (512, 512) if axes == 3 else (512, 1 << 13), np.float32)
     for start in range(0, shape[0], len(piece) if axes < 3 else 1):

@@ -18,7 +18,7 @@ SEED = 0
 SECONDS, MEGABYTES = 10.0, 1000.0
 # STRESS is what `make stress` sets: there all of them, here some of every kind
 STRESSED = int(os.environ.get("STRESS", "1")) > 1
-LEAST, SOME = 1500, 260
+LEAST, SOME = 1500, 220
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/clear_refs").exists(), reason="memory's peak as POSIX' Linux counts it"
 )

@@ -54,7 +54,7 @@ def cases(seed: int) -> Iterator[Case]:
         for _ in range(4):
             keep = draw.uniform(0.2, 0.9)
             cut = text.encode()[: int(len(text) * keep)]
-            yield Case(f"{of}: {name} cut", of, filled(cut + b"\xff"), command)
+            yield Case(f"{of}: cut off after {keep:.3f}", of, filled(cut + b"\xff"), command)
         yield Case(f"{of}: UTF-16", of, filled(text.encode("utf-16")), command)
         yield Case(f"{of}: cut in a quotation", of, truncated(5 / len(text)), command)
 

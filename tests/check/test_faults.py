@@ -1,0 +1,162 @@
+"""The whole check: each planted fault is found, and a clean scan has none."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
+from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
+from phyradgs_cl.check.gain import without_drift
+from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_scan, write_scan
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+from phyradgs_cl.workflow import load_scan
+
+
+def verdicts(found):
+    return {finding.question: finding.verdict for finding in found.findings}
+
+
+def stated(scan, **geometry):
+    """The same frames with another geometry stated."""
+    changed = replace(scan.geometry, **geometry)
+    return replace(scan, geometry=changed, trajectory=CircularOrbit(changed, scan.trajectory.kinematics))
+
+
+def negative(scan):
+    sweeps = scan.trajectory.kinematics
+    turned = replace(sweeps, angle_start_rad=-sweeps.angle_start_rad, angle_end_rad=-sweeps.angle_end_rad)
+    return replace(scan, trajectory=CircularOrbit(scan.geometry, turned))
+
+
+def test_a_clean_scan_has_nothing_suspicious(rt, clean) -> None:
+    seen = []
+    found = check(clean, rt, report=lambda done, total: seen.append((done, total)))
+    assert found.suspicious == []
+    assert verdicts(found)["sign of rotation"] == verdicts(found)["centre of rotation"] == OK
+    assert verdicts(found)["gain drift"] == OK
+    assert seen == [(n, 10) for n in range(1, 11)]
+
+
+def test_the_wrong_sign_of_rotation(rt, clean) -> None:
+    found = check(negative(clean), rt)
+    assert [f.question for f in found.suspicious] == ["sign of rotation"]
+
+
+def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt) -> None:
+    geometry = ConeGeometry(500.0, 700.0, (32, 32), (0.125, 0.125))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
+    protocol = make_protocol("rapid", views=15, exposure_deg=24.0, readout_ratio=0.5)
+    options = SimulationOptions(protocol=protocol, noise="tigre", time_samples=8)
+    scan = simulate(scene.source, geometry, scene.grid, options)
+    for one in (scan, negative(scan)):
+        found = verdicts(check(one, rt))
+        assert found["sign of rotation"] == found["sign of readout"] == CANNOT_TELL
+
+
+@pytest.mark.parametrize("pixels", [-3.0, 3.0])
+def test_an_offset_is_estimated_with_its_uncertainty(rt, clean, pixels) -> None:
+    pitch_mm = clean.geometry.pixel_size_mm[1]
+    found = check(stated(clean, detector_offset_mm=(0.0, pixels * pitch_mm)), rt)
+    assert [f.question for f in found.suspicious] == ["centre of rotation"]
+    assert found.offset_mm == pytest.approx(-pixels * pitch_mm, abs=0.1 * pitch_mm)
+    assert 0 < found.offset_spread_mm < 0.1 * pitch_mm
+
+
+@pytest.mark.parametrize("change", [-0.05, 0.05])
+def test_a_drift_of_the_gain(rt, clean, change) -> None:
+    drifted = without_drift(clean, -np.log1p(change), -np.log1p(change) / 2)
+    found = check(drifted, rt)
+    assert [f.question for f in found.suspicious] == ["gain drift"]
+    value = next(f.value for f in found.findings if f.question == "gain drift")
+    assert value == pytest.approx(change, abs=0.01)
+
+
+def test_the_wrong_sign_of_readout(rt) -> None:
+    """In a wide cone, along an object whose slices differ: what else would give it away?"""
+    geometry = ConeGeometry(3.0, 4.5, (48, 48), (0.125, 0.125))
+    scene = phantom_scene(rt, "foot", geometry, Grid.cube(32, 2.0), 32, "rows", 0)
+    protocol = make_protocol("rapid", views=25)
+    scan = simulate(scene.source, geometry, scene.grid, SimulationOptions(protocol=protocol, time_samples=8))
+    other = replace(scan, shutter=replace(scan.shutter, direction=-1))
+    assert verdicts(check(scan, rt))["sign of readout"] == OK
+    assert verdicts(check(other, rt))["sign of readout"] == SUSPICIOUS
+
+
+def test_scans_at_rest_are_not_asked_about_lines(rt, clean) -> None:
+    asked = verdicts(check(replace(clean, is_fly=False), rt))
+    assert "sign of readout" not in asked and "exposure" not in asked and len(asked) == 8
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
+    path = tmp_path / "scan.h5"
+    write_scan(path, clean)
+    assert cli.run(["check", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert text.count("\n") >= 11 and "0 of 10 questions suspicious" in text
+    write_scan(path, negative(clean))
+    assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["suspicious"] == 1 and len(facts["findings"]) == 10
+    assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(
+        facts["findings"][0]
+    )
+
+
+@pytest.mark.parametrize("kind", ["orbit", "poses"])
+def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None:
+    pitch_mm = clean.geometry.pixel_size_mm[1]
+    wrong = stated(clean, detector_offset_mm=(0.25, 3 * pitch_mm))
+    frames = replace(wrong, trajectory=clean.trajectory)
+    if kind == "poses":
+        time_s = np.linspace(-1, 30, 400)
+        wrong = replace(wrong, trajectory=PoseTable(time_s, wrong.geometry.pose(np.deg2rad(24 * time_s))))
+    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
+    write_scan(path, wrong)
+    before = path.read_bytes()
+    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed), "--json"]) == SUSPICIOUS_STATUS
+    shift_mm = json.loads(capsys.readouterr().out)["offset_mm"]
+    copy, expected = load_scan(fixed), frames.trajectory.pose(3, clean.frame_start_s[3:4])
+    offset_v_mm, offset_u_mm = copy.geometry.detector_offset_mm
+    assert offset_v_mm == 0.25 and offset_u_mm == pytest.approx(3 * pitch_mm + shift_mm)
+    assert path.read_bytes() == before and np.array_equal(copy.projections, clean.projections)
+    pose = copy.trajectory.pose(3, copy.frame_start_s[3:4])
+    np.testing.assert_allclose(pose[:, 3:5], expected[:, 3:5], atol=0.15 * pitch_mm)
+
+
+def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
+    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
+    data = np.concatenate([np.full((1, 32, 32), 60000.0), 60000 * np.exp(-clean.projections)]).astype(
+        np.uint16
+    )
+    key = np.r_[1, np.zeros(clean.frames, int)]
+    write_scan(path, clean, data=data, image_key=key, quantity="counts")
+    cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)])
+    held = []
+
+    def keep(frames, keys, quantity):
+        held.append((frames, quantity))
+        return clean.projections, None
+
+    read_scan(fixed, keep)
+    assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
+
+
+@pytest.mark.parametrize("options", [["--fix-offset"], ["-o", "new.h5"], ["--fix-offset", "-o", "SCAN"]])
+def test_options_that_do_not_go_together(cli, clean, tmp_path, monkeypatch, capsys, options) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_scan(tmp_path / "SCAN", clean)
+    assert cli.run(["check", "SCAN", *options]) == 2
+    assert capsys.readouterr().err.startswith("phyradgs: ")
+    assert [p.name for p in tmp_path.iterdir()] == ["SCAN"]

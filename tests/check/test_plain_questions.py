@@ -1,0 +1,153 @@
+"""The questions that need no reconstruction: each finds what is planted for it and is silent without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable
+from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
+from phyradgs_cl.check.angles import check_angles
+from phyradgs_cl.check.coverage import check_coverage
+from phyradgs_cl.check.dead_pixels import check_dead_pixels
+from phyradgs_cl.check.saturation import check_saturation
+from phyradgs_cl.check.timing import check_timing, exposure_arc_rad
+
+
+def some_frames(scan, chosen):
+    """The scan with some of its frames."""
+    sweeps = scan.trajectory.kinematics
+    kept = {name: getattr(sweeps, name)[chosen] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
+    return replace(
+        scan,
+        projections=scan.projections[chosen],
+        frame_start_s=scan.frame_start_s[chosen],
+        trajectory=CircularOrbit(scan.geometry, replace(sweeps, **kept)),
+    )
+
+
+def test_a_clean_scan_is_left_in_peace(clean) -> None:
+    finding, dead = check_dead_pixels(clean)
+    findings = [
+        check_timing(clean),
+        check_angles(clean),
+        check_coverage(clean),
+        check_saturation(clean),
+        finding,
+    ]
+    assert [f.verdict for f in findings] == [OK] * 5
+    assert not dead.any() and not any(f.advice for f in findings)
+
+
+@pytest.mark.parametrize("name", ["exposure_s", "readout_s"])
+def test_a_line_cannot_open_twice_nor_two_frames_be_read_at_once(clean, name) -> None:
+    period_s = float(np.diff(clean.frame_start_s)[0])
+    scan = replace(clean, shutter=replace(clean.shutter, **{name: 2 * period_s}))
+    finding = check_timing(scan)
+    assert finding.verdict == SUSPICIOUS and name.split("_")[0] in finding.text
+    assert finding.value == pytest.approx(2.0)
+
+
+def test_speed_within_frames_that_does_not_fit_the_steps_between_them(clean) -> None:
+    sweeps = clean.trajectory.kinematics
+    slower = replace(sweeps, angle_end_rad=(sweeps.angle_start_rad + sweeps.angle_end_rad) / 2)
+    finding = check_timing(replace(clean, trajectory=CircularOrbit(clean.geometry, slower)))
+    assert finding.verdict == SUSPICIOUS and "12° from frame to frame, the angles say 24°" in finding.advice
+
+
+def test_frames_must_follow_each_other(clean) -> None:
+    start_s = clean.frame_start_s.copy()
+    start_s[3] = start_s[2]
+    assert check_timing(replace(clean, frame_start_s=start_s)).verdict == SUSPICIOUS
+
+
+def test_an_encoder_that_wanders_is_no_fault(clean) -> None:
+    time_s = np.linspace(0, 30, 301)
+    table = EncoderTable(time_s, np.deg2rad(24 * time_s) + 0.02 * np.sin(time_s))
+    scan = replace(clean, trajectory=CircularOrbit(clean.geometry, table))
+    assert check_timing(scan).verdict == OK
+
+
+def test_the_arc_of_an_exposure(clean) -> None:
+    assert np.rad2deg(exposure_arc_rad(clean)) == pytest.approx(24.0)
+    assert exposure_arc_rad(replace(clean, is_fly=False)) == 0
+
+
+def test_missing_views_and_too_short_a_turn(clean) -> None:
+    gap = check_angles(some_frames(clean, np.r_[0:5, 9:15]))
+    assert gap.verdict == OK and gap.value == pytest.approx(24)  # a short scan, which is long enough
+    two_gaps = check_angles(some_frames(clean, np.r_[0:4, 7:9, 12:15]))
+    assert two_gaps.verdict == SUSPICIOUS and two_gaps.value == pytest.approx(96)
+    short = check_angles(some_frames(clean, np.arange(6)))
+    assert short.verdict == SUSPICIOUS and short.value == pytest.approx(120)
+    alike = check_angles(some_frames(clean, np.zeros(6, int)))
+    assert alike.verdict == SUSPICIOUS and "1 different angles" in alike.text
+
+
+def cropped(scan, columns, offset_mm):
+    """A narrower panel, said to stand at ``offset_mm``."""
+    p = scan.projections[:, :, columns]
+    geometry = replace(scan.geometry, detector_shape=p.shape[1:], detector_offset_mm=(0.0, offset_mm))
+    return replace(
+        scan, projections=p, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics)
+    )
+
+
+def test_a_panel_that_cuts_the_object(clean) -> None:
+    finding = check_coverage(cropped(clean, slice(9, 23), 0.0))
+    assert finding.verdict == SUSPICIOUS and finding.value > finding.threshold
+
+
+def test_a_displaced_panel_may_cut_it_on_its_short_side(clean) -> None:
+    right_half = slice(14, 32)
+    assert check_coverage(cropped(clean, right_half, 0.875)).verdict == OK
+    assert check_coverage(cropped(clean, right_half, -0.875)).verdict == SUSPICIOUS
+
+
+def test_saturated_areas_but_not_noise_that_is_cut_off(clean) -> None:
+    clipped = np.maximum(clean.projections, 0.1).astype(np.float32)
+    finding = check_saturation(replace(clean, projections=clipped))
+    assert finding.verdict == SUSPICIOUS and "least" in finding.text
+    dark = np.minimum(clean.projections, np.percentile(clean.projections, 90)).astype(np.float32)
+    finding = check_saturation(replace(clean, projections=dark))
+    assert finding.verdict == SUSPICIOUS and "largest" in finding.text
+    noise = np.random.default_rng(0).normal(0.1, 0.01, clean.projections.shape)
+    noisy = np.maximum(noise, 0.1).astype(np.float32)  # every second pixel at the end
+    assert check_saturation(replace(clean, projections=noisy)).verdict == OK
+
+
+def test_counts_at_the_ceiling_are_seen_on_reading(clean) -> None:
+    p = clean.projections
+    bright, flat = np.minimum(7e4 * np.exp(-p), 65535), np.full((1, *p.shape[1:]), 65535.0)
+    data = np.concatenate([flat, bright]).astype(np.uint16)
+    key = np.r_[1, np.zeros(len(p), int)]
+    counts = CountReader()
+    counts(data, key, "counts")
+    assert counts.ceiling == 65535 and counts.at_ceiling > 0.01
+    assert check_saturation(clean, counts).verdict == SUSPICIOUS
+    counts = CountReader()
+    noise = np.random.default_rng(0).poisson(data * 0.1)
+    counts(noise.astype(np.uint16), key, "counts")
+    assert check_saturation(clean, counts).verdict == OK
+
+
+@pytest.mark.parametrize("value", [0.0, 0.4, 9.9])
+def test_dead_pixels_are_found_where_they_are(clean, value) -> None:
+    p = clean.projections.copy()
+    rows, columns = np.array([3, 10, 20, 29]), np.array([15, 8, 17, 30])
+    p[:, rows, columns] = value
+    finding, dead = check_dead_pixels(replace(clean, projections=p))
+    planted = np.zeros(dead.shape, bool)
+    planted[rows, columns] = True
+    assert finding.verdict == SUSPICIOUS and np.array_equal(dead, planted)
+    masked, _ = check_dead_pixels(replace(clean, projections=p, pixel_mask=planted))
+    assert masked.verdict == OK
+
+
+def test_a_pixel_of_the_wrong_gain_is_as_bad(clean) -> None:
+    p = clean.projections.copy()
+    p[:, 12, 13] += 0.5
+    finding, dead = check_dead_pixels(replace(clean, projections=p))
+    assert finding.verdict == SUSPICIOUS and list(zip(*np.nonzero(dead), strict=True)) == [(12, 13)]

@@ -1,0 +1,132 @@
+"""Coarse scans and hypotheses: the same poses and times, by another route."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
+from phyradgs_cl.check.coarse import FINE, QUICK, binned, coarse, fewer_frames
+from phyradgs_cl.check.statistics import gain, standing, vertex
+from phyradgs_cl.check.variants import exposed, reversed_readout, reversed_rotation, shifted
+
+CLOSE = {"rtol": 0, "atol": 1e-12}
+
+
+def poses(scan):
+    return np.stack(
+        [scan.trajectory.pose(f, np.array([s, s + 0.7])) for f, s in enumerate(scan.frame_start_s)]
+    )
+
+
+def displaced(scan, u_mm):
+    geometry = replace(scan.geometry, detector_offset_mm=(0.3, u_mm))
+    return replace(scan, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics))
+
+
+def test_turning_back_is_the_orbit_of_negative_angles(clean) -> None:
+    scan = displaced(clean, 0.4)
+    sweeps = scan.trajectory.kinematics
+    negative = replace(sweeps, angle_start_rad=-sweeps.angle_start_rad, angle_end_rad=-sweeps.angle_end_rad)
+    expected = replace(scan, trajectory=CircularOrbit(scan.geometry, negative))
+    np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(expected), **CLOSE)
+
+
+def test_a_shift_is_an_offset_of_the_panel(clean) -> None:
+    moved = displaced(clean, 0.4 + 2.5 * clean.geometry.pixel_size_mm[1])
+    np.testing.assert_allclose(poses(shifted(displaced(clean, 0.4), 2.5)), poses(moved), **CLOSE)
+
+
+@pytest.mark.parametrize("block", [2, 3])
+def test_blocks_stand_in_the_middle_of_their_pixels(clean, block) -> None:
+    scan = shifted(reversed_rotation(displaced(clean, 0.4)), 1.5)
+    small = binned(scan, block)
+    rows, columns = small.geometry.detector_shape
+    assert (rows, columns) == (32 // block, 32 // block)
+    fine = pixel_centres(poses(scan), scan.geometry.detector_shape)[:, :, : rows * block, : columns * block]
+    middle = fine.reshape(*fine.shape[:2], rows, block, columns, block, 3).mean((3, 5))
+    at = small.frame_start_s - scan.frame_start_s
+    again = np.stack(
+        [small.trajectory.pose(f, np.array([s, s + 0.7]) - at[f]) for f, s in enumerate(small.frame_start_s)]
+    )
+    np.testing.assert_allclose(pixel_centres(again, small.geometry.detector_shape), middle, **CLOSE)
+
+
+def test_the_stated_panel_of_blocks_is_where_its_orbit_has_it(clean) -> None:
+    small = binned(displaced(clean, 0.4), 3)
+    orbit = CircularOrbit(small.geometry, clean.trajectory.kinematics)
+    np.testing.assert_allclose(poses(small), poses(replace(small, trajectory=orbit)), **CLOSE)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("block", [2, 3])
+@pytest.mark.parametrize("pulse_s", [None, (0.3, 0.8)])
+def test_blocks_of_lines_open_when_their_lines_do_on_average(clean, direction, block, pulse_s) -> None:
+    scan = replace(clean, shutter=Shutter(1.0, 0.5, "rows", direction, None))
+    small = binned(scan, block)
+    count = 32 // block
+    lines = scan.shutter.line_windows_s(32)[: count * block].reshape(count, block, 2).mean(1)
+    later_s = float(small.frame_start_s[0] - scan.frame_start_s[0])
+    np.testing.assert_allclose(later_s + small.shutter.line_windows_s(count), lines, **CLOSE)
+    pulsed = binned(replace(scan, shutter=replace(scan.shutter, pulse_s=pulse_s)), block).shutter.pulse_s
+    assert pulsed == (None if pulse_s is None else pytest.approx((pulse_s[0] - later_s, pulse_s[1])))
+
+
+def test_masked_pixels_are_left_out_of_their_block(clean) -> None:
+    p, mask = clean.projections.copy(), np.zeros((32, 32), bool)
+    mask[4, 6], mask[8:10, 8:10] = True, True
+    p[:, mask] = 99.0
+    small = binned(replace(clean, projections=p, pixel_mask=mask), 2)
+    expected = (p[:, 4, 7] + p[:, 5, 6] + p[:, 5, 7]) / 3
+    np.testing.assert_allclose(small.projections[:, 2, 3], expected, rtol=1e-6)
+    assert np.argwhere(small.pixel_mask[0]).tolist() == [[4, 4]]
+
+
+def test_fewer_frames_keep_their_poses_and_times(clean) -> None:
+    few = fewer_frames(clean, 5)
+    chosen = [0, 4, 7, 10, 14]
+    assert few.frames == 5 and np.array_equal(few.projections, clean.projections[chosen])
+    np.testing.assert_allclose(poses(few), poses(clean)[chosen], **CLOSE)
+    np.testing.assert_allclose(
+        poses(binned(few, 2))[:, :, :3], poses(binned(clean, 2))[chosen][:, :, :3], **CLOSE
+    )
+
+
+def test_levels_bound_pixels_and_voxels(clean) -> None:
+    assert coarse(clean, FINE).projections.shape == clean.projections.shape
+    small = coarse(replace(clean, projections=clean.projections), replace(QUICK, columns=16))
+    assert small.geometry.detector_shape == (16, 16)
+    assert max(small.grid.shape) <= 24 and small.grid.size_mm == pytest.approx(clean.grid.size_mm)
+
+
+def test_a_table_of_poses_can_be_asked_too(clean) -> None:
+    time_s = np.linspace(-1, 30, 400)
+    table = PoseTable(time_s, clean.geometry.pose(np.deg2rad(24 * time_s)))
+    scan = replace(clean, trajectory=table)
+    np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(reversed_rotation(clean)), atol=1e-6)
+    np.testing.assert_allclose(poses(shifted(scan, 2.0)), poses(shifted(clean, 2.0)), atol=1e-6)
+
+
+def test_times_of_hypotheses(clean) -> None:
+    assert reversed_readout(clean).shutter.direction == -1
+    assert exposed(clean, 0.5).shutter.exposure_s == clean.shutter.exposure_s / 2
+
+
+def test_the_vertex_of_a_parabola_and_its_deviation() -> None:
+    rng = np.random.default_rng(0)
+    at, centres = np.array([-1.0, 0.0, 1.0]), rng.normal(0.3, 0.1, 400)
+    found, spread = vertex(at, (at[:, None] - centres) ** 2 + 5)
+    assert found == pytest.approx(centres.mean())
+    assert spread == pytest.approx(0.1 / 20, rel=0.3)
+    assert np.isnan(vertex(at, -np.ones((3, 1)) * (at[:, None] - centres) ** 2)[0])
+
+
+def test_the_standing_of_hypotheses_is_antisymmetric() -> None:
+    rng = np.random.default_rng(0)
+    one = 1 + 0.01 * rng.random(30)
+    other = one * (1.05 + 0.01 * rng.random(30))
+    assert standing(one, other) > 10 and standing(one, other) == pytest.approx(-standing(other, one))
+    assert gain(one, other) == pytest.approx(1 / gain(other, one))
+    assert standing(one, one) == 0 and standing(one[:2], other[:2]) == 0
