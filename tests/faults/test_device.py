@@ -12,7 +12,7 @@ from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.runtime import context
 
 # STRESS is what `make stress` sets: there every launch of a run fails once
-MOST = 3 if int(os.environ.get("STRESS", "1")) == 1 else 100_000
+MOST = 2 if int(os.environ.get("STRESS", "1")) == 1 else 100_000
 RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
     "cgls": ["--method", "cgls", "--iterations", "5", "--set", "noise_stop=0"],
