@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tolerances import RANK_GRADIENT, RANK_VOLUME
+from tolerances import DOMAIN_GRADIENT, RANK_GRADIENT, RANK_VOLUME
 
 from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
 from phyradgs_cl.errors import InputError, PhyradgsError
@@ -91,8 +91,9 @@ def test_gradients_of_ranks_add_up_to_the_undivided_one(rt, ranks_of, scan, size
     options = replace(OPTIONS, motion=motion, batch=1, **SMOOTH)
     expected = gradient(scan, options, rt)
     divided = replace(options, split=split)
+    tolerance = RANK_GRADIENT if split == "frames" else DOMAIN_GRADIENT
     for found in ranks_of(size, lambda ranks: gradient(scan, divided, Runtime(ranks=ranks))):
-        assert np.linalg.norm(found - expected) <= RANK_GRADIENT * np.linalg.norm(expected)
+        assert np.linalg.norm(found - expected) <= tolerance * np.linalg.norm(expected)
 
 
 def test_a_batch_s_gradient_is_the_sum_of_its_frames(scan) -> None:
@@ -131,7 +132,7 @@ def test_classical_methods_come_to_the_same_volume(ranks_of, scan, method, model
             np.testing.assert_array_equal(volume, volumes[0])
 
 
-MEMORY_BYTES = 700_000
+MEMORY_BYTES = 3_000_000  # the whole takes 8.7 MB on one device
 LARGE = replace(
     OPTIONS, split="domain", parts=4, motion=Motion("micro-views", 8, 5), gaussians=400, tv_edge=8
 )
