@@ -30,6 +30,8 @@ _SPLAT_TRIALS = (20, 200)  # iterations
 _ITERATIVE_TRIALS = (1, 3)
 _LEAST_DIFFERENCE_S = 0.3  # between the trials of methods whose iterations are alike
 _MOST_ALIKE = 200
+_AS_WELL_RUN_S = 20.0  # a whole run that takes no longer is the best estimate of a method that may stop by itself
+_GROWN, _GROWTH_TRIALS = 1.1, 3  # by how much a cloud has to grow for a longer trial, and how much longer it is
 _FEWEST_BETWEEN = 5  # iterations from one round of density control to the next, in a trial
 
 
@@ -79,24 +81,49 @@ def estimate(
     reads them from the driver's cache, as the run will.
     """
     started = time.perf_counter()
-    last: list[Reconstruction] = []
-
-    def seconds(iterations: int | None) -> float:
-        short = options if iterations is None else shortened(options, iterations)
-        begun = time.perf_counter()
-        last[:] = [reconstruct(scan, method, rt, short, before=before)]
-        return time.perf_counter() - begun
-
+    trials = _Trials(scan, method, options, rt, before)
     total = getattr(options, "iterations", None)
     if total is None or not METHODS[method].is_resumable:
-        whole_s, each_s, trial, total = seconds(None), 0.0, 0, 0
+        whole_s, each_s, total = trials.run(None), 0.0, 0
     elif isinstance(options, SplatOptions):
-        whole_s, each_s, trial = _of_schedule(seconds, total, *_SPLAT_TRIALS)
+        whole_s, each_s = _of_schedule(trials, options, *_SPLAT_TRIALS)
     else:
-        whole_s, each_s, trial = _of_alike(seconds, total, *_ITERATIVE_TRIALS)
-    around_s = around(last[0]) if around else 0.0
+        whole_s, each_s = _of_alike(trials, total, *_ITERATIVE_TRIALS)
+        if whole_s <= _AS_WELL_RUN_S and getattr(options, "noise_stop", 0) > 0:
+            whole_s = trials.run(total)  # it may stop by itself, and only a run tells when
+    around_s = around(trials.last) if around else 0.0
     spent_s, held = time.perf_counter() - started, peak_host_bytes()
-    return Estimate(whole_s + around_s, held, rt.peak_bytes, total, each_s, trial, spent_s, around_s)
+    return Estimate(
+        whole_s + around_s, held, rt.peak_bytes, total, each_s, trials.iterations, spent_s, around_s
+    )
+
+
+class _Trials:
+    """Short runs of one reconstruction; ``last`` is the latest result, ``iterations`` how many they had in all."""
+
+    def __init__(
+        self, scan: Scan, method: str, options: Any, rt: Runtime, before: InputOptions | None
+    ) -> None:
+        self.scan, self.method, self.options, self.rt, self.before = scan, method, options, rt, before
+        self.iterations = 0
+
+    def run(self, iterations: int | None) -> float:
+        """Seconds of so many iterations, or of the method as a whole."""
+        short = self.options if iterations is None else shortened(self.options, iterations)
+        self.iterations += iterations or 0
+        begun = time.perf_counter()
+        self.last = reconstruct(self.scan, self.method, self.rt, short, before=self.before)
+        return time.perf_counter() - begun
+
+    @property
+    def control_s(self) -> float:
+        """Seconds of the last run in density control."""
+        return float(self.last.facts["density_control_seconds"])
+
+    @property
+    def has_grown(self) -> bool:
+        """Whether the last run ended with more Gaussians than it began with."""
+        return self.last.facts["gaussians"] > _GROWN * self.last.facts["gaussians_first"]
 
 
 def shortened(options: Any, iterations: int) -> Any:
@@ -110,39 +137,53 @@ def shortened(options: Any, iterations: int) -> Any:
     return replace(options, iterations=iterations, control=control, parameter_terms_from=late)
 
 
-def _of_schedule(
-    seconds: Callable[[int], float], total: int, few: int, more: int
-) -> tuple[float, float, int]:
-    """(seconds of ``total`` iterations, seconds of one, iterations that were run) of a run that changes on its way.
+def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) -> tuple[float, float]:
+    """(seconds of a whole run, seconds of one of its iterations), of a run that changes on its way.
 
-    ``few`` iterations, twice, tell what a run takes beside its iterations; ``more`` go through all of its schedule.
+    ``few`` iterations, twice, tell what a run takes beside its iterations; ``more`` go through all of its schedule. Those
+    have as many rounds of density control as the whole run, so that what these take is kept apart. A cloud that grows does
+    so faster in a short run, where gradients are larger: then a longer one, up to a fifth of the whole, says more.
     """
-    first_s = seconds(min(few, total))
+    total = options.iterations
+    first_s = trials.run(min(few, total))
     if total <= few:
-        return first_s, first_s / max(total, 1), total
+        return first_s, first_s / max(total, 1)
+    early_control_s = trials.control_s
     if total <= more:
-        warm_s = seconds(total)  # the first has built the kernels, for this one too
-        return first_s + (1 - few / total) * warm_s, warm_s / total, few + total
-    again_s, through_s = seconds(few), seconds(more)
-    each_s = max(through_s - again_s, 0.0) / (more - few)
-    return first_s + (total - few) * each_s, each_s, 2 * few + more
+        warm_s = trials.run(total)  # the first has built the kernels, for this one too
+        return first_s + (1 - few / total) * warm_s, warm_s / total
+    first_s -= early_control_s
+    again_s = trials.run(few) - trials.control_s
+    through_s = trials.run(more)
+    if trials.has_grown and total > _GROWTH_TRIALS * more:
+        more *= _GROWTH_TRIALS
+        through_s = trials.run(more)
+    rounds = trials.last.facts["density_control_rounds"]
+    each_s = max(through_s - trials.control_s - again_s, 0.0) / (more - few)
+    control_s = trials.control_s * _rounds(options) / max(rounds, 1)
+    return first_s + (total - few) * each_s + control_s, each_s + control_s / total
 
 
-def _of_alike(seconds: Callable[[int], float], total: int, few: int, more: int) -> tuple[float, float, int]:
+def _rounds(options: SplatOptions) -> int:
+    """Rounds of density control in a run."""
+    return sum(options.control.is_due(i, options.iterations) for i in range(1, options.iterations + 1))
+
+
+def _of_alike(trials: _Trials, total: int, few: int, more: int) -> tuple[float, float]:
     """The same of a run whose iterations are alike; so many that the difference of two trials can be told from noise."""
-    first_s = seconds(min(few, total))
+    first_s = trials.run(min(few, total))
     if total <= few:  # the first has built the kernels, which the run will find built
-        whole_s = seconds(total)
-        return first_s, whole_s / max(total, 1), 2 * total
-    again_s, trial = seconds(few), 2 * few
+        whole_s = trials.run(total)
+        return first_s, whole_s / max(total, 1)
+    again_s = trials.run(few)
     while True:
         more = min(more, total)
-        more_s, trial = seconds(more), trial + more
+        more_s = trials.run(more)
         if more_s - again_s >= _LEAST_DIFFERENCE_S or more == total or more >= _MOST_ALIKE:
             break
         more *= 4
     each_s = max(more_s - again_s, 0.0) / (more - few)
-    return first_s + (total - few) * each_s, each_s, trial
+    return first_s + (total - few) * each_s, each_s
 
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:

@@ -57,6 +57,8 @@ def reconstruct_splats(
         "gaussians_first": first_count,
         "gaussians": cloud.count,
         "seconds": time.perf_counter() - started + run.seconds_before,
+        "density_control_seconds": run.control_seconds,
+        "density_control_rounds": run.control_rounds,
         "interrupted_at": run.interrupted_at,
         "detector_model": "log" if run.frames.intensity_unit is None else "intensity",
         "batch": run.batch,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +14,7 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.estimate import duration, estimate, shortened
 from phyradgs_cl.reconstructors import method_options
 from phyradgs_cl.reconstructors.result import Reconstruction
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.workflow import load_scan
 
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4"]
@@ -31,10 +33,12 @@ def scan(cli, tmp_path_factory) -> Path:
 
 
 class Clock:
-    """A clock that only reconstructions move: ``start`` seconds each and ``each`` an iteration."""
+    """A clock that only reconstructions move: ``start`` seconds each, ``each`` an iteration, ``control`` a round of density
+    control; runs of over 100 iterations end with ``growth`` times the Gaussians."""
 
-    def __init__(self, start: float, each: float) -> None:
+    def __init__(self, start: float, each: float, control: float = 0.0, growth: float = 1.0) -> None:
         self.now, self.start, self.each, self.iterations = 0.0, start, each, []
+        self.control, self.growth = control, growth
 
     def perf_counter(self) -> float:
         return self.now
@@ -42,8 +46,17 @@ class Clock:
     def reconstruct(self, scan, method, rt, options, *, before=None) -> Reconstruction:
         iterations = getattr(options, "iterations", 1)
         self.iterations.append(iterations)
-        self.now += self.start + iterations * self.each
-        return None  # nobody looks
+        rounds = 0
+        if isinstance(options, SplatOptions):
+            rounds = sum(options.control.is_due(i, iterations) for i in range(1, iterations + 1))
+        self.now += self.start + iterations * self.each + rounds * self.control
+        facts = {
+            "density_control_rounds": rounds,
+            "density_control_seconds": rounds * self.control,
+            "gaussians_first": 100,
+            "gaussians": 100 * (self.growth if iterations > 100 else 1),
+        }
+        return SimpleNamespace(facts=facts)
 
 
 @pytest.fixture
@@ -61,6 +74,28 @@ def test_time_is_that_of_a_run_whose_iterations_are_alike(rt, scan, clock, metho
     assert found.seconds == pytest.approx(2.0 + 0.25 * iterations)
     assert found.iterations == iterations and found.seconds_an_iteration > 0
     assert sum(clock.iterations) <= 300
+
+
+@pytest.mark.parametrize(("growth", "longest"), [(1.0, 200), (2.0, 600)])
+def test_rounds_of_density_control_count_as_often_as_they_come(rt, scan, monkeypatch, growth, longest) -> None:
+    """A trial has as many rounds as the whole run in a fraction of its iterations; a cloud that grows has a longer trial."""
+    made = Clock(2.0, 0.25, control=3.0, growth=growth)
+    monkeypatch.setattr(room, "time", made)
+    monkeypatch.setattr(room, "reconstruct", made.reconstruct)
+    options = method_options("r2", None, {"iterations": 3000})
+    control = options.control
+    rounds = sum(control.is_due(i, 3000) for i in range(1, 3001))
+    assert rounds > 10
+    found = estimate(load_scan(scan), "r2", options, rt)
+    assert found.seconds == pytest.approx(2.0 + 0.25 * 3000 + 3.0 * rounds)
+    assert max(made.iterations) == longest
+
+
+def test_a_method_that_may_stop_by_itself_is_run_if_that_is_short(rt, scan, clock) -> None:
+    for iterations, is_run in ((60, True), (200, False)):
+        clock.iterations.clear()
+        estimate(load_scan(scan), "cgls", method_options("cgls", None, {"iterations": iterations}), rt)
+        assert (clock.iterations[-1] == iterations) == is_run
 
 
 def test_a_trial_goes_through_the_whole_schedule() -> None:
