@@ -55,24 +55,51 @@ app = typer.Typer(
     add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result.\n\n"
+    help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result. 'phyradgs COMMAND --help' "
+    "explains a command.\n\n"
     "Exit status: 0 done, 2 wrong input, 3 numbers that overflowed, 4 output not written, 5 no device or one that fails, "
     "6 out of memory, 10 suspicious (check), 130 interrupted, 143 terminated.",
 )
-app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate_command)
-app.command("import", epilog=import_scan.EXAMPLE)(import_scan.import_command)
-app.command("check", epilog=check.EXAMPLE)(check.check_command)
-app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct_command)
-app.command("estimate", epilog=estimate.EXAMPLE)(estimate.estimate_command)
-app.command("evaluate", epilog=evaluate.EXAMPLE)(evaluate.evaluate_command)
-app.command("report", epilog=report.EXAMPLE)(report.report_command)
-app.command("view", epilog=view.EXAMPLE)(view.view_command)
-app.command("export", epilog=export_volume.EXAMPLE)(export_volume.export_command)
-app.command("bench", epilog=bench.EXAMPLE)(bench.bench_command)
-app.command("sweep", epilog=sweep.EXAMPLE)(sweep.sweep_command)
-app.command("watch", epilog=watch.EXAMPLE)(watch.watch_command)
-app.command("info", epilog=info.EXAMPLE)(info.info_command)
-app.command("devices", epilog=devices.EXAMPLE)(devices.devices_command)
+app.command("simulate", short_help="Simulate a fly-scan of a phantom or a volume.", epilog=simulate.EXAMPLE)(
+    simulate.simulate_command
+)
+app.command(
+    "import", short_help="Turn the scan of another program into a scan file.", epilog=import_scan.EXAMPLE
+)(import_scan.import_command)
+app.command("check", short_help="Look for what is wrong or suspicious in a scan.", epilog=check.EXAMPLE)(
+    check.check_command
+)
+app.command("reconstruct", short_help="Reconstruct a scan into a volume.", epilog=reconstruct.EXAMPLE)(
+    reconstruct.reconstruct_command
+)
+app.command(
+    "estimate", short_help="Say what time and memory a reconstruction would take.", epilog=estimate.EXAMPLE
+)(estimate.estimate_command)
+app.command("evaluate", short_help="Measure a volume against the truth.", epilog=evaluate.EXAMPLE)(
+    evaluate.evaluate_command
+)
+app.command("report", short_help="Write one HTML page about a reconstruction.", epilog=report.EXAMPLE)(
+    report.report_command
+)
+app.command("view", short_help="Look at a volume in napari.", epilog=view.EXAMPLE)(view.view_command)
+app.command(
+    "export",
+    short_help="Write a volume for 3D Slicer, ImageJ, napari and others.",
+    epilog=export_volume.EXAMPLE,
+)(export_volume.export_command)
+app.command("bench", short_help="Compare methods on volumes.", epilog=bench.EXAMPLE)(bench.bench_command)
+app.command("sweep", short_help="Reconstruct many scans with many settings.", epilog=sweep.EXAMPLE)(
+    sweep.sweep_command
+)
+app.command("watch", short_help="Reconstruct the scans of a folder as they arrive.", epilog=watch.EXAMPLE)(
+    watch.watch_command
+)
+app.command("info", short_help="Say what a scan or volume file holds.", epilog=info.EXAMPLE)(
+    info.info_command
+)
+app.command("devices", short_help="List OpenCL devices, and say which one is taken.", epilog=devices.EXAMPLE)(
+    devices.devices_command
+)
 
 
 @app.callback(invoke_without_command=True)

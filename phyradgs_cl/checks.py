@@ -70,6 +70,8 @@ def shown(value: object) -> str:
         text = repr(value)
     except ValueError:  # Python refuses to print whole numbers of thousands of digits
         return "a number of thousands of digits"
+    except RecursionError:
+        return "hundreds of tables or lists in each other"
     return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
 
 

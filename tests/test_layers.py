@@ -22,7 +22,7 @@ FLOORS: tuple[frozenset[str], ...] = (
     frozenset({"phantoms", "detector", "metrics", "io", "runtime"}),
     frozenset({"operators", "objective", "optim", "neural"}),
     frozenset({"simulation", "reconstructors", "importers", "exporters", "cluster"}),
-    frozenset({"check", "estimate", "workflow", "bench", "settings", "progress", "api", "report"}),
+    frozenset({"check", "estimate", "rank_plan", "workflow", "bench", "settings", "progress", "api", "report"}),
     frozenset({"commands"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),

@@ -26,7 +26,8 @@ def check_angles(scan: Scan) -> Finding:
     gaps_deg = np.rad2deg(np.diff(angles_rad, append=angles_rad[0] + 2 * np.pi))
     apart_deg = gaps_deg[gaps_deg > math.degrees(_SAME_RAD)]
     if apart_deg.size < 3:
-        text, advice = f"{apart_deg.size} different angles", "check rotation_angle and its unit (degrees)"
+        count = max(apart_deg.size, 1)
+        text, advice = f"{count} different angle{'s' if count > 1 else ''}", "check rotation_angle and its unit (degrees)"
         return Finding(_QUESTION, SUSPICIOUS, float(apart_deg.size), 3.0, "angles", text, advice)
     usual_deg = float(np.median(apart_deg))
     widest = np.sort(apart_deg)[::-1]

@@ -20,14 +20,20 @@ def check_coverage(scan: Scan) -> Finding:
 
     A border counts as touched where the mean over a few neighbouring rows of its two outermost columns is above the
     threshold and above the noise, in a tenth of the frames. A displaced panel may cut the object on its short side.
-    Rows are not asked: objects longer than the panel are the rule.
+    Rows are not asked: objects longer than the panel are the rule. Frames in which nothing rises above the noise have no
+    object, or another sign.
     """
     p = np.asarray(scan.projections)
     if p.shape[2] < 8:
         return Finding(_QUESTION, CANNOT_TELL, 0.0, 0.0, "line integral", "fewer than 8 columns")
     valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, p.shape)
     largest = float(np.percentile(p if valid is None else p[valid], 99.9))
-    threshold = max(_LARGEST_SHARE * largest, _NOISES * noise_level(p, valid))
+    noise = _NOISES * noise_level(p, valid)
+    if largest <= noise:
+        text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
+        advice = "was the object in the beam? Are the values line integrals, larger where more is in the way?"
+        return Finding(_QUESTION, SUSPICIOUS, largest, noise, "line integral", text, advice)
+    threshold = max(_LARGEST_SHARE * largest, noise)
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     allowed = _cut_on_purpose(scan)
     asked = {name: level for name, level in sides.items() if name != allowed}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import binary_propagation, maximum_filter, median_filter, minimum_filter
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
@@ -14,6 +14,8 @@ _SHARE = 2e-4  # of the panel's pixels
 _LEAST_FRAMES = 5
 _MOST_TIMES = 0.7  # of the frames
 _MOST_FRAMES = 40
+_STILL_SIDES = 0.5  # of the outermost columns: from here air has no noise
+_AROUND = np.ones((3, 3), bool)
 _QUESTION = "dead pixels"
 
 
@@ -33,7 +35,7 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     frames = np.asarray(scan.projections)[chosen]
     dead = (_constant(frames) | _apart(frames)) & ~known
     share = float(dead.sum() / max(int((~known).sum()), 1))
-    text = f"{int(dead.sum())} pixels ({100 * share:.2g} %) that the mask does not have"
+    text = f"{int(dead.sum())} pixels ({100 * share:.3g} %) that the mask does not have"
     if share <= _SHARE:
         return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text), dead
     row, column = (int(i[0]) for i in np.nonzero(dead))
@@ -51,13 +53,19 @@ def _masked(scan: Scan) -> np.ndarray:
 
 
 def _constant(frames: np.ndarray) -> np.ndarray:
+    """Pixels that never change while those around them do; air without noise never changes either, and is no fault."""
     swing = np.ptp(frames, axis=0)
-    return (swing == 0) & (median_filter(swing, size=3) > 0)
+    constant = swing == 0
+    sides = np.zeros_like(constant)
+    sides[:, [0, -1]] = constant[:, [0, -1]]
+    if sides[:, [0, -1]].mean() > _STILL_SIDES:
+        constant = constant & ~binary_propagation(sides, _AROUND, mask=constant)
+    return constant & (median_filter(swing, size=3) > 0)
 
 
 def _apart(frames: np.ndarray) -> np.ndarray:
     """Pixels beyond all their neighbours in most frames, by far: edges of the object pass, or have neighbours alike."""
-    ring = np.ones((3, 3), bool)
+    ring = _AROUND.copy()
     ring[1, 1] = False
     above = np.mean([frame > maximum_filter(frame, footprint=ring) for frame in frames], axis=0)
     below = np.mean([frame < minimum_filter(frame, footprint=ring) for frame in frames], axis=0)

@@ -21,6 +21,10 @@ def check_exposure(rt: Runtime, scan: Scan) -> Finding:
     squared residual. A quarter less says that the exposure is stated too long; anything else says nothing, because a
     wrong exposure of a small arc stays within the same range. So the answer is never ``ok``: ``timing`` bounds it.
     """
+    if scan.shutter.pulse_s is not None:
+        text = "the beam is pulsed: when lines see light is the pulse's to say"
+        advice = "compare the pulse with the generator's log"
+        return Finding(_QUESTION, CANNOT_TELL, 1.0, _LARGEST_GAIN, "share", text, advice)
     stated, half = fitted(rt, scan), fitted(rt, exposed(scan, 0.5))
     ratio, errors = gain(stated, half), standing(stated, half)
     text = f"exposed half as long, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"

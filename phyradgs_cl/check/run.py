@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.angles import check_angles
 from phyradgs_cl.check.coarse import FINE, QUICK, coarse
@@ -22,6 +23,7 @@ from phyradgs_cl.check.rotation import check_rotation, is_clear
 from phyradgs_cl.check.saturation import CountReader, check_saturation
 from phyradgs_cl.check.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
@@ -45,8 +47,12 @@ def check(
     counts: CountReader | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> CheckResult:
-    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was."""
-    scan = prepared(scan, InputOptions())
+    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was.
+
+    Raises:
+        InputError: every pixel is masked; NaN or infinity where none is.
+    """
+    scan = prepared(_usable(scan), InputOptions())
     total = 8 + (scan.is_fly and scan.shutter.readout_s > 0) + (scan.is_fly and scan.shutter.exposure_s > 0)
     found: list[Finding] = []
 
@@ -82,6 +88,19 @@ def check(
     if scan.is_fly and scan.shutter.exposure_s > 0:
         add(check_exposure(rt, without_drift(quick, drift, level)))
     return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
+
+
+def _usable(scan: Scan) -> Scan:
+    """The scan with zeros for masked values that are not finite."""
+    p = np.asarray(scan.projections)
+    valid = np.broadcast_to(True if scan.pixel_mask is None else np.asarray(scan.pixel_mask) == 0, p.shape)
+    if not valid.any():
+        raise InputError("pixel_mask", "every pixel masked", "pixels that say something", "check the mask")
+    finite = np.isfinite(p)
+    if finite.all():
+        return scan
+    checks.finite("projections", p[valid])
+    return replace(scan, projections=np.where(finite, p, 0).astype(np.float32))
 
 
 def _gain(rt: Runtime, scan: Scan, add: Callable[[Finding], Finding]) -> tuple[float, float]:

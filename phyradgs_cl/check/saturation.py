@@ -44,7 +44,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     asked: it is air in simulated and in clipped scans.
     """
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
-        text = f"{100 * counts.at_ceiling:.2g} % of the pixels lie together at {counts.ceiling:g} counts"
+        text = f"{100 * counts.at_ceiling:.3g} % of the pixels lie together at {counts.ceiling:g} counts"
         advice = "the detector is saturated there: lower the exposure, or mask these pixels"
         return Finding(_QUESTION, SUSPICIOUS, counts.at_ceiling, _SHARE, "share of pixels", text, advice)
     p = np.asarray(scan.projections)
@@ -57,7 +57,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         "largest": (_clustered((p == highest) & ~masked) if highest > _ZERO else 0.0, highest),
     }
     name, (share, value) = max(ends.items(), key=lambda item: item[1][0])
-    text = f"{100 * share:.2g} % of the pixels lie together at the {name} line integral, {value:.4g}"
+    text = f"{100 * share:.3g} % of the pixels lie together at the {name} line integral, {value:.4g}"
     if share <= _SHARE:
         return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text)
     advice = {

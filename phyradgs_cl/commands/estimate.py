@@ -5,9 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import typer
+
+from phyradgs_cl import checks
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import (
     Assignments,
+    Batch,
     Config,
     Device,
     GaussianCount,
@@ -18,8 +22,10 @@ from phyradgs_cl.commands.options import (
     Memory,
     Method,
     MotionModel,
+    Parts,
     Preset,
     Segments,
+    Split,
     Strips,
     SubIntervals,
     TimeError,
@@ -27,12 +33,14 @@ from phyradgs_cl.commands.options import (
     given_options,
 )
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
+from phyradgs_cl.rank_plan import plan_ranks
 from phyradgs_cl.reconstructors import Reconstruction, method_options
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import run_settings
 from phyradgs_cl.workflow import load_scan
 
 EXAMPLE = "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row"
+MOST_RANKS = 100_000
 
 
 def estimate_command(
@@ -46,6 +54,9 @@ def estimate_command(
     iterations: Iterations = None,
     gaussians: GaussianCount = None,
     preset: Preset = None,
+    batch: Batch = None,
+    split: Split = None,
+    parts: Parts = None,
     config: Config = None,
     assignments: Assignments = None,
     detector_model: LineModel = None,
@@ -53,6 +64,13 @@ def estimate_command(
     median_filter: MedianFilter = None,
     device: Device = None,
     memory: Memory = None,
+    ranks: Annotated[
+        int | None,
+        typer.Option(
+            metavar="R",
+            help="Without a trial: what lies where on R ranks of mpiexec, bytes a rank, bytes exchanged (docs: cluster.md).",
+        ),
+    ] = None,
 ) -> None:
     """Say how long a reconstruction would take and how much memory, from a few iterations of it."""
     given = given_options(
@@ -65,6 +83,9 @@ def estimate_command(
         iterations=iterations,
         gaussians=gaussians,
         preset=preset,
+        batch=batch,
+        split=split,
+        parts=parts,
         detector_model=detector_model,
         ignore_lag=ignore_lag,
         median_filter=median_filter,
@@ -75,6 +96,10 @@ def estimate_command(
     options = method_options(settings.method, settings.preset, settings.changes)
     loaded = load_scan(scan)
     loaded.check_timing()
+    if ranks is not None:
+        checks.within("--ranks", ranks, 1, MOST_RANKS)
+        say(plan_ranks(loaded, settings.method, options, ranks).text())
+        return
     with settings.naming_origins():
         rt = Runtime(settings.device, memory=settings.memory)
     before_s = seconds_since_start()  # a run will have started, and read the scan, as this did

@@ -46,7 +46,7 @@ def file_option(*names: str, help: str, show_default: bool | str = True) -> Any:
 
 def file_argument(name: str, help: str) -> Any:
     """An argument that is a file name."""
-    return typer.Argument(parser=file_parser(name), help=help)
+    return typer.Argument(parser=file_parser(name), metavar=name, help=help)
 
 
 Device = Annotated[
@@ -88,7 +88,7 @@ Method = Annotated[
     MethodName | None,  # type: ignore[valid-type]
     typer.Option(
         help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
-        "the others are iterative on voxels.",
+        "naf, sax-nerf: neural fields; the others are iterative on voxels.",
         show_default="phyradgs",
     ),
 ]

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.hdf5_trial import survive
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.datasets import read_length, read_values
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
@@ -22,8 +21,6 @@ def opened(path: Path) -> Iterator[Hdf5Source]:
 
     h5py has a KeyError for the one, and hands out names that are no text as bytes, which no path can be joined with.
     """
-    if path.is_file():
-        survive(path)
     try:
         with open_hdf5(path) as source:
             yield source

@@ -16,6 +16,7 @@ from pathlib import Path
 import h5py
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hdf5_trial import survive
 
 _MOST_SOFT_LINKS = 16
 # Masks of zeros shrink a thousandfold, frames hardly at all: a file of some size may unfold to so many times that.
@@ -25,7 +26,7 @@ _FREE_BYTES = 64 << 20
 
 @contextmanager
 def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
-    """Open a file for reading; InputError for what is missing, a folder, truncated or not HDF5.
+    """Open a file for reading; InputError for what is missing, a folder, truncated, not HDF5, or more than HDF5 survives.
 
     Errors of HDF5 in the body come out as InputError too, so the body should do nothing but read.
     """
@@ -35,6 +36,7 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
     if not path.is_file():
         what = "a folder" if path.is_dir() else "something that is not a regular file"
         raise InputError(str(path), what, "an HDF5 file", "name an HDF5 file")
+    survive(path)
     try:
         file = h5py.File(path, "r")
     except (OSError, RuntimeError, ValueError) as error:

@@ -37,12 +37,14 @@ class HashEncoding(nn.Module):
         return len(self.sizes) * self.features
 
     def forward(self, positions: torch.Tensor) -> torch.Tensor:
-        encoded, start = [], 0
+        indices, weights, start = [], [], 0
         for cells, size in zip(self.resolutions, self.sizes, strict=True):
             index, weight = corners(positions, cells, size)
-            encoded.append(_Interpolate.apply(self.table[start : start + size], index, weight))
+            indices.append((index + start).t())
+            weights.append(weight.t())
             start += size
-        return torch.cat(encoded, 1)
+        encoded = _Interpolate.apply(self.table, torch.cat(indices), torch.cat(weights))  # (levels · P, features)
+        return encoded.reshape(len(self.sizes), -1, self.features).transpose(0, 1).reshape(-1, self.width)
 
 
 def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -68,22 +70,22 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 class _Interpolate(torch.autograd.Function):
-    """Σ weight · table[index] over 8 corners; the gradient sums into the table in one fixed order."""
+    """Σ weight · table[index] over the 8 corners (B, 8) of each bag; the gradient sums into the table in one fixed order."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(index, weight)
         ctx.entries = table.shape[0]
-        gathered = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
-        return torch.einsum("kpf,kp->pf", gathered, weight)
+        return nn.functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, by_features: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         index, weight = ctx.saved_tensors
-        flat = index.reshape(-1)
-        columns = []
-        for feature in by_features.t():
-            column = torch.zeros(ctx.entries, dtype=by_features.dtype, device=by_features.device)
-            columns.append(column.scatter_add_(0, flat, (weight * feature).reshape(-1)))
-        return torch.stack(columns, 1), None, None
+        features = by_features.shape[1]
+        first = (index * features).reshape(-1)
+        gradient = by_features.new_zeros(ctx.entries * features)
+        for number in range(features):
+            share = (weight * by_features[:, number, None]).reshape(-1)
+            gradient.scatter_add_(0, first + number, share)
+        return gradient.reshape(ctx.entries, features), None, None

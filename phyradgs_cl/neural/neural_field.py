@@ -27,22 +27,37 @@ class NeuralField(nn.Module):
 
 
 @torch.no_grad()
-def voxel_values(field: NeuralField, grid: Grid, device: torch.device, points_at_once: int) -> np.ndarray:
-    """The field at the centres of all voxels (nz, ny, nx) float32; ``grid`` in units of half the longest side, centred.
+def voxel_values(
+    field: NeuralField, grid: Grid, device: torch.device, points_at_once: int, points: int = 1
+) -> np.ndarray:
+    """The field in all voxels (nz, ny, nx) float32; ``grid`` in units of half the longest side, centred.
 
-    It is asked brick by brick. Where positions belong together, the voxels of a segment are neighbours along x, and a
-    row's last segment is filled up beyond its end.
+    A voxel is the mean over ``points``³ points, the centres of its equal parts. They are asked brick by brick. Where
+    positions belong together, those of a segment are neighbours along x, and a row's last segment is filled up beyond
+    its end.
     """
-    z, y, x = grid.axes_mm()
+    fine = _divided(grid, points)
+    z, y, x = fine.axes_mm()
     filled = -(-x.size // field.segment) * field.segment
-    x = np.concatenate([x, x[-1] + grid.voxel_size_mm[2] * np.arange(1, filled - x.size + 1)])
-    rows = np.stack(np.meshgrid(z, y, indexing="ij"), -1).reshape(-1, 2)  # of voxels along x
-    values = np.empty((len(rows), filled), np.float32)
-    at_once = max(points_at_once // filled, 1)
+    x = np.concatenate([x, x[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - x.size + 1)])
+    nz, ny, nx = grid.shape
+    rows = np.empty((nz, ny, points, points, 2))  # z, y of the rows of points, row of voxels by row of voxels
+    rows[..., 0], rows[..., 1] = z.reshape(nz, 1, points, 1), y.reshape(1, ny, 1, points)
+    rows = rows.reshape(nz * ny, points**2, 2)
+    values = np.empty((nz * ny, nx), np.float32)
+    at_once = max(points_at_once // (filled * points**2), 1)
     for start in range(0, len(rows), at_once):
-        part = rows[start : start + at_once]
+        part = rows[start : start + at_once].reshape(-1, 2)
         positions = np.empty((len(part), filled, 3), np.float32)
         positions[..., 0], positions[..., 1], positions[..., 2] = x, part[:, 1:], part[:, :1]
-        brick = field(to_tensor(positions.reshape(-1, 3), device))
-        values[start : start + at_once] = to_array(brick).reshape(len(part), filled)
-    return np.ascontiguousarray(values.reshape(*grid.shape[:2], filled)[..., : grid.shape[2]])
+        brick = to_array(field(to_tensor(positions.reshape(-1, 3), device))).reshape(len(part), filled)
+        brick = brick[:, : nx * points].reshape(-1, points**2, nx, points)
+        values[start : start + at_once] = brick.mean((1, 3))
+    return values.reshape(grid.shape)
+
+
+def _divided(grid: Grid, points: int) -> Grid:
+    """The same box with every voxel cut into ``points`` along each side."""
+    (nz, ny, nx), (dz, dy, dx) = grid.shape, grid.voxel_size_mm
+    counts = (points * nz, points * ny, points * nx)
+    return Grid(counts, (dz / points, dy / points, dx / points), grid.offset_mm)

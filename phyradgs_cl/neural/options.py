@@ -13,14 +13,16 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-CELLS_A_VOXEL = 2.0  # of the finest level
+CELLS_A_VOXEL = 1.0  # of the finest level
 SAMPLES_A_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
+SAMPLES_A_TIME = 1.0  # of each of several: what counts is the mean over their rays
 
 _RANGES = {
     "iterations": (0, 1_000_000),
     "rays": (1, 1_000_000),
     "samples": (0, 100_000),
     "times": (0, 10_000),
+    "voxel_points": (1, 16),
     "levels": (0, 32),
     "features": (1, 64),
     "base_resolution": (1, 4096),
@@ -42,11 +44,12 @@ class NeuralOptions:
     """A field on a hash encoding and a small network, fitted to rays.
 
     iterations: passes over all frames, of one step a frame. rays: pixels a step. samples: along a ray inside the volume,
-    0 for 1.5 a voxel of the longest side. jitter: of the samples: one random shift a ``ray``, one a ``sample`` inside its
-    own interval, ``none``. times: how many of a line's a step looks at, drawn anew for each pixel; 0: all of them.
-    positive_only: pixels with a line integral above 0 only.
+    0 for 1.5 a voxel of the longest side, 1 for each of several times. jitter: of the samples: one random shift
+    a ``ray``, one a ``sample`` inside its own interval, ``none``. times: how many of a line's a step looks at, drawn anew
+    for each pixel; 0: all of them. positive_only: pixels with a line integral above 0 only. voxel_points: along each side
+    of a voxel, which is the field's mean over their cube.
 
-    levels (0: until the finest has two cells a voxel), features, base_resolution (cells along a side), level_growth,
+    levels (0: until the finest has a cell a voxel), features, base_resolution (cells along a side), level_growth,
     table_log2 (most entries of a level): the encoding.
     layers, width: the network. last_activation: its end; for a sigmoid density_bound, its largest value in units of FDK's
     99.9th percentile, and first_share, the share of it at which the field starts everywhere. rate, rate_factor, rate_step:
@@ -63,9 +66,10 @@ class NeuralOptions:
     jitter: str = "ray"
     times: int = 0
     positive_only: bool = False
+    voxel_points: int = 2
     levels: int = 0
     features: int = 2
-    base_resolution: int = 16
+    base_resolution: int = 8
     level_growth: float = 2.0
     table_log2: int = 19
     layers: int = 4
@@ -74,7 +78,7 @@ class NeuralOptions:
     density_bound: float = 2.0
     first_share: float = 0.05
     rate: float = 1e-2
-    rate_factor: float = 0.1
+    rate_factor: float = 0.3
     rate_step: int = 0
     torch_device: str = "auto"
 
@@ -101,9 +105,10 @@ class NeuralOptions:
         finest = math.log(_FINEST / self.base_resolution, self.level_growth)
         return 1 + max(math.ceil(min(steps, finest) - 1e-9), 0)
 
-    def samples_for(self, longest_voxels: int) -> int:
-        """Samples along a ray for a volume of so many voxels along its longest side."""
-        return self.samples or max(round(SAMPLES_A_VOXEL * longest_voxels), 2)
+    def samples_for(self, longest_voxels: int, times: int = 1) -> int:
+        """Samples along each ray of a pixel with so many ``times``, for a volume of so many voxels along its longest side."""
+        density = SAMPLES_A_VOXEL if times == 1 else SAMPLES_A_TIME
+        return self.samples or max(round(density * longest_voxels), 2)
 
     def times_for(self, count: int, model: str) -> int:
         """How many of the ``count`` times of a line a step looks at.
@@ -149,6 +154,6 @@ class LineOptions(NeuralOptions):
         }
         checks.fields_within("", self, ranges)
 
-    def samples_for(self, longest_voxels: int) -> int:
+    def samples_for(self, longest_voxels: int, times: int = 1) -> int:
         """As for every field, in whole segments."""
-        return -(-super().samples_for(longest_voxels) // self.segment) * self.segment
+        return -(-super().samples_for(longest_voxels, times) // self.segment) * self.segment

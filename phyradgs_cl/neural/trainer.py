@@ -48,7 +48,7 @@ class Trainer:
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
         self.model = stated if times > 1 else "log"  # of one value both are the mean
         self.times = options.times_for(times, self.model)
-        self.samples = options.samples_for(max(scan.grid.shape))
+        self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
         half_sides = np.array(scan.grid.size_mm[::-1]) / 2 / scan.grid.half_longest_mm
         self._shadows = [rays.shadow(half_sides, scan.geometry.detector_shape) for rays in self.rays]
@@ -92,9 +92,10 @@ class Trainer:
             self.queue = self._shuffled()
 
     def volume(self, grid: Grid) -> np.ndarray:
-        """The field at the voxels (nz, ny, nx) of the scan's grid in mm, 1/mm."""
+        """The field in the voxels (nz, ny, nx) of the scan's grid in mm, 1/mm."""
         unit_grid = Grid(grid.shape, grid.scaled(1 / grid.half_longest_mm).voxel_size_mm)
-        values = voxel_values(self.field, unit_grid, self.device, self.points_at_once)
+        points = self.options.voxel_points
+        values = voxel_values(self.field, unit_grid, self.device, self.points_at_once, points)
         return values * np.float32(self.density_per_mm)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -36,15 +36,17 @@ def exact_sum(
         for part in parts:
             whole += as_whole(part[:, block], shift, broken)
         ranks.add(whole)
-        total[:, block] = np.ldexp(whole.astype(np.float64), -shift[:, None])
+        total[:, block] = whole * np.ldexp(1.0, -shift)[:, None]
     total[broken] = np.nan
     return total
 
 
 def as_whole(values: np.ndarray, shift: np.ndarray, broken: np.ndarray) -> np.ndarray:
     """Values (rows, n) times 2^shift (rows,), rounded, int64; 0 in rows that are broken."""
-    wide = np.where(broken[:, None], 0.0, values.astype(np.float64))
-    return np.rint(np.ldexp(wide, shift[:, None])).astype(np.int64)
+    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # by a power of two: exact
+    if broken.any():
+        wide[broken] = 0
+    return np.rint(wide, out=wide).astype(np.int64)
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.parallel.communicator import Alone, Communicator
 from phyradgs_cl.parallel.launch import Launch, launched
 
-_PATIENCE_S = 2.0
+_PATIENCE_S, _LATER_S = 5.0, 0.5  # of rank 0, and how much later each next one gives up: one alone is to speak
 _MOST_VALUES = 1 << 26  # of one call: counts of MPI before its version 4 end at 2³¹
 
 
@@ -88,7 +88,7 @@ class Mpi:
         return np.ascontiguousarray(np.moveaxis(joined, 0, -1))
 
     def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-        with self._counted(sum(part.nbytes for part in parts)):
+        with self._counted(sum(part.nbytes for rank, part in enumerate(parts) if rank != self.rank)):
             return self._comm.alltoall(list(parts))
 
     def team(self, number: int) -> Mpi:
@@ -96,7 +96,7 @@ class Mpi:
 
     def all_fail(self) -> bool:
         waiting = self._failing.Ibarrier()
-        deadline = time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + _PATIENCE_S + _LATER_S * min(self.rank, 20)
         while not waiting.Test():
             if time.monotonic() > deadline:
                 return False

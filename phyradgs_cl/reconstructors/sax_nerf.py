@@ -18,7 +18,9 @@ SAX_PUBLISHED = LineOptions(
     samples=256,
     jitter="sample",
     positive_only=True,
+    voxel_points=1,
     levels=16,
+    base_resolution=16,
     table_log2=19,
     density_bound=1.0,
     first_share=0.5,
@@ -26,7 +28,7 @@ SAX_PUBLISHED = LineOptions(
     rate_factor=0.1,
     rate_step=1500,
 )
-SAX_PRESETS = {"default": LineOptions(rays=256, windows=4), "published": SAX_PUBLISHED}
+SAX_PRESETS = {"default": LineOptions(rays=128, windows=2), "published": SAX_PUBLISHED}
 
 
 def sax_nerf(

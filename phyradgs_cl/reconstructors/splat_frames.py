@@ -43,16 +43,11 @@ class DeviceFrames:
         by_column = scan.shutter.axis == "columns"
         rows, columns = scan.geometry.detector_shape
         self.lines, self.width = (columns, rows) if by_column else (rows, columns)
-        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
-        tables = [
-            scaled_cells(options.motion.cells(scan, f, peak), 1 / scale.length_mm) for f in range(scan.frames)
-        ]
+        tables, merges = cells_of_scan(scan, options)
+        tables = [scaled_cells(table, 1 / scale.length_mm) for table in tables]
         self._tables = tables
         self._cells = [DeviceCells.upload(rt, table) for table in tables]
         self._parts: dict[tuple[int, int, int], DeviceCells] = {}
-        # of one value both models are the mean
-        merges = model == "intensity" and any(averages(table) for table in tables)
         self.intensity_unit = scale.line_integral if merges else None
         self._line_integral, self._by_column = np.float32(scale.line_integral), by_column
         self._frames = scan.projections
@@ -93,6 +88,15 @@ class DeviceFrames:
         shared = frame if len(self._mask) > 1 else 0
         measured = self._measured[frame] if self._measured else self.rt.upload(self._internal(frame))
         return self._cells[frame], measured, self._mask[shared], self._pixels[shared]
+
+
+def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], bool]:
+    """The time cells of every frame, in mm, and whether the detector merges intensities of several."""
+    model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+    peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
+    tables = [options.motion.cells(scan, frame, peak) for frame in range(scan.frames)]
+    # of one value both models are the mean
+    return tables, model == "intensity" and any(averages(table) for table in tables)
 
 
 def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:

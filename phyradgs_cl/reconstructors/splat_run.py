@@ -37,7 +37,12 @@ from phyradgs_cl.reconstructors.splat_shared import SharedFrames
 from phyradgs_cl.reconstructors.splat_start import box_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY = 50
+REPORT_EVERY, LEAST_RECORDED = 50, 20
+
+
+def record_interval(iterations: int) -> int:
+    """Iterations from line to line of the record: as for reports, but fewer in short runs, to show how they went."""
+    return max(1, min(REPORT_EVERY, iterations // LEAST_RECORDED))
 
 
 def division_of(rt: Runtime, options: SplatOptions, batch: int) -> Division:
@@ -71,6 +76,7 @@ class SplatRun:
         self.interrupted_at: int | None = None
         self.record: list[dict[str, float]] = []
         self.seconds_before = 0.0
+        self.control_seconds, self.control_rounds = 0.0, 0
         self._started = time.perf_counter()
         self._queue: list[int] = []
         self._load(population)
@@ -85,15 +91,26 @@ class SplatRun:
             while self.iteration < total and self.interrupted_at is None:
                 before = self.iteration
                 self.step()
-                if self.iteration // REPORT_EVERY > before // REPORT_EVERY or self.iteration == total:
+                if self._passes(record_interval(total), before):
+                    self._keep_record()
+                if self._passes(REPORT_EVERY, before):
                     self._report(report)
                 if self.rt.ranks.any(request.is_set) and self.iteration < total:
                     self.interrupted_at = self.iteration
 
-    def _report(self, report: ProgressReport) -> None:
+    def _passes(self, every: int, before: int) -> bool:
+        """Whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
+        return self.iteration // every > before // every or self.iteration == self.options.iterations
+
+    def _facts(self) -> dict[str, float]:
         seconds = time.perf_counter() - self._started
-        facts = {"loss": self._checked_loss(), "gaussians": self.count, "seconds": seconds}
-        self.record.append({"iteration": self.iteration, **facts})
+        return {"loss": self._checked_loss(), "gaussians": self.count, "seconds": seconds}
+
+    def _keep_record(self) -> None:
+        self.record.append({"iteration": self.iteration, **self._facts()})
+
+    def _report(self, report: ProgressReport) -> None:
+        facts = self._facts()
         now = Progress(
             self.iteration, self.options.iterations, **facts, state=self.state, volume=self.present_volume
         )
@@ -200,10 +217,13 @@ class SplatRun:
 
     def _control_density(self) -> None:
         sums = self._statistics().astype(np.float64)
+        begun = time.perf_counter()  # the statistics were the last to come: the device has nothing left to do
         statistic = sums[0] / np.maximum(sums[1], 1)
         own = self.division.control(self, self._population(), statistic, box_of(self.grid))
         count = self.division.whole(np.zeros(own.count, np.int8)).size
         self._place(own, count)
+        self.control_seconds += time.perf_counter() - begun
+        self.control_rounds += 1
 
     def _load(self, population: Population) -> None:
         """Puts this rank's part of a whole population on the device."""

@@ -153,13 +153,15 @@ def _reconstructed(
         _set_aside(checkpoint_path(job.output))
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
     result: Reconstruction | None = None
+    metrics: dict[str, float] = {}
     try:
         with keeper.telling(), keep_finished_work():
             result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=keeper, **extra)
             if not leads:
-                return result, {}
+                return result, metrics
             with finish_despite_interrupt():
-                metrics = compare(result.volume, scan.reference) if scan.reference is not None else {}
+                if scan.reference is not None:
+                    metrics = compare(result.volume, scan.reference)
                 _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
                 _keep_checkpoint(job, result, fingerprint)
     except InterruptedAfterwards:

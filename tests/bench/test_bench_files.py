@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from phyradgs_cl.bench import (
@@ -22,6 +24,7 @@ from phyradgs_cl.bench import (
     run_bench,
 )
 from phyradgs_cl.bench import rows as bench_rows
+from phyradgs_cl.bench.figures import read_slices, slices_path, write_slices
 from phyradgs_cl.bench.published import TABLE1, TABLE2
 from phyradgs_cl.bench.results import KEY, Present, append_line, read_lines
 from phyradgs_cl.bench.volumes import find_volumes
@@ -65,6 +68,31 @@ def test_devices_and_pipes_are_no_results_files(tmp_path: Path) -> None:
     (folder / RESULTS).symlink_to(pipe)
     with pytest.raises(InputError, match="not a regular file"):
         run_bench(BenchJob("quick", folder, rows=["FDK"]), pytest.fail)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("damage", ["cut off", "a bomb", "objects", "other names", "not there"])
+def test_damaged_slices_are_none_at_all(tmp_path: Path, damage: str) -> None:
+    images = [np.full((3, 4), float(n), np.float32) for n in range(3)]
+    facts = {**FACTS, "volume": "jaw"}
+    write_slices(tmp_path, facts, images)
+    np.testing.assert_array_equal(read_slices(tmp_path, facts), images)
+    path = slices_path(tmp_path, facts)
+    if damage == "cut off":
+        path.write_bytes(path.read_bytes()[:200])
+    elif damage == "a bomb":
+        with (
+            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+            archive.open("arr_0.npy", "w") as member,
+        ):
+            for _ in range(300):
+                member.write(b"\0" * (1 << 20))
+    elif damage == "objects":
+        np.savez(path, np.array([path], object))
+    elif damage == "other names":
+        np.savez(path, volume=images[0])
+    else:
+        path.unlink()
+    assert read_slices(tmp_path, facts) is None
 
 
 def test_a_run_is_present_with_the_same_identity_and_options() -> None:

@@ -11,8 +11,10 @@ import pytest
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
+from phyradgs_cl.check.exposure import check_exposure
 from phyradgs_cl.check.gain import without_drift
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -160,3 +162,22 @@ def test_options_that_do_not_go_together(cli, clean, tmp_path, monkeypatch, caps
     assert cli.run(["check", "SCAN", *options]) == 2
     assert capsys.readouterr().err.startswith("phyradgs: ")
     assert [p.name for p in tmp_path.iterdir()] == ["SCAN"]
+
+
+def test_masked_pixels_hold_anything_but_not_all_may_be_masked(rt, clean) -> None:
+    p, mask = clean.projections.copy(), np.zeros(clean.geometry.detector_shape, bool)
+    mask[5, 7] = True
+    p[:, 5, 7] = np.nan
+    found = check(replace(clean, projections=p, pixel_mask=mask), rt)
+    assert found.suspicious == [] and np.isfinite(found.offset_mm)
+    with pytest.raises(InputError, match="NaN"):
+        check(replace(clean, projections=p), rt)
+    with pytest.raises(InputError, match="every pixel masked"):
+        check(replace(clean, pixel_mask=np.ones_like(mask)), rt)
+
+
+def test_of_a_pulsed_beam_the_exposure_tells_nothing(rt, clean) -> None:
+    """Half the exposure would leave other lines in the dark: their residuals cannot be compared."""
+    scan = replace(clean, shutter=replace(clean.shutter, pulse_s=(0.5, 0.5)))
+    finding = check_exposure(rt, scan)
+    assert finding.verdict == CANNOT_TELL and "pulse" in finding.text and "pulse" in finding.advice

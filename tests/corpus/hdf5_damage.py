@@ -133,7 +133,8 @@ def _bomb(file: h5py.File, address: str) -> None:
     axes, attributes = max(file[address].ndim, 1), dict(file[address].attrs)
     del file[address]
     shape = {1: (1 << 25,), 2: (1 << 12, 1 << 13), 3: (128, 512, 512)}[axes]
-    made = file.create_dataset(address, shape, "f4", compression="gzip", compression_opts=1)
+    chunks = {1: (1 << 18,), 2: (32, 1 << 13), 3: (1, 512, 512)}[axes]
+    made = file.create_dataset(address, shape, "f4", chunks=chunks, compression="gzip", compression_opts=9)
     piece = np.zeros((1 << 22,) if axes == 1 else (512, 512) if axes == 3 else (512, 1 << 13), np.float32)
     for start in range(0, shape[0], len(piece) if axes < 3 else 1):
         made[start : start + len(piece) if axes < 3 else start + 1] = piece

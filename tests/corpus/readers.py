@@ -15,6 +15,7 @@ from phyradgs_cl.io import checkpoint_path, load_scanner, load_volume, read_chec
 from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.files import load_scan, summary
+from phyradgs_cl.workflow.sweep import read_grid
 
 DATA = Path("/nowhere")
 
@@ -41,6 +42,11 @@ def _import(form: str) -> Callable[[Path], object]:
     return lambda path: import_scan(path, options.get(form), form)
 
 
+def _sweep(folder: Path) -> object:
+    path = folder / "grid.toml"
+    return read_grid(read_config(path, "GRID"), path)
+
+
 def _checkpoint(path: Path) -> object:
     good = checkpoint_path(path.parents[1] / "good" / "phyradgs")
     return read_checkpoint(path, _fingerprint(good))
@@ -55,6 +61,7 @@ READERS: dict[str, Reader] = {
     "bare volume": Reader("bare.h5", load_volume),
     "scanner": Reader("scanner.toml", lambda path: load_scanner(path, DATA)),
     "configuration": Reader("run.toml", read_config),
+    "sweep": Reader("sweep", _sweep, "grid.toml"),
     "checkpoint": Reader("phyradgs.checkpoint.npz", _checkpoint),
     "results": Reader("results.jsonl", read_lines),
     "import of r2, JSON": Reader("r2", _import("r2"), "meta_data.json"),

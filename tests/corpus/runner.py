@@ -41,6 +41,7 @@ class Runner:
     def __init__(self, program: str = "worker.py") -> None:
         self._program = program
         self._process: subprocess.Popen[str] | None = None
+        self.asked = 0
 
     def run(self, case: Case, good: Path, folder: Path) -> Outcome:
         """One case, its file made in ``folder``, its output asked for beside an older one."""
@@ -69,6 +70,7 @@ class Runner:
     def answer(self, question: object) -> object | None:
         """The worker's answer to any question; None where it died of it, or had to be ended."""
         process = self._alive()
+        self.asked += 1
         assert process.stdin is not None and process.stdout is not None
         process.stdin.write(json.dumps(question) + "\n")
         process.stdin.flush()
@@ -80,12 +82,15 @@ class Runner:
         return json.loads(text) if text else None
 
     def close(self) -> None:
-        """Ends the worker."""
+        """Ends the worker: it has no more to read, and leaves by itself where it can."""
         if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            for stream in (self._process.stdin, self._process.stdout):
-                stream.close()  # type: ignore[union-attr]
+            self._process.stdin.close()  # type: ignore[union-attr]
+            try:
+                self._process.wait(timeout=30)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process.stdout.close()  # type: ignore[union-attr]
 
     def _alive(self) -> subprocess.Popen[str]:
         if self._process is None or self._process.poll() is not None:

@@ -1,7 +1,8 @@
 """Changed bytes under every reader: what comes is a value or an error of ours, soon and in little memory.
 
 Hypothesis draws the changes and, where one is wrong, shrinks it; its bytes are to be kept in ``kept/``, which is read
-first. `make stress` goes on for STRESS × 36 s, half an hour at STRESS=50.
+first. `make stress` goes on for STRESS × 36 s, half an hour at STRESS=50. How many files each reader was given stands in
+pytest's XML report (--junit-xml), as property ``files``.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -42,6 +44,19 @@ NUMBERS = [
     b"9" * 30,
 ]
 
+SWEEP = """scans = ["*.h5"]
+seeds = [0, 3]
+[options]
+median_filter = 3
+[[grid]]
+method = ["sirt", "cgls"]
+iterations = [5, 20]
+[[runs]]
+method = "phyradgs"
+control.every = 50
+rates.position = [2e-4, 2e-5]
+"""
+
 
 def changed(data: bytes, changes: list[tuple[str, float, bool, bytes]]) -> bytes:
     """``data`` after some changes, each at a share of its length, or of its first 2 kB."""
@@ -69,6 +84,9 @@ def changed(data: bytes, changes: list[tuple[str, float, bool, bytes]]) -> bytes
 @pytest.fixture(scope="module")
 def good(tmp_path_factory) -> Path:
     folder = write_good(tmp_path_factory.mktemp("fuzz") / "good")
+    (folder / "sweep").mkdir()
+    shutil.copy(folder / "fly.h5", folder / "sweep/a.h5")
+    (folder / "sweep/grid.toml").write_text(SWEEP)
     lines = [json.dumps({"run": name, "options": {"a": [1, 2.5]}}) for name in ("one", "two", "three")]
     (folder / "results.jsonl").write_text("\n".join(lines) + "\n")
     return folder
@@ -105,14 +123,18 @@ def test_what_once_went_wrong(good, worker, path) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_changed_bytes(good, worker, name) -> None:
-    content = _content(good, name)
-    until_s = time.monotonic() + (STRESS - 1) * SECONDS_OF_STRESS / len(READERS)
+def test_changed_bytes(good, worker, name, record_property) -> None:
+    content, before = _content(good, name), worker.asked
+    goes_on_s = STRESS * SECONDS_OF_STRESS / len(READERS) if STRESS > 1 else 0.0
+    until_s = time.monotonic() + goes_on_s
     examples = FEW // 4 if name in SLOW else FEW
-    while True:
-        _fuzz(worker, good, name, content, examples if STRESS == 1 else 200)
-        if time.monotonic() >= until_s:
-            break
+    try:
+        while True:
+            _fuzz(worker, good, name, content, examples if STRESS == 1 else 200)
+            if time.monotonic() >= until_s:
+                break
+    finally:
+        record_property("files", worker.asked - before)
 
 
 def _fuzz(worker: Runner, good: Path, name: str, content: bytes, examples: int) -> None:

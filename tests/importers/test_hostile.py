@@ -20,7 +20,7 @@ import writers_of_importers as w
 
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import ImportOptions, hdf5_trial, import_scan
+from phyradgs_cl.importers import ImportOptions, import_scan
 
 CONE = ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0)
 REAL = ImportOptions(pixel_size_mm=(3.0, 2.5))
@@ -138,13 +138,6 @@ def test_a_file_that_crashes_the_hdf5_library_does_not_end_this_process() -> Non
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_file_that_hdf5_never_finishes_is_left(tmp_path, make_truth, monkeypatch) -> None:
-    monkeypatch.setattr(hdf5_trial, "_WALK", "while True: pass")
-    monkeypatch.setattr(hdf5_trial, "SECONDS", 0.5)
-    with pytest.raises(InputError, match="does not finish"):
-        import_scan(w.write_nxtomo(tmp_path / "nx.h5", make_truth()))
 
 
 def test_a_description_under_another_name(tmp_path, make_truth) -> None:

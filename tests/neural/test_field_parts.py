@@ -99,6 +99,9 @@ def test_bricks_of_voxels_do_not_matter_and_voxels_lie_where_the_grid_says(optio
     whole = voxel_values(field, grid, CPU, 10**6)
     assert whole.shape == grid.shape and whole.dtype == np.float32
     assert np.allclose(whole, voxel_values(field, grid, CPU, 1), rtol=FLOAT32)
+    means = voxel_values(field, grid, CPU, 10**6, 3)
+    assert means.shape == grid.shape
+    assert np.allclose(means, voxel_values(field, grid, CPU, 1, 3), rtol=FLOAT32)
 
     class Position(torch.nn.Module):
         segment = options.__dict__.get("segment", 1)
@@ -107,7 +110,21 @@ def test_bricks_of_voxels_do_not_matter_and_voxels_lie_where_the_grid_says(optio
             return x[:, 0] + 10 * x[:, 1] + 100 * x[:, 2]
 
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
-    assert np.allclose(voxel_values(Position(), grid, CPU, 20), x + 10 * y + 100 * z, atol=1e-4)
+    for points in (1, 2, 3):  # of a linear field, the mean over a voxel is its value at the centre
+        found = voxel_values(Position(), grid, CPU, 20, points)
+        assert np.allclose(found, x + 10 * y + 100 * z, atol=1e-4)
+
+
+def test_a_voxel_is_the_mean_over_its_points() -> None:
+    field = first_field(NeuralOptions(), 16, 0)
+    with torch.no_grad():
+        field.encoding.table.uniform_(-1, 1)
+    grid = Grid((2, 3, 4), (0.5, 0.5, 0.5))
+    whole, size = voxel_values(field, grid, CPU, 10**6, 2), 0.25
+    fine = voxel_values(field, Grid((4, 6, 8), (size,) * 3), CPU, 10**6)
+    expected = fine.reshape(2, 2, 3, 2, 4, 2).mean((1, 3, 5))
+    assert np.allclose(whole, expected, rtol=FLOAT32)
+    assert not np.allclose(whole, voxel_values(field, grid, CPU, 10**6), rtol=0.01)
 
 
 def test_the_field_starts_at_its_share_of_the_bound() -> None:
@@ -179,5 +196,5 @@ def test_options_that_do_not_go_together_are_refused() -> None:
     assert NeuralOptions().samples_for(64) == 96
     assert [NeuralOptions().levels_for(n) for n in (4, 64, 100, 128)] == [1, 4, 5, 5]
     assert NeuralOptions(levels=3).levels_for(64) == 3 and NeuralOptions(level_growth=1.0).levels_for(64) == 1
-    assert NeuralOptions().samples_for(128) == 192
+    assert NeuralOptions().samples_for(128) == 192 and NeuralOptions().samples_for(128, 5) == 128
     assert LineOptions(segment=5).samples_for(64) == 100

@@ -30,8 +30,9 @@ def rays(scan) -> tuple[np.ndarray, np.ndarray]:
     return source.reshape(-1, 3), direction.reshape(-1, 3)
 
 
-def integrals(field, rays, jitter: str, seed: int = 0) -> np.ndarray:
-    samples = NeuralOptions().samples_for(VOXELS)
+def integrals(field, rays, jitter: str, seed: int = 0, times: int = 1) -> np.ndarray:
+    """Integrals (R,) with as many samples as a pixel of so many times has by default."""
+    samples = NeuralOptions().samples_for(VOXELS, times)
     shifts = sample_shifts(len(rays[0]), samples, jitter, np.random.default_rng(seed))
     source, direction = (torch.tensor(a.astype(np.float32)) for a in rays)
     box = torch.ones(3)
@@ -94,6 +95,18 @@ def test_an_ellipsoid_that_fades_towards_its_edge(rays) -> None:
     found = integrals(lambda x: (1 - distance(x)).clamp(min=0), rays, "ray")
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
+
+
+def test_the_mean_over_an_exposure(rays) -> None:
+    """Fewer samples a ray, and five rays of a pixel: a Gaussian, and an ellipsoid that fades."""
+    a, b, c = quadratic(rays)
+    gaussian = np.sqrt(2 * np.pi / (9 * a)) * np.exp(-9 * (c - b * b / a) / 2)
+    fading = 4 / 3 * a * (np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)) ** 3
+    fields = (lambda x: torch.exp(-9 * distance(x) / 2), lambda x: (1 - distance(x)).clamp(min=0))
+    for field, each in zip(fields, (gaussian, fading), strict=True):
+        found = integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1)
+        expected = each.reshape(-1, 5).mean(1)
+        assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
 
 
 @pytest.mark.parametrize("jitter", ["ray", "sample"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import FrozenInstanceError
+
 import numpy as np
 import pytest
 from tolerances import FLOAT32, FLOAT64, PARAMETER_GRADIENT, TWIN_GRADIENT
@@ -31,13 +33,20 @@ def test_values_by_hand() -> None:
     assert value == pytest.approx(0.3 * 2 + 0.7 * ((5 - 3) ** 2 + (0.08 - 0.05) ** 2) / 2, rel=FLOAT64)
 
 
+def test_terms_are_a_value_with_the_papers_defaults() -> None:
+    assert ParameterTerms() == ParameterTerms(0.001, 0.0, 10.0, 0.004)
+    with pytest.raises(FrozenInstanceError):
+        TERMS.shape_weight = 1.0
+
+
 def test_no_gaussian_costs_nothing() -> None:
     value, gradient = parameter_loss(np.zeros((11, 0)), TERMS)
     assert value == 0 and gradient.shape == (11, 0)
 
 
-@pytest.mark.parametrize("count", [5, 16, 21])
-def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_differences, count) -> None:
+@pytest.mark.parametrize(("count", "others"), [(5, 0), (16, 0), (21, 0), (1, 0), (5, 7)])
+def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_differences, count, others) -> None:
+    """A Gaussian alone too, and where some of those that the means are over are elsewhere."""
     activation = Activation(0.01, 0.6)
     raw = activation.invert(make_cloud(count, 72, scale=(0.03, 0.3))).astype(np.float32).astype(float)
     raw[6:10] *= 1.7  # raw quaternions need not be unit
@@ -63,9 +72,11 @@ def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_difference
         shape_weight=TERMS.shape_weight,
         shape_ratio=TERMS.shape_ratio,
         shape_floor=TERMS.shape_floor,
+        of=count + others if others else None,
     )
     found = any_rt.download(gradients)[:11, :count]
     expected = finite_differences(lambda r: parameter_loss(activation.apply(r), TERMS)[0], raw)
+    expected *= count / (count + others)
     np.testing.assert_allclose(found, expected, rtol=0, atol=PARAMETER_GRADIENT * np.abs(expected).max())
     np.testing.assert_array_equal(any_rt.download(statistics), 0)  # nothing was in view
 

@@ -35,6 +35,7 @@ KERNELS = Path(__file__).resolve().parents[2] / "cl"
 SHAPE, GRID = (5, 7), Grid((5, 6, 7), (0.3, 0.28, 0.25), (0.1, 0.0, -0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
+NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
 VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing")
 BUILDS = {
@@ -115,7 +116,7 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
     for model in MODELS:
         for options in OPTIONS:
             found[f"splats {model} {options}"] = partial(splats, model=model, options=options)
-    for name in METHODS:
+    for name in [name for name in METHODS if name not in NEURAL]:
         for motion in ("static", "exact" if name in SPLATTING else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
     return found

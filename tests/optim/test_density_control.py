@@ -45,6 +45,32 @@ def test_nobody_is_chosen_below_the_threshold(population) -> None:
     np.testing.assert_array_equal(grown.moments, population.moments)
 
 
+def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
+    """At the threshold: chosen. As large as the split's scale: cloned. On the box, at the least density: kept."""
+    rows = ACTIVATION.apply(population.raw)
+    control = replace(CONTROL, split_scale=float(rows[3, 3]), prune_density=float(rows[10, 0]))
+    box = np.array([rows[:3].min(1), rows[:3].max(1)])
+    pruned = prune(population, ACTIVATION, control, box)
+    assert pruned.count == 5
+    grown = control_density(
+        population, np.array([0, 0, 0, 1.0, 0]), ACTIVATION, control, 10 * BOX, np.random.default_rng(0)
+    )
+    assert grown.count == 6
+    np.testing.assert_allclose(
+        ACTIVATION.apply(grown.raw)[3:6].max(), LARGE, rtol=FLOAT64
+    )  # no child is smaller
+    assert np.isclose(ACTIVATION.apply(grown.raw)[3], LARGE).sum() == 3
+
+
+def test_with_room_for_few_equals_at_the_threshold_are_chosen(population) -> None:
+    assert run(population, [1.0] * 5, replace(CONTROL, max_gaussians=7)).count == 7
+
+
+def test_populations_are_compared_by_what_they_are(population) -> None:
+    other = Population(population.raw.copy(), population.moments.copy())
+    assert population == population and population != other and len({population, other}) == 2
+
+
 def test_a_clone_shares_place_shape_and_mass(population) -> None:
     grown = run(population, [0, 2, 0, 0, 0])
     assert grown.count == 6

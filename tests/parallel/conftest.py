@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-collect_ignore = [] if importlib.util.find_spec("mpi4py") and shutil.which("mpiexec") else ["test_mpi.py"]
+MPIEXEC = Path(sys.executable).with_name("mpiexec").exists() or shutil.which("mpiexec")
+collect_ignore = [] if importlib.util.find_spec("mpi4py") and MPIEXEC else ["test_mpi.py"]
 
 
 _WORK = threading.Lock()  # drivers are not asked to do with several threads
@@ -21,14 +24,17 @@ _WORK = threading.Lock()  # drivers are not asked to do with several threads
 class Threads:
     """A ``Communicator`` whose ranks are threads, one at work at a time; slots hold what each has brought to a call."""
 
-    exchanged_bytes, exchange_s, idle_s = 0, 0.0, 0.0
+    exchange_s, idle_s = 0.0, 0.0
 
     def __init__(self, rank: int, slots: list[Any], barrier: threading.Barrier, teams: dict) -> None:
         self.rank, self.size = rank, len(slots)
         self.local_rank, self.local_size = rank, len(slots)
         self._slots, self._barrier, self._teams = slots, barrier, teams
+        self._whole: Threads = self
+        self.exchanged_bytes = 0
 
-    def _all(self, value: Any) -> list[Any]:
+    def _all(self, value: Any, nbytes: int = 0) -> list[Any]:
+        self._whole.exchanged_bytes += nbytes  # counted as under MPI
         self._slots[self.rank] = value
         _WORK.release()
         try:
@@ -40,28 +46,29 @@ class Threads:
         return everyone
 
     def add(self, values: np.ndarray) -> None:
-        everyone = self._all(values.copy())
+        everyone = self._all(values.copy(), values.nbytes)
         values[...] = 0
         for other in everyone[self.rank :] + everyone[: self.rank]:  # another order on every rank
             values += other
 
     def largest(self, values: np.ndarray) -> None:
-        values[...] = np.maximum.reduce(self._all(values.copy()))
+        values[...] = np.maximum.reduce(self._all(values.copy(), values.nbytes))
 
     def any(self, flag: bool) -> bool:
-        return any(self._all(flag))
+        return any(self._all(flag, 4))
 
     def tell(self, value: Any) -> Any:
         return self._all(value)[0]
 
     def join(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate(self._all(values))
+        return np.concatenate(self._all(values, values.nbytes))
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate(self._all(values), axis=-1)
+        return np.concatenate(self._all(values, values.nbytes), axis=-1)
 
     def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-        return [given[self.rank] for given in self._all(list(parts))]
+        others = sum(part.nbytes for rank, part in enumerate(parts) if rank != self.rank)
+        return [given[self.rank] for given in self._all(list(parts), others)]
 
     def team(self, number: int) -> Threads:
         numbers = self._all(number)
@@ -69,7 +76,9 @@ class Threads:
         key = (number, len(self._teams.setdefault(self.rank, [])))
         self._teams[self.rank].append(number)
         shared = self._all((key, [None] * len(members), threading.Barrier(len(members)), {}))[members[0]]
-        return Threads(members.index(self.rank), *shared[1:])
+        team = Threads(members.index(self.rank), *shared[1:])
+        team._whole = self._whole
+        return team
 
     def all_fail(self) -> bool:
         return False

@@ -1,9 +1,9 @@
 """The page in a real browser: not a part of the test suite, because it needs one.
 
-    pip install playwright; apt-get install chromium
-    pytest tests/report/browser_page.py [--basetemp FOLDER]
+    apt-get install chromium
+    make test-browser
 
-PHYRADGS_CHROMIUM names the browser's program if it is not on the path.
+PHYRADGS_CHROMIUM names the browser's program if it is not on the path; PHYRADGS_PICTURES a folder for screenshots.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from phyradgs_cl.report import write_report
 
 WIDTHS = (1280, 390)
+PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    program = os.environ.get("PHYRADGS_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    program = os.environ.get("PHYRADGS_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
+    assert program, f"no browser: install one of {', '.join(PROGRAMS)}, or name its program by PHYRADGS_CHROMIUM"
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser
@@ -140,10 +142,13 @@ def test_without_script_the_middle_slices_stay(browser, address) -> None:
 
 
 def test_pictures_for_the_documentation(browser, address, tmp_path: Path) -> None:
-    """The first screens, at both widths, for a look."""
+    """The first screens and whole pages, at both widths, for a look."""
+    folder = Path(os.environ.get("PHYRADGS_PICTURES") or tmp_path)
+    folder.mkdir(parents=True, exist_ok=True)
     for width, height in ((1280, 800), (390, 844)):
         page = browser.new_page(viewport={"width": width, "height": height})
         page.goto(address)
-        page.screenshot(path=tmp_path / f"page_{width}.png")
-        assert (tmp_path / f"page_{width}.png").stat().st_size > 10_000
+        for name, whole in ((f"page_{width}.png", False), (f"whole_{width}.png", True)):
+            page.screenshot(path=folder / name, full_page=whole)
+            assert (folder / name).stat().st_size > 10_000
         page.close()

@@ -21,7 +21,9 @@ from phyradgs_cl.commands.report import report_command
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
 from phyradgs_cl.report import Run, load_run, report_page, write_report
+from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.projections import chosen_frames, computed_views
+from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
 
 ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
 HOSTILE = "</title></script><script>alert(1)</script><img src=x onerror='alert(2)'>\"'&amp;"
@@ -98,6 +100,17 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
     residuals = [line["residual"] for line in record]
     drops = np.diff(heights[:3]) / -np.diff(residuals)
     assert np.allclose(drops, drops[0], rtol=0.02)  # one scale for all points
+
+
+def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
+    target = tmp_path / "short.h5"
+    changes = {"iterations": 12, "gaussians": 50, "tv_weight": 0.0}
+    run_reconstruction(ReconstructionJob(files[0], target, changes=changes), lambda: rt, lambda progress: None)
+    record = load_run(target).record
+    assert [line["iteration"] for line in record] == list(range(1, 13))
+    page = parse(report_page(load_run(target)))
+    assert "convergence" in page.ids
+    assert f"Loss: from {number(record[0]['loss'])} to {number(record[-1]['loss'])}" in page.words
 
 
 def test_pictures_decode_to_the_volume_slices(page, files) -> None:

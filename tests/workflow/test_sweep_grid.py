@@ -95,6 +95,11 @@ def test_what_is_asked_for_twice_is_run_once_and_names_differ(read, tmp_path) ->
         (GRID + "[[runs]]\nseed = 1\n", "seed: found 1; expected no option of a run; write seeds"),
         (GRID + '[[runs]]\ndevice = "gpu"\n', "device.*say it as --device"),
         (GRID + "[[runs]]\n[options]\niteratoins = 5\n", "iteratoins.*did you mean 'iterations'"),
+        (
+            GRID + "[options]\nrates = 1\n[[runs]]\nrates.position = [2e-4, 2e-5]\n",
+            "rates.position: found rates=1 too",
+        ),
+        (GRID + f"[[grid]]\nrates{'.a' * 3000} = 1\n", "found tables in tables in tables"),
     ],
 )
 def test_what_is_wrong_is_named_at_once(read, text, message) -> None:

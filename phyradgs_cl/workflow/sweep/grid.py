@@ -22,6 +22,7 @@ from phyradgs_cl.workflow.files import expecting
 
 MOST_RUNS = 100_000
 _LARGEST_SEED = 2**63
+_DEEPEST = 8  # tables in tables: no option is deeper than two
 _KEYS = ("scans", "seeds", "options", "grid", "runs")
 _ELSEWHERE = {
     "seed": "write seeds = [0, 1] at the top",
@@ -87,6 +88,8 @@ def read_grid(document: Table, path: Path) -> SweepGrid:
 
 def flat(table: Table, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """(dotted name, value) of everything in nested tables."""
+    if prefix.count(".") > _DEEPEST:
+        raise InputError(prefix[:60], "tables in tables in tables", f"at most {_DEEPEST} of them")
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.")
@@ -101,6 +104,8 @@ def _nested(pairs: Iterator[tuple[str, Any]]) -> dict[str, Any]:
         inside = table
         for group in groups:
             inside = inside.setdefault(group, {})
+            if not isinstance(inside, dict):
+                raise InputError(name, f"{group}={checks.shown(inside)} too", f"a value or a table {group}")
         inside[last] = value
     return table
 

@@ -89,7 +89,7 @@ def _kept(run: SweepRun) -> Line | None:
         return None
     try:
         line = json.loads(run.record.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):  # not there, not JSON, or JSON too deep
         return None
     return line if isinstance(line, dict) and same_run(line, run.facts) else None
 

@@ -1,0 +1,221 @@
+"""How a step of one reconstruction over ranks is made up: kernels, host, sums over ranks, waiting; and what that predicts.
+
+    python benchmarks/mpi_scaling.py [--quick] [--ranks 1,2,3,4] [--json docs/results/mpi_scaling.json]
+
+In an environment with the extra [mpi]. Every number of ranks is a run of mpiexec on this machine; where the device is its
+processor, a rank has one thread of PoCL. Splats exact in time, 25 frames. Strong: four frames a step whatever the ranks.
+Weak: a frame a rank. Of every part the least of the steps counts, on the rank for which it is largest: whoever else is at
+work on a machine only ever adds to it. Waiting is a median, and beyond as many ranks as processors it says nothing.
+
+The model. A step of B frames on R ranks takes
+
+    ceil(B / R) (kernels and host of a frame) + (kernels and host of a step) + sum of the gradients,
+
+the parts by least squares from the strong runs, and the sum is 13 rows x 8 bytes x Gaussians through Allreduce:
+2 log2(R) latencies and 2 (R - 1) / R times the bytes over the network's rate. The rate of this machine is measured.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from measuring import Facts, finish, median, parser_of, where
+
+from phyradgs_cl.acquisition import ConeGeometry, make_protocol
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.optim import DensityControl
+from phyradgs_cl.parallel import Mpi, launched_ranks
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors import splat_shared
+from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splat_run import SplatRun
+from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+
+STRONG_BATCH, WARM = 4, 2
+PARTS = ("step_ms", "kernels_ms", "sum_ms", "allreduce_ms", "idle_ms", "host_ms")
+ONE_THREAD = {"POCL_CPU_MAX_CU_COUNT": "1", "POCL_MAX_PTHREAD_COUNT": "1", "OMP_NUM_THREADS": "1"}
+NETWORKS = {
+    "this machine's memory": None,
+    "10 Gbit/s Ethernet": (1.25e9, 20e-6),
+    "100 Gbit/s": (12.5e9, 2e-6),
+    "400 Gbit/s": (50e9, 2e-6),
+}
+PREDICTED = (2, 4, 8, 16, 32, 64)
+
+
+# --- one rank -------------------------------------------------------------------------------------------
+
+
+def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
+    """A run of about so many Gaussians that does not grow."""
+    geometry = ConeGeometry(5.0, 7.0, (pixels, pixels), (4.0 / pixels,) * 2)
+    voxels = 16
+    while voxels**3 < 8 * gaussians:  # enough that attenuate
+        voxels += 16
+    grid = Grid.cube(voxels, 2.0)
+    options = SimulationOptions(make_protocol("rapid"), time_samples=2)
+    scan = simulate(AnalyticSource(shepp_logan(1.0), geometry), geometry, grid, options)
+    splats = SplatOptions(
+        gaussians=gaussians, batch=batch, iterations=10**6, control=DensityControl(every=0), tv_edge=32
+    )
+    fdk = static_fdk(rt, scan)
+    scale = internal_scale(fdk, scan.grid)
+    rng = np.random.default_rng(0)
+    internal = scan.grid.scaled(1 / scale.length_mm)
+    population = first_population(fdk / scale.density_per_mm, internal, splats, rng)
+    return SplatRun(rt, scan, splats, scale, population, rng)
+
+
+def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
+    """(steps, parts) milliseconds of this rank, and bytes that it hands over in a step."""
+    rt, ranks = run.rt, run.rt.ranks
+    spent = [0.0]
+    exact_sum = splat_shared.exact_sum
+
+    def timed_sum(*arguments: object) -> np.ndarray:
+        begun = time.perf_counter()
+        total = exact_sum(*arguments)
+        spent[0] += time.perf_counter() - begun
+        return total
+
+    splat_shared.exact_sum = timed_sum  # type: ignore[assignment]
+    rows, nbytes = [], 0
+    for _ in range(WARM + steps):
+        rt.kernel_seconds()
+        before = (ranks.exchanged_bytes, ranks.exchange_s, ranks.idle_s)
+        spent[0], begun = 0.0, time.perf_counter()
+        run.step()
+        rt.finish()
+        step = time.perf_counter() - begun
+        kernels = sum(seconds for name, seconds in rt.kernel_seconds().items())
+        nbytes = ranks.exchanged_bytes - before[0]
+        exchange, idle = ranks.exchange_s - before[1], ranks.idle_s - before[2]
+        summing = spent[0] - idle
+        rows.append([step, kernels, summing, exchange - idle, idle, step - kernels - summing - idle])
+    splat_shared.exact_sum = exact_sum
+    return 1e3 * np.array(rows[WARM:]), nbytes
+
+
+def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str | None, out: Path) -> None:
+    ranks = launched_ranks()
+    if isinstance(ranks, Mpi):
+        ranks.timed = True
+    rt = Runtime(device, profile=True, ranks=ranks)
+    run = started(rt, gaussians, pixels, batch)
+    rows, nbytes = measure(run, steps)
+    everyone = ranks.join(rows[None])
+    if ranks.rank == 0:
+        facts = {
+            "gaussians": run.count,
+            "batch": batch,
+            "ranks": ranks.size,
+            "bytes_a_step": nbytes,
+            "by_rank": [
+                {
+                    name: round(median(rank[:, k]) if name == "idle_ms" else float(rank[:, k].min()), 3)
+                    for k, name in enumerate(PARTS)
+                }
+                for rank in everyone
+            ],
+        }
+        out.write_text(json.dumps(facts))
+
+
+# --- all of them ----------------------------------------------------------------------------------------
+
+
+def on_ranks(ranks: int, words: list[str]) -> Facts:
+    """What rank 0 of so many has written."""
+    beside = Path(sys.executable).with_name("mpiexec")
+    launcher = str(beside) if beside.exists() else "mpiexec"
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out.json"
+        own = [sys.executable, "-m", "mpi4py", __file__, "--out", str(out), *words]
+        subprocess.run([launcher, "-n", str(ranks), *own], check=True, env={**os.environ, **ONE_THREAD})
+        return json.loads(out.read_text())
+
+
+def slowest(facts: Facts, name: str) -> float:
+    return max(rank[name] for rank in facts["by_rank"])  # type: ignore[attr-defined]
+
+
+def exchange_share(facts: Facts) -> float:
+    """Sums over ranks, with all that prepares them, as a share of a step without waiting."""
+    parts = {name: slowest(facts, name) for name in PARTS}
+    return parts["sum_ms"] / (parts["kernels_ms"] + parts["host_ms"] + parts["sum_ms"])
+
+
+def predict(strong: list[Facts], batch: int) -> Facts:
+    """Milliseconds of a step of ``batch`` frames by network and ranks, from the parts of the strong runs."""
+    work = [slowest(facts, "kernels_ms") + slowest(facts, "host_ms") for facts in strong]
+    frames = [-(-int(facts["batch"]) // int(facts["ranks"])) for facts in strong]  # type: ignore[call-overload]
+    a_frame, a_step = np.polyfit(frames, work, 1) if len(set(frames)) > 1 else (work[0], 0.0)
+    two = next(facts for facts in strong if facts["ranks"] == 2)
+    nbytes, allreduce_s = int(two["bytes_a_step"]), 1e-3 * slowest(two, "allreduce_ms")  # type: ignore[call-overload]
+    prepare_ms = slowest(two, "sum_ms") - slowest(two, "allreduce_ms")
+    own_rate = nbytes / allreduce_s  # of two ranks, which send 2 (R − 1) / R = 1 times the bytes
+    found: Facts = {
+        "frame_ms": round(float(a_frame), 2),
+        "step_ms": round(float(max(a_step, 0.0)), 2),
+        "prepare_sum_ms": round(prepare_ms, 2),
+        "allreduce_bytes_per_s": round(own_rate),
+        "fit_ms": [round(float(a_frame * n + a_step - w), 2) for n, w in zip(frames, work, strict=True)],
+    }
+    for name, network in NETWORKS.items():
+        rate, latency_s = network or (own_rate, 0.0)
+        steps = {}
+        for ranks in PREDICTED:
+            sending_ms = 1e3 * (2 * (ranks - 1) / ranks * nbytes / rate + 2 * np.log2(ranks) * latency_s)
+            own = -(-batch // ranks)
+            whole = own * a_frame + max(a_step, 0.0) + prepare_ms + sending_ms
+            alone = batch * a_frame + max(a_step, 0.0)
+            steps[str(ranks)] = {
+                "step_ms": round(float(whole), 1),
+                "exchange_share": round(float((prepare_ms + sending_ms) / whole), 4),
+                "speed_up": round(float(alone / whole), 2),
+            }
+        found[name] = steps
+    return found
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--ranks", default="1,2,3,4")
+    parser.add_argument("--gaussians", type=int, default=50_000)
+    parser.add_argument("--pixels", type=int, default=128)
+    parser.add_argument("--steps", type=int, default=12)
+    parser.add_argument("--batch", type=int, default=0, help="frames a step of one run, within mpiexec")
+    parser.add_argument("--out", type=Path, default=None, help="where rank 0 writes, within mpiexec")
+    arguments = parser.parse_args()
+    gaussians, pixels, steps = (
+        (1000, 32, 3) if arguments.quick else (arguments.gaussians, arguments.pixels, arguments.steps)
+    )
+    if arguments.out:
+        be_a_rank(gaussians, pixels, arguments.batch, steps, arguments.device, arguments.out)
+        return
+    sizes = [int(word) for word in arguments.ranks.split(",")]
+    words = ["--gaussians", str(gaussians), "--pixels", str(pixels), "--steps", str(steps)]
+    words += ["--device", arguments.device] if arguments.device else []
+    facts: Facts = where(Runtime(arguments.device))
+    facts |= {"pixels": pixels, "steps": steps, "motion": "exact", "threads_a_rank": 1}
+    strong = [on_ranks(size, [*words, "--batch", str(STRONG_BATCH)]) for size in sizes]
+    weak = [on_ranks(size, [*words, "--batch", str(size)]) for size in sizes]
+    facts["strong"], facts["weak"] = strong, weak
+    facts["exchange_share_of_two"] = round(exchange_share(next(f for f in weak if f["ranks"] == 2)), 4)
+    facts["predicted_batch"] = max(PREDICTED)
+    facts["predicted"] = predict(strong, max(PREDICTED))
+    finish(facts, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""What is made of tables of time cells: layers without two cells of a line, finer panels, segments that lines overhang."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import FLOAT64
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Shutter, pixel_centres
+from phyradgs_cl.acquisition.cells import (
+    exact_cells,
+    finer_cells,
+    layer_numbers,
+    layer_weights,
+    micro_view_cells,
+    segments_for,
+    static_cells,
+)
+from phyradgs_cl.errors import InputError
+
+LINES = 10
+GEOMETRY = ConeGeometry(50.0, 70.0, (LINES, 7), (0.6, 0.5), (1.0, -2.0))
+ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.25))
+
+
+def micro_views(strips: int, sub_intervals: int):
+    return micro_view_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, strips, sub_intervals)
+
+
+def test_cells_that_only_touch_share_a_layer() -> None:
+    np.testing.assert_array_equal(layer_numbers(micro_views(3, 1)), 0)
+    table = micro_views(2, 3)
+    assert sorted(layer_numbers(table)) == [0, 0, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    "table", [micro_views(3, 2), exact_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, 4)]
+)
+def test_layers_hold_every_lines_weights_once(table) -> None:
+    numbers = layer_numbers(table)
+    weights = layer_weights(table, numbers)
+    assert weights.shape == (numbers.max() + 1, LINES)
+    np.testing.assert_allclose(weights.sum(0), table.line_weights(), rtol=0, atol=FLOAT64)
+    for line in range(LINES):
+        serving = [c for c in range(table.count) if table.line_start[c] <= line < table.line_stop[c]]
+        assert len({int(numbers[c]) for c in serving}) == len(serving)
+        for cell in serving:
+            share = 1.0 if table.line_times is None else table.line_times[cell, 2, line]
+            assert weights[numbers[cell], line] == table.weight[cell] * share
+
+
+def test_no_cell_needs_no_layer() -> None:
+    empty = replace(static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES), weight=np.zeros(0))
+    assert layer_weights(empty, np.zeros(0, np.int64)).shape == (0, LINES)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_finer_pixels_lie_inside_of_those_they_were_cut_from(factor) -> None:
+    table = micro_views(2, 2)
+    finer = finer_cells(table, factor)
+    assert finer.lines == factor * LINES
+    np.testing.assert_array_equal(finer.line_stop, factor * table.line_stop)
+    np.testing.assert_array_equal(finer.line_start, factor * table.line_start)
+    coarse = pixel_centres(table.pose, (LINES, 7))
+    fine = pixel_centres(finer.pose, (factor * LINES, factor * 7))
+    means = fine.reshape(table.count, LINES, factor, 7, factor, 3).mean(axis=(2, 4))
+    np.testing.assert_allclose(means, coarse, rtol=0, atol=FLOAT64)
+    np.testing.assert_array_equal(finer.pose[:, :3], table.pose[:, :3])
+    own = GEOMETRY.finer(factor)
+    assert own.detector_shape == (factor * LINES, factor * 7)
+    angle = 0.1 + 0.25 * table.time_s[0]
+    np.testing.assert_allclose(own.pose(angle), finer.pose[0], rtol=0, atol=FLOAT64)
+
+
+@pytest.mark.parametrize(("reach", "served_by"), [(0.05, 1), (0.15, 2)])
+@pytest.mark.parametrize("late", [False, True])
+def test_a_line_stays_in_a_segment_that_it_overhangs_by_less_than_a_tenth(reach, served_by, late) -> None:
+    """Two segments of a second; the first line is exposed from 0 to 1 + reach, or the last from 1 − reach to 2."""
+    shutter = Shutter(1.0 + reach, 1.0 - reach)
+    table = exact_cells(ORBIT, shutter, 0, 3.0, LINES, 2)
+    share = table.line_times[:, 2, -1 if late else 0]
+    assert np.count_nonzero(share) == served_by
+    expected = [1.0] if served_by == 1 else [reach / (1 + reach), 1 / (1 + reach)]
+    np.testing.assert_allclose(np.sort(share[share > 0]), expected, rtol=0, atol=FLOAT64)
+
+
+def test_windows_of_no_length_count_as_a_whole_line() -> None:
+    table = exact_cells(ORBIT, Shutter(0.0, 0.6), 0, 3.0, LINES, 3)
+    share = table.line_times[:, 2]
+    assert set(np.unique(share)) == {0.0, 1.0}
+    np.testing.assert_array_equal(share.sum(0), 1.0)
+
+
+def test_a_panel_that_turns_about_itself_needs_segments_too() -> None:
+    """The angle is the larger of the source's about the origin and the panel's own."""
+
+    class Turning:
+        """The source stands; the panel tips by 0.35 rad over the frame."""
+
+        def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+            pose = np.tile(GEOMETRY.pose(0.0), (np.size(time_s), 1))
+            tip = 0.25 * (np.asarray(time_s) - 3.0)
+            pose[:, 9:12] = 0.6 * np.stack([np.sin(tip), 0 * tip, np.cos(tip)], -1)
+            return pose
+
+    where = (Shutter(0.8, 0.6), 0, 3.0, 0.001)
+    assert segments_for(Turning(), *where) == segments_for(ORBIT, *where) > 3
+
+
+def test_a_static_table_is_one_cell_of_all_lines() -> None:
+    table = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
+    assert (table.count, table.line_start[0], table.line_stop[0], table.weight[0]) == (1, 0, LINES, 1.0)
+
+
+def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
+    assert Motion() == Motion("micro-views", 8, 5, 0, 0.005)
+    for name, lowest, highest in (
+        ("strips", 1, 10_000),
+        ("sub_intervals", 1, 10_000),
+        ("segments", 0, 1000),
+        ("time_error", 1e-6, 1),
+    ):
+        for inside in (lowest, highest):
+            assert getattr(Motion(**{name: inside}), name) == inside
+        for outside in (lowest * 0.9 - 1e-9, highest * 1.001):
+            with pytest.raises(InputError):
+                Motion(**{name: outside})
+    assert ConeGeometry(50.0, 70.0, (1, 1), (0.6, 0.5)).detector_shape == (1, 1)

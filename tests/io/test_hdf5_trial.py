@@ -1,0 +1,83 @@
+"""Files that the HDF5 library does not survive: another process finds out, and is replaced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import hdf5_trial
+from phyradgs_cl.io.hdf5 import open_hdf5
+
+KEPT = Path(__file__).resolve().parents[1] / "corpus" / "kept"
+CRASHES = KEPT / "import_of_nxtomo" / "crashes_hdf5.h5"
+NEVER_ENDS = KEPT / "scan" / "never_ends_in_hdf5.h5"
+
+
+@pytest.fixture
+def scout(monkeypatch):
+    """A process of the test's own, not yet started."""
+    mine = hdf5_trial._Scout()
+    monkeypatch.setattr(hdf5_trial, "_scout", mine)
+    hdf5_trial._verdict.cache_clear()
+    yield mine
+    mine.leave()
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    path = tmp_path / "good.h5"
+    with h5py.File(path, "w") as file:
+        file["value"] = 3.0
+    return path
+
+
+def value_of(path: Path) -> float:
+    with open_hdf5(path) as source:
+        return float(source.dataset("/value")[()])
+
+
+def refusal_of(path: Path) -> str:
+    with pytest.raises(InputError) as error, open_hdf5(path):
+        pass
+    assert error.value.culprit == str(path)
+    return error.value.found
+
+
+def test_a_file_that_keeps_hdf5_for_ever_is_refused_and_the_next_is_read(scout, good, monkeypatch) -> None:
+    monkeypatch.setattr(hdf5_trial, "CPU_SECONDS", 0)  # of a second that has begun, at most
+    assert "does not finish reading" in refusal_of(NEVER_ENDS)
+    assert value_of(good) == 3.0
+
+
+def test_a_file_that_crashes_hdf5_is_refused_and_the_next_is_read(scout, good) -> None:
+    assert "the HDF5 library crashes on it" in refusal_of(CRASHES)
+    assert value_of(good) == 3.0
+
+
+def test_one_process_looks_at_all_files_once(scout, good, tmp_path) -> None:
+    other = tmp_path / "other.h5"
+    other.write_bytes(good.read_bytes())
+    assert value_of(good) == value_of(other) == 3.0
+    process, before = scout._process, hdf5_trial._verdict.cache_info().misses
+    assert value_of(good) == 3.0 and scout._process is process
+    assert hdf5_trial._verdict.cache_info().misses == before
+    scout.leave()
+    assert process.returncode == 0
+
+
+def test_a_look_that_waits_for_ever_is_given_up(scout, good, monkeypatch) -> None:
+    """On a disk that does not answer no processor is used: the clock counts."""
+    monkeypatch.setattr(hdf5_trial, "_LOOK", "import time; print('ready', flush=True); time.sleep(600)")
+    monkeypatch.setattr(hdf5_trial, "SECONDS", 0.3)
+    assert "does not finish reading" in refusal_of(good)
+
+
+@pytest.mark.parametrize("start", [("_LOOK", "raise SystemExit(1)"), ("sys.executable", "/no/such/python")])
+def test_where_no_process_can_be_had_files_are_read_without(scout, good, monkeypatch, start) -> None:
+    name, value = start
+    owner = hdf5_trial.sys if "." in name else hdf5_trial
+    monkeypatch.setattr(owner, name.rpartition(".")[2], value)
+    assert value_of(good) == 3.0 and scout._process is None

@@ -1,0 +1,227 @@
+"""Under real MPI: `make test-mpi`. The same volumes on 1 to 4 ranks, and one end for all, whoever dies."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tolerances import RANK_GRADIENT, RANK_VOLUME
+
+from phyradgs_cl.acquisition import ConeGeometry, Protocol
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_volume, write_scan
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+
+BESIDE = Path(sys.executable).with_name("mpiexec")
+MPIEXEC = str(BESIDE) if BESIDE.exists() else str(shutil.which("mpiexec"))
+WORK = Path(__file__).with_name("mpi_work.py")
+PHYRADGS = [sys.executable, "-m", "phyradgs_cl"]
+# ranks of a test share the processors of one machine
+QUIET = {**os.environ, "POCL_CPU_MAX_CU_COUNT": "1", "POCL_MAX_PTHREAD_COUNT": "1"}
+
+
+@pytest.fixture(scope="module")
+def scan_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    geometry = ConeGeometry(5, 7.5, (24, 24), (3.9 / 24, 3.9 / 24))
+    source = AnalyticSource(shepp_logan(1.0), geometry)
+    protocol = Protocol(views=6, exposure_deg=20.0)
+    path = tmp_path_factory.mktemp("mpi") / "scan.h5"
+    write_scan(path, simulate(source, geometry, Grid.cube(16, 2.0), SimulationOptions(protocol)))
+    return path
+
+
+Made = Callable[[int], dict[str, np.ndarray]]
+
+
+@pytest.fixture(scope="module")
+def made(scan_file: Path) -> Made:
+    """What ``mpi_work.py`` makes on so many ranks; each number is run once."""
+    kept: dict[int, dict[str, np.ndarray]] = {}
+
+    def on(size: int) -> dict[str, np.ndarray]:
+        if size not in kept:
+            out = scan_file.with_name(f"on{size}.npz")
+            command = [MPIEXEC, "-n", str(size), sys.executable, "-m", "mpi4py", str(WORK)]
+            done = subprocess.run(
+                [*command, str(scan_file), str(out)], env=QUIET, capture_output=True, text=True
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+            with np.load(out) as arrays:
+                kept[size] = dict(arrays)
+        return kept[size]
+
+    return on
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_the_same_volume_on_1_to_4_ranks(made: Made, size: int) -> None:
+    one, several = made(1), made(size)
+    assert int(several["size"]) == size
+    for name in ("frames", "lines", "domain"):
+        np.testing.assert_array_equal(several[name], one[name])
+    for name in ("sirt", "os-sart", "fista-tv", "asd-pocs"):
+        assert np.linalg.norm(several[name] - one[name]) <= RANK_VOLUME * np.linalg.norm(one[name])
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_gradients_of_ranks_add_up_to_the_serial_one(made: Made, size: int) -> None:
+    one, several = made(1), made(size)
+    error = np.linalg.norm(several["gradient"] - one["gradient"])
+    assert 0 < error <= RANK_GRADIENT * np.linalg.norm(one["gradient"])  # lines were shared out
+    np.testing.assert_array_equal(several["gradient of four frames"], one["gradient of four frames"])
+
+
+# --- the command line -------------------------------------------------------------------------------
+
+
+def command(size: int, scan: Path, output: Path, *more: str) -> list[str]:
+    options = ["--iterations", "400", "--batch", "4", "--gaussians", "300", "--checkpoint-every", "0.05"]
+    return [MPIEXEC, "-n", str(size), *PHYRADGS, "reconstruct", str(scan), "-o", str(output), *options, *more]
+
+
+def run(words: Sequence[str]) -> subprocess.CompletedProcess:
+    return subprocess.run(words, env=QUIET, capture_output=True, text=True, timeout=300)
+
+
+def said(stderr: str) -> list[str]:
+    """Lines of ours: without those of a counter, and of mpiexec."""
+    lines = stderr.replace("\r", "\n").splitlines()
+    return [line for line in lines if line.startswith("phyradgs:") or "Traceback" in line]
+
+
+def descendants(pid: int) -> list[int]:
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in (task / "children").read_text().split():
+            found += [int(child), *descendants(int(child))]
+    return found
+
+
+def ranks_of(launcher: subprocess.Popen) -> dict[int, int]:
+    """Process ids by rank."""
+    found = {}
+    for pid in descendants(launcher.pid):
+        words = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+        given = dict(word.split(b"=", 1) for word in words if b"=" in word)
+        if b"PMI_RANK" in given and b"phyradgs" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            found[int(given[b"PMI_RANK"])] = pid
+    return found
+
+
+def stop_midway(
+    words: Sequence[str], output: Path, act: Callable[[subprocess.Popen], None]
+) -> tuple[int, str]:
+    """Runs until there is a checkpoint, then acts; (exit status, standard error) when no rank is left."""
+    checkpoint = output.with_name(f"{output.name}.checkpoint.npz")
+    with open(output.with_suffix(".log"), "w+") as log:
+        process = subprocess.Popen(
+            words, env=QUIET, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+        )
+        try:
+            deadline = time.monotonic() + 120
+            while not checkpoint.exists():
+                assert process.poll() is None and time.monotonic() < deadline, log.name
+                time.sleep(0.01)
+            pids = ranks_of(process).values()
+            act(process)
+            status = process.wait(60)
+            deadline = time.monotonic() + 10
+            while any(Path(f"/proc/{pid}").exists() for pid in pids) and time.monotonic() < deadline:
+                time.sleep(0.01)
+            assert not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        log.seek(0)
+        return status, log.read()
+
+
+@pytest.fixture(scope="module")
+def whole(scan_file: Path) -> np.ndarray:
+    """The volume of a run that nobody disturbed."""
+    output = scan_file.with_name("whole.h5")
+    assert run(command(2, scan_file, output)).returncode == 0
+    return read_volume(output).volume
+
+
+@pytest.mark.parametrize(("killed", "size", "then"), [(1, 3, 2), (0, 2, 4), (1, 2, 1)])
+def test_a_killed_rank_ends_all_and_the_checkpoint_goes_on(
+    scan_file, whole, tmp_path, killed, size, then
+) -> None:
+    output = tmp_path / "volume.h5"
+    words = command(size, scan_file, output)
+    status, stderr = stop_midway(
+        words, output, lambda process: os.kill(ranks_of(process)[killed], signal.SIGKILL)
+    )
+    assert status != 0 and not output.exists()
+    assert said(stderr) == []  # the launcher says which process was lost
+    done = run(command(then, scan_file, output, "--resume"))
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_array_equal(read_volume(output).volume, whole)
+    assert not list(tmp_path.glob("*.checkpoint*"))
+
+
+@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_to_mpiexec_keeps_what_there_is(scan_file, whole, tmp_path, number, expected) -> None:
+    output = tmp_path / "volume.h5"
+    words = command(2, scan_file, output)
+    status, stderr = stop_midway(words, output, lambda process: process.send_signal(number))
+    assert status == expected, stderr
+    assert [line.split(" after")[0] for line in said(stderr)] == ["phyradgs: interrupted"]
+    assert output.exists()
+    assert run(command(3, scan_file, output, "--resume")).returncode == 0
+    np.testing.assert_array_equal(read_volume(output).volume, whole)
+
+
+def test_one_rank_that_fails_ends_all_with_its_line(scan_file, tmp_path) -> None:
+    output = tmp_path / "volume.h5"
+    alone = command(1, scan_file, output)
+    second = [":", "-n", "1", "-env", "PHYRADGS_MEMORY", "100K", *alone[3:]]
+    done = run([*alone, *second])
+    assert done.returncode == 6
+    (line,) = said(done.stderr)
+    assert line.startswith("phyradgs: rank 1: ") and "PHYRADGS_MEMORY" in line
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "status", "line"),
+    [
+        (["--method", "fdk"], 2, "--method fdk: found 3 ranks"),
+        (["--device", "99"], 2, "--device: found '99'"),
+        (["--parts", "1", "--batch", "2"], 2, "--parts: found 1 parts of 2 frames a step for 3 ranks"),
+        (["--memory", "100K"], 6, "memory of"),
+    ],
+)
+def test_what_is_wrong_is_said_once(scan_file, tmp_path, more, status, line) -> None:
+    words = [
+        MPIEXEC,
+        "-n",
+        "3",
+        *PHYRADGS,
+        "reconstruct",
+        str(scan_file),
+        "-o",
+        str(tmp_path / "v.h5"),
+        *more,
+    ]
+    done = run(words)
+    assert done.returncode == status
+    (found,) = said(done.stderr)
+    assert found.startswith(f"phyradgs: {line}")
+
+
+def test_other_commands_are_done_once(scan_file) -> None:
+    alone = run([*PHYRADGS, "info", str(scan_file)])
+    several = run([MPIEXEC, "-n", "2", *PHYRADGS, "info", str(scan_file)])
+    assert several.returncode == 0 and several.stdout == alone.stdout
