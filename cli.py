@@ -55,8 +55,8 @@ app = typer.Typer(
     add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result. 'phyradgs COMMAND --help' "
-    "explains a command.\n\n"
+    help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result. "
+    "'phyradgs COMMAND --help' explains a command.\n\n"
     "Exit status: 0 done, 2 wrong input, 3 numbers that overflowed, 4 output not written, 5 no device or one that fails, "
     "6 out of memory, 10 suspicious (check), 130 interrupted, 143 terminated.",
 )

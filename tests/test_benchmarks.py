@@ -56,6 +56,15 @@ def test_bricks_of_large_problems(tmp_path) -> None:
         assert found["relative_difference"] <= (1e-5 if name == "ray-driven forward" else 0), name
 
 
+def test_a_device_agrees_with_itself_to_the_bit(tmp_path) -> None:
+    kept, facts = tmp_path / "kept.npz", tmp_path / "facts.json"
+    run("across_devices.py", "store", str(kept))
+    run("across_devices.py", "compare", str(kept), "--json", str(facts))
+    found = json.loads(facts.read_text())
+    assert found["devices"][0] == found["devices"][1]
+    assert len(found["differences"]) > 30 and not any(found["differences"].values())
+
+
 def test_time_to_a_psnr_is_resumed(tmp_path) -> None:
     import h5py
     import numpy as np

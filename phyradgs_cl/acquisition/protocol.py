@@ -35,10 +35,6 @@ class Protocol:
         checks.within("start angle (degrees)", self.start_deg, -1e6, 1e6)
         checks.within("exposure arc (degrees)", self.exposure_deg, 0, 3600)
         checks.within("readout ratio", self.readout_ratio, 0, 1000)
-        if not (np.isfinite(self.exposure_deg) and self.exposure_deg >= 0):
-            raise InputError("exposure arc", f"{self.exposure_deg}°", "an angle of at least 0°")
-        if not (np.isfinite(self.readout_ratio) and self.readout_ratio >= 0):
-            raise InputError("readout ratio", str(self.readout_ratio), "T_ro/T_exp of at least 0")
         if self.pulse is not None:
             self._check_pulse(*self.pulse)
 

@@ -27,7 +27,10 @@ def check_angles(scan: Scan) -> Finding:
     apart_deg = gaps_deg[gaps_deg > math.degrees(_SAME_RAD)]
     if apart_deg.size < 3:
         count = max(apart_deg.size, 1)
-        text, advice = f"{count} different angle{'s' if count > 1 else ''}", "check rotation_angle and its unit (degrees)"
+        text, advice = (
+            f"{count} different angle{'s' if count > 1 else ''}",
+            "check rotation_angle and its unit (degrees)",
+        )
         return Finding(_QUESTION, SUSPICIOUS, float(apart_deg.size), 3.0, "angles", text, advice)
     usual_deg = float(np.median(apart_deg))
     widest = np.sort(apart_deg)[::-1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
@@ -11,6 +13,7 @@ from phyradgs_cl.detector import noise_level
 _LARGEST_SHARE = 0.1  # of the largest line integral
 _DISPLACED = 0.1  # of the panel's width: from here a panel is shifted on purpose
 _NOISES = 4.0
+_OPAQUE = 30.0  # line integral: nothing comes through
 _FRAMES = 0.1  # of all: how many may touch a border
 _QUESTION = "coverage"
 
@@ -21,7 +24,7 @@ def check_coverage(scan: Scan) -> Finding:
     A border counts as touched where the mean over a few neighbouring rows of its two outermost columns is above the
     threshold and above the noise, in a tenth of the frames. A displaced panel may cut the object on its short side.
     Rows are not asked: objects longer than the panel are the rule. Frames in which nothing rises above the noise have no
-    object, or another sign.
+    object, or another sign; line integrals beyond 30 are something else.
     """
     p = np.asarray(scan.projections)
     if p.shape[2] < 8:
@@ -33,6 +36,10 @@ def check_coverage(scan: Scan) -> Finding:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
         advice = "was the object in the beam? Are the values line integrals, larger where more is in the way?"
         return Finding(_QUESTION, SUSPICIOUS, largest, noise, "line integral", text, advice)
+    if largest > _OPAQUE:
+        text = f"line integrals reach {largest:.3g}: one photon in {math.exp(min(largest, 700)):.1g} comes through"
+        advice = "are these counts, or transmission? Say which: import --quantity, or quantity of the data"
+        return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, "line integral", text, advice)
     threshold = max(_LARGEST_SHARE * largest, noise)
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     allowed = _cut_on_purpose(scan)

@@ -16,6 +16,8 @@ _MOST_TIMES = 0.7  # of the frames
 _MOST_FRAMES = 40
 _STILL_SIDES = 0.5  # of the outermost columns: from here air has no noise
 _AROUND = np.ones((3, 3), bool)
+_NEAR_AXIS = 1.5  # columns
+_SHARED = 0.1  # of a pixel's distance, by its four neighbours: an object is never as sharp as a dead pixel
 _QUESTION = "dead pixels"
 
 
@@ -23,7 +25,8 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     """The share of pixels that are dead and not masked, against 0.02 %; and where they are (v, u) bool.
 
     Dead is a pixel that never changes while those around it do, or one that lies beyond all its neighbours in 70 % of the
-    frames, its median distance from the median of 3 × 3 pixels being more than ten of the panel's usual deviations.
+    frames, its median distance from the median of 3 × 3 pixels being more than ten of the panel's usual deviations. Near the
+    axis, where small parts of the object stand still on the panel, it has to be sharper than these.
     """
     known = _masked(scan)
     if scan.frames < _LEAST_FRAMES:
@@ -33,7 +36,8 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
         )
     chosen = np.unique(np.linspace(0, scan.frames - 1, _MOST_FRAMES).round().astype(int))
     frames = np.asarray(scan.projections)[chosen]
-    dead = (_constant(frames) | _apart(frames)) & ~known
+    apart = _apart(frames) & ~(_shared(frames) & _near_axis(scan))
+    dead = (_constant(frames) | apart) & ~known
     share = float(dead.sum() / max(int((~known).sum()), 1))
     text = f"{int(dead.sum())} pixels ({100 * share:.3g} %) that the mask does not have"
     if share <= _SHARE:
@@ -74,3 +78,19 @@ def _apart(frames: np.ndarray) -> np.ndarray:
     floor = 1e-3 * float(np.percentile(frames, 99.9))
     far = np.abs(apart - np.median(apart)) > _DEVIATIONS * max(usual, floor, 1e-12)
     return far & (np.maximum(above, below) > _MOST_TIMES)
+
+
+def _near_axis(scan: Scan) -> np.ndarray:
+    """Columns (u,) bool that see the axis of rotation, where parts of the object stand still."""
+    time_s = scan.frame_start_s[:1] + scan.shutter.middle_s
+    source, corner, u, v = scan.trajectory.pose(0, time_s)[0].reshape(4, 3)
+    column = np.linalg.lstsq(np.stack([u, v, source], axis=1), source - corner, rcond=None)[0][0]
+    return np.abs(np.arange(scan.geometry.detector_shape[1]) - column) <= _NEAR_AXIS
+
+
+def _shared(frames: np.ndarray) -> np.ndarray:
+    """Pixels whose distance from the median of 5 × 5 their four neighbours share (one of which may be dead itself)."""
+    apart = np.median([frame - median_filter(frame, size=5) for frame in frames], axis=0)
+    wide = np.pad(apart, 1, mode="edge")
+    sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)
+    return sides * np.sign(apart) > _SHARED * np.abs(apart)

@@ -77,7 +77,7 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
         moved[frame] = _wrapped(last - first) * (starts_s[frame + 1] - starts_s[frame]) / span_s
         stepped[frame] = moved[frame] + _wrapped(following - first - moved[frame])
     apart = float(np.median(np.abs(stepped - moved))) / max(float(np.median(np.abs(stepped))), 1e-9)
-    text = f"the angles between frames are {100 * apart:.2g} % from those that the speed in the frames gives"
+    text = f"the angles between frames are {100 * apart:.2f} % from those that the speed in the frames gives"
     if apart <= _APART:
         return Finding(_QUESTION, OK, 1 + apart, 1 + _APART, "share", text)
     degrees = math.degrees(float(np.median(moved))), math.degrees(float(np.median(stepped)))

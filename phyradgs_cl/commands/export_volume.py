@@ -12,6 +12,7 @@ from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import file_argument, file_option
 from phyradgs_cl.exporters import EXPORTS, export_volume
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.workflow.files import expecting
 
 EXAMPLE = "Example: phyradgs export volume.h5 --to nii --mu-water-per-mm 0.0195"
 Export = Enum("Export", {name: name for name in EXPORTS}, type=str)  # type: ignore[misc]
@@ -42,7 +43,7 @@ def export_command(
     ] = None,
 ) -> None:
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
-    with finish_despite_interrupt():
+    with finish_despite_interrupt(), expecting(volume, "volume"):
         written = export_volume(volume, to.value, output, mu_water_per_mm)  # type: ignore[attr-defined]
     unit = "" if to.value in ("ply", "npz") else ", HU" if mu_water_per_mm is not None else ", 1/mm"  # type: ignore[attr-defined]
     say(f"{written}: {to.value}{unit}")  # type: ignore[attr-defined]

@@ -38,4 +38,4 @@ def report_command(
     """Write one HTML page about a reconstruction: slices, convergence, projections, scan, provenance."""
     wish = device_wish(device)
     write_report(run, output, lambda: Runtime(wish), scan=scan, views=views)
-    say(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+    say(f"{output}: {output.stat().st_size / 1e6:.3g} MB")

@@ -49,8 +49,8 @@ def sweep_command(
     ] = None,
 ) -> None:
     """Reconstruct many scans with many settings: a resumable results file, volumes, and tables."""
-    where = chosen_workers(scheduler, workers, device)
     read = read_grid(read_config(grid, "GRID"), grid)
+    where = chosen_workers(scheduler, workers, device)  # may say something, and an error has one line
     job = SweepJob(read, output, where, device if where is None else None, checkpoint_every)
     interrupted = f"interrupted: finished runs are in {output / RESULTS}; repeat the command to go on"
     signals.say_at_the_end(interrupted)

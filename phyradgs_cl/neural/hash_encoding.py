@@ -43,7 +43,7 @@ class HashEncoding(nn.Module):
             indices.append((index + start).t())
             weights.append(weight.t())
             start += size
-        encoded = _Interpolate.apply(self.table, torch.cat(indices), torch.cat(weights))  # (levels · P, features)
+        encoded = _Interpolate.apply(self.table, torch.cat(indices), torch.cat(weights))
         return encoded.reshape(len(self.sizes), -1, self.features).transpose(0, 1).reshape(-1, self.width)
 
 
@@ -69,6 +69,12 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
     return (2 if axis == 2 else 1, 2 if axis == 1 else 1, 2 if axis == 0 else 1, -1)
 
 
+def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Σ weight · table[index] over the last axis of index (B, 8): ``embedding_bag``, which some devices lack."""
+    rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
+    return torch.einsum("bkf,bk->bf", rows, weight)
+
+
 class _Interpolate(torch.autograd.Function):
     """Σ weight · table[index] over the 8 corners (B, 8) of each bag; the gradient sums into the table in one fixed order."""
 
@@ -76,6 +82,8 @@ class _Interpolate(torch.autograd.Function):
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(index, weight)
         ctx.entries = table.shape[0]
+        if table.device.type != "cpu":
+            return weighted_rows(table, index, weight)
         return nn.functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
 
     @staticmethod

@@ -15,7 +15,7 @@ LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
 CELLS_A_VOXEL = 1.0  # of the finest level
 SAMPLES_A_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
-SAMPLES_A_TIME = 1.0  # of each of several: what counts is the mean over their rays
+SAMPLES_A_TIME = 1.2  # of each of several: what counts is the mean over their rays
 
 _RANGES = {
     "iterations": (0, 1_000_000),
@@ -44,7 +44,7 @@ class NeuralOptions:
     """A field on a hash encoding and a small network, fitted to rays.
 
     iterations: passes over all frames, of one step a frame. rays: pixels a step. samples: along a ray inside the volume,
-    0 for 1.5 a voxel of the longest side, 1 for each of several times. jitter: of the samples: one random shift
+    0 for 1.5 a voxel of the longest side, 1.2 for each of several times. jitter: of the samples: one random shift
     a ``ray``, one a ``sample`` inside its own interval, ``none``. times: how many of a line's a step looks at, drawn anew
     for each pixel; 0: all of them. positive_only: pixels with a line integral above 0 only. voxel_points: along each side
     of a voxel, which is the field's mean over their cube.
@@ -106,7 +106,7 @@ class NeuralOptions:
         return 1 + max(math.ceil(min(steps, finest) - 1e-9), 0)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
-        """Samples along each ray of a pixel with so many ``times``, for a volume of so many voxels along its longest side."""
+        """Samples along each ray of a pixel of so many ``times``, for so many voxels along the longest side."""
         density = SAMPLES_A_VOXEL if times == 1 else SAMPLES_A_TIME
         return self.samples or max(round(density * longest_voxels), 2)
 

@@ -51,7 +51,8 @@ class SplatPlan:
     def facts(self) -> tuple[str, ...]:
         frames, slices = self.scan.frames, self.scan.grid.shape[0]
         host = (
-            f"host memory of every rank at the start: {size_text(self.host_bytes())}, frames and first volume"
+            f"host memory at the start: {size_text(self.host_bytes())} of rank 0, frames and first volume; "
+            f"{size_text(self.scan.projections.nbytes)} of the others, frames"
         )
         if self.by_domain:
             return (

@@ -13,8 +13,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.operators.splat_count import Work
+from phyradgs_cl.optim import Population
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State
+from phyradgs_cl.reconstructors.splat_frames import Scale
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splat_run import SplatRun
 from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
@@ -35,11 +37,8 @@ def reconstruct_splats(
     ``resume`` continues an interrupted run of the same scan and options from its state.
     """
     started = time.perf_counter()
-    fdk = static_fdk(rt, scan)
-    scale = internal_scale(fdk, scan.grid)
-    grid = scan.grid.scaled(1 / scale.length_mm)
-    rng = np.random.default_rng(seed)
-    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
+    # a volume that one rank alone has on its host
+    scale, population, rng = rt.ranks.tell(_start(rt, scan, options, seed) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
     if resume is not None:
@@ -53,7 +52,7 @@ def reconstruct_splats(
         "seed": seed,
         "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm,
-        "gaussians_asked": options.gaussians_for(grid),
+        "gaussians_asked": options.gaussians_for(run.grid),
         "gaussians_first": first_count,
         "gaussians": cloud.count,
         "seconds": time.perf_counter() - started + run.seconds_before,
@@ -71,6 +70,17 @@ def reconstruct_splats(
     state = run.state() if run.interrupted_at is not None else None
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, run.record, facts, state)
+
+
+def _start(
+    rt: Runtime, scan: Scan, options: SplatOptions, seed: int
+) -> tuple[Scale, Population, np.random.Generator]:
+    """Internal units, the first cloud, and the generator from which it was drawn, all from an FDK volume."""
+    fdk = static_fdk(rt, scan)
+    scale = internal_scale(fdk, scan.grid)
+    rng = np.random.default_rng(seed)
+    grid = scan.grid.scaled(1 / scale.length_mm)
+    return scale, first_population(fdk / scale.density_per_mm, grid, options, rng), rng
 
 
 def time_facts(run: SplatRun) -> dict[str, object]:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, fields, replace
 
 import numpy as np
 import pytest
 from tolerances import FLOAT64
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Shutter, pixel_centres
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    EncoderTable,
+    FrameSweeps,
+    Motion,
+    PoseTable,
+    Shutter,
+    pixel_centres,
+)
 from phyradgs_cl.acquisition.cells import (
     exact_cells,
     finer_cells,
@@ -93,20 +103,77 @@ def test_windows_of_no_length_count_as_a_whole_line() -> None:
     np.testing.assert_array_equal(share.sum(0), 1.0)
 
 
-def test_a_panel_that_turns_about_itself_needs_segments_too() -> None:
-    """The angle is the larger of the source's about the origin and the panel's own."""
+def in_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """The panel turned about its normal."""
+    u, v = pose[:, 6:9] / 0.5, pose[:, 9:12] / 0.6
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return np.concatenate([0.5 * (cos * u + sin * v), 0.6 * (cos * v - sin * u)], 1)
+
+
+def tipped(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """The panel turned about its rows."""
+    v = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    return np.concatenate([pose[:, 6:9], 0.6 * v], 1)
+
+
+def in_a_tilted_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rows in the plane of the orbit at first, columns far from upright."""
+    tilted = pose.copy()
+    tilted[:, 9:12] = 0.6 * np.array([np.sin(0.8), 0.0, np.cos(0.8)])
+    return in_plane(tilted, angle)
+
+
+@pytest.mark.parametrize("steps", [in_plane, tipped, in_a_tilted_plane])
+def test_a_panel_that_turns_about_itself_needs_segments_too(steps) -> None:
+    """By 0.25 rad/s, as the orbit; the source stands. The number follows from the turn, 0.35 rad, and the bound."""
 
     class Turning:
-        """The source stands; the panel tips by 0.35 rad over the frame."""
-
         def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
             pose = np.tile(GEOMETRY.pose(0.0), (np.size(time_s), 1))
-            tip = 0.25 * (np.asarray(time_s) - 3.0)
-            pose[:, 9:12] = 0.6 * np.stack([np.sin(tip), 0 * tip, np.cos(tip)], -1)
+            pose[:, 6:] = steps(pose, 0.25 * (np.asarray(time_s) - 3.0))
             return pose
 
     where = (Shutter(0.8, 0.6), 0, 3.0, 0.001)
-    assert segments_for(Turning(), *where) == segments_for(ORBIT, *where) > 3
+    assert (
+        segments_for(Turning(), *where)
+        == segments_for(ORBIT, *where)
+        == np.ceil(0.35 * np.sqrt(0.32 / 0.001))
+    )
+
+
+def test_one_segment_of_a_gantry_at_rest() -> None:
+    at_rest = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0))
+    assert exact_cells(at_rest, Shutter(0.8, 0.6), 0, 3.0, LINES, 1).end_poses is None
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        GEOMETRY,
+        ORBIT,
+        ORBIT.kinematics,
+        PoseTable(np.arange(2.0), GEOMETRY.pose(np.arange(2.0))),
+        Motion(),
+        Shutter(0.8),
+        static_cells(ORBIT, Shutter(0.8), 0, 3.0, LINES),
+    ],
+)
+def test_geometry_and_timing_are_values(value) -> None:
+    with pytest.raises(FrozenInstanceError):
+        setattr(value, fields(value)[0].name, None)
+
+
+def test_what_holds_arrays_is_compared_by_what_it_is() -> None:
+    """Equality of arrays is an array: these are equal to themselves alone, and can be keys."""
+    times = np.array([0.0, 1.0])
+    made = [lambda: EncoderTable(times, times), lambda: FrameSweeps(times, 1.0, times, times)]
+    made += [
+        lambda: PoseTable(times, GEOMETRY.pose(times)),
+        lambda: CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0)),
+    ]
+    for make in made:
+        one, other = make(), make()
+        assert one == one and one != other and len({one, other}) == 2
 
 
 def test_a_static_table_is_one_cell_of_all_lines() -> None:

@@ -94,6 +94,53 @@ def test_jitter_needs_a_generator_and_a_gantry_that_turns() -> None:
         Protocol(exposure_deg=0.0).orbit(GEOMETRY, 0.2, np.random.default_rng(0))
 
 
+@pytest.mark.parametrize("exposure_s", [1.0, 2.5])
+def test_times_grow_with_the_exposure(exposure_s) -> None:
+    protocol = Protocol(4, 0.0, 0.5, exposure_s=exposure_s, pulse=(0.5, 0.25))
+    shutter = protocol.shutter()
+    assert (shutter.exposure_s, shutter.readout_s) == (exposure_s, 0.5 * exposure_s)
+    assert shutter.pulse_s == (0.5 * exposure_s, 0.25 * exposure_s)
+    np.testing.assert_allclose(protocol.frame_start_s(), 1.5 * exposure_s * np.arange(4), rtol=1e-12)
+    turning = Protocol(4, 30.0, exposure_s=exposure_s)
+    np.testing.assert_allclose(turning.frame_start_s(), 3 * exposure_s * np.arange(4), rtol=1e-12)
+
+
+def test_the_gantry_wanders_in_straight_lines_between_a_knot_a_frame() -> None:
+    protocol = Protocol(5, 20.0, exposure_s=2.0, start_deg=7.0)
+    encoder = protocol.orbit(GEOMETRY, 0.3, np.random.default_rng(6)).kinematics
+    knots = np.random.default_rng(6).normal(0, np.deg2rad(0.3), 6)
+    end_s = protocol.frame_start_s()[-1] + protocol.shutter().span_s
+    wander = encoder.angle_rad_table - np.deg2rad(7.0) - np.deg2rad(10.0) * encoder.time_s
+    expected = np.interp(encoder.time_s, np.linspace(0, end_s, 6), knots)
+    np.testing.assert_allclose(wander, expected, rtol=0, atol=1e-12)
+    assert (encoder.time_s[0], encoder.time_s[-1]) == (0.0, end_s)
+
+
+def test_protocols_hold_the_ends_of_their_ranges() -> None:
+    ranges = {
+        "views": (1, 100_000),
+        "start_deg": (-1e6, 1e6),
+        "exposure_deg": (0, 3600),
+        "readout_ratio": (0, 1000),
+    }
+    for name, (lowest, highest) in ranges.items():
+        for inside in (lowest, highest):
+            assert getattr(Protocol(**{name: inside}), name) == inside
+        for outside in (lowest - 0.1, highest + 0.1, np.nan, np.inf):
+            with pytest.raises(InputError):
+                Protocol(**{name: outside})
+
+
+@pytest.mark.parametrize(
+    "pulse", [(-0.5, 0.5), (1.86, 0.1), (0.0, 0.0), (0.2, 0.0), (0.2, -0.1), (np.nan, 1.0), (0.0, np.inf)]
+)
+def test_pulses_without_light_are_refused(pulse) -> None:
+    with pytest.raises(InputError, match="pulse"):
+        Protocol(readout_ratio=0.86, pulse=pulse)
+    with pytest.raises(InputError, match="pulse"):
+        Shutter(1.0, 0.86, pulse_s=pulse)
+
+
 def test_options_replace_and_nonsense_is_refused() -> None:
     assert make_protocol("rapid", views=30, exposure_deg=None) == Protocol(views=30)
     with pytest.raises(InputError, match="rapid, standard, static"):

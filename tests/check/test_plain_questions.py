@@ -169,9 +169,30 @@ def test_air_without_noise_is_not_dead(clean) -> None:
 @pytest.mark.parametrize("factor", [0.0, -1.0])
 def test_frames_without_an_object_or_of_another_sign(clean, factor) -> None:
     finding = check_coverage(replace(clean, projections=factor * clean.projections))
-    assert finding.verdict == SUSPICIOUS and "no object" in finding.text and "line integrals" in finding.advice
+    assert (
+        finding.verdict == SUSPICIOUS and "no object" in finding.text and "line integrals" in finding.advice
+    )
 
 
 def test_a_share_is_never_written_as_a_power_of_ten(clean) -> None:
     finding = check_saturation(replace(clean, projections=np.ones_like(clean.projections)))
     assert finding.verdict == SUSPICIOUS and finding.text.startswith("100 % of the pixels")
+
+
+def test_counts_that_are_taken_for_line_integrals(clean) -> None:
+    counts = (1000 * np.exp(-clean.projections)).astype(np.float32)
+    finding = check_coverage(replace(clean, projections=counts))
+    assert finding.verdict == SUSPICIOUS and "--quantity" in finding.advice
+
+
+def test_a_small_part_on_the_axis_is_not_a_dead_pixel(clean) -> None:
+    """It stays in its place on the panel, as a dead pixel does, but is as wide as the panel resolves."""
+    row, column = np.indices(clean.geometry.detector_shape)
+    verdicts = []
+    for u in (15, 8):  # the axis is at 15.5
+        part = 0.5 * np.exp(-((row - 20) ** 2 + (column - u) ** 2) / (2 * 0.6**2))
+        verdicts.append(check_dead_pixels(replace(clean, projections=clean.projections + part))[0].verdict)
+    assert verdicts == [OK, SUSPICIOUS]
+    p = clean.projections.copy()
+    p[:, [20, 21], 15] = 0.0  # two of them, side by side
+    assert check_dead_pixels(replace(clean, projections=p))[1].sum() == 2

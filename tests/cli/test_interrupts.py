@@ -274,9 +274,11 @@ def test_unfinished_folders_go_as_files_do(tmp_path):
 
 
 def test_signals_are_answered_before_anything_heavy_loads():
-    program = "import sys, phyradgs_cl.__main__; print(*sys.modules)"
+    program = "import sys; before = set(sys.modules); import phyradgs_cl.__main__; print(*set(sys.modules) - before)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert not {"numpy", "typer", "importlib.metadata", "pyopencl", "signal"} & set(done.stdout.split())
+    loaded = set(done.stdout.split())
+    assert "phyradgs_cl.__main__" in loaded
+    assert not {"numpy", "typer", "importlib.metadata", "pyopencl", "signal"} & loaded
 
 
 def run_process(arguments, body):

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 STRESS = int(os.environ.get("STRESS", "1"))
 SECONDS_OF_STRESS = 36.0
-FEW = 12
+FEW, BATCH = 12, 10
 SECONDS, MEGABYTES = 10.0, 1000.0
 KEPT = Path(__file__).with_name("kept")
 CHANGE = st.tuples(
@@ -130,7 +130,7 @@ def test_changed_bytes(good, worker, name, record_property) -> None:
     examples = FEW // 4 if name in SLOW else FEW
     try:
         while True:
-            _fuzz(worker, good, name, content, examples if STRESS == 1 else 200)
+            _fuzz(worker, good, name, content, examples if STRESS == 1 else BATCH)
             if time.monotonic() >= until_s:
                 break
     finally:

@@ -9,6 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.commands.export_volume import EXAMPLE, export_command
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import EXPORTS
@@ -38,6 +39,13 @@ def test_wrong_input_is_our_error(run, tmp_path) -> None:
     done = run(tmp_path / "none.h5", "--to", "nii")
     assert isinstance(done.exception, InputError)
     assert run(tmp_path / "none.h5", "--to", "obj").exit_code == 2
+
+
+def test_a_scan_is_no_volume(run, rt, tmp_path) -> None:
+    scan = tmp_path / "scan.h5"
+    save_scan(scan, simulate("foot", size=8, detector=8, views=3, noise="none", device=rt))
+    with pytest.raises(InputError, match="found a scan.*expected a volume"):
+        raise run(scan, "--to", "nii").exception
 
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "export.md"

@@ -11,8 +11,8 @@ import pytest
 from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.runtime import context
 
-# STRESS is what `make stress` sets: there every launch of a run fails once
-MOST = 2 if int(os.environ.get("STRESS", "1")) == 1 else 100_000
+# STRESS=50 is what `make stress` sets: there a hundred launches all over a run fail once each, or all where it has fewer
+MOST = 2 * int(os.environ.get("STRESS", "1"))
 RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
     "cgls": ["--method", "cgls", "--iterations", "5", "--set", "noise_stop=0"],

@@ -117,3 +117,10 @@ def test_a_scan_beside_the_input_is_made_anew(run, tmp_path, make_truth) -> None
     for _ in range(2):
         done = run(source, "-o", out)
         assert done.exit_code == 0, done.exception
+
+
+@pytest.mark.parametrize("name", ["", "a.tif"])
+def test_images_without_a_description_are_told_what_they_lack(run, tmp_path, name) -> None:
+    (tmp_path / "a.tif").write_bytes(b"II*")
+    done = run(tmp_path / name, "-o", tmp_path / "scan.h5")
+    assert isinstance(done.exception, InputError) and "no TOML" in str(done.exception)

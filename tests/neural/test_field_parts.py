@@ -11,7 +11,7 @@ from phyradgs_cl.errors import DeviceError, InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions
 from phyradgs_cl.neural.fields import first_field
-from phyradgs_cl.neural.hash_encoding import HashEncoding, corners
+from phyradgs_cl.neural.hash_encoding import HashEncoding, corners, weighted_rows
 from phyradgs_cl.neural.line_attention import LineAttention
 from phyradgs_cl.neural.neural_field import voxel_values
 from phyradgs_cl.neural.pixel_choice import chosen_times, scattered_pixels, windows_and_scattered_pixels
@@ -60,6 +60,14 @@ def test_the_encoding_is_its_definition_and_so_is_its_gradient() -> None:
         assert float((encoding(torch.tensor(positions)) * weights).sum()) == pytest.approx(
             by_gradient, rel=1e-9
         )
+
+
+def test_devices_without_the_fused_sum_add_up_the_same() -> None:
+    made = torch.Generator().manual_seed(0)
+    table, weight = torch.rand(50, 3, generator=made), torch.rand(20, 8, generator=made)
+    index = torch.randint(0, 50, (20, 8), generator=made)
+    fused = torch.nn.functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
+    assert torch.allclose(weighted_rows(table, index, weight), fused, rtol=FLOAT32)
 
 
 def test_corner_weights_sum_to_one_and_entries_are_in_the_table() -> None:
@@ -196,5 +204,5 @@ def test_options_that_do_not_go_together_are_refused() -> None:
     assert NeuralOptions().samples_for(64) == 96
     assert [NeuralOptions().levels_for(n) for n in (4, 64, 100, 128)] == [1, 4, 5, 5]
     assert NeuralOptions(levels=3).levels_for(64) == 3 and NeuralOptions(level_growth=1.0).levels_for(64) == 1
-    assert NeuralOptions().samples_for(128) == 192 and NeuralOptions().samples_for(128, 5) == 128
+    assert NeuralOptions().samples_for(128) == 192 and NeuralOptions().samples_for(128, 5) == 154
     assert LineOptions(segment=5).samples_for(64) == 100

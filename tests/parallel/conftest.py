@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ class Threads:
         return any(self._all(flag, 4))
 
     def tell(self, value: Any) -> Any:
-        return self._all(value)[0]
+        return deepcopy(self._all(value)[0])  # as what comes by MPI
 
     def join(self, values: np.ndarray) -> np.ndarray:
         return np.concatenate(self._all(values, values.nbytes))

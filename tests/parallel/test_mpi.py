@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -26,7 +28,7 @@ MPIEXEC = str(BESIDE) if BESIDE.exists() else str(shutil.which("mpiexec"))
 WORK = Path(__file__).with_name("mpi_work.py")
 PHYRADGS = [sys.executable, "-m", "phyradgs_cl"]
 # ranks of a test share the processors of one machine
-QUIET = {**os.environ, "POCL_CPU_MAX_CU_COUNT": "1", "POCL_MAX_PTHREAD_COUNT": "1"}
+QUIET = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
 
 
 @pytest.fixture(scope="module")
@@ -225,3 +227,29 @@ def test_other_commands_are_done_once(scan_file) -> None:
     alone = run([*PHYRADGS, "info", str(scan_file)])
     several = run([MPIEXEC, "-n", "2", *PHYRADGS, "info", str(scan_file)])
     assert several.returncode == 0 and several.stdout == alone.stdout
+
+
+def test_the_program_of_the_docs_works_with_mpiexec_and_without(scan_file, tmp_path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text(encoding="utf-8")
+    program = next(b for b in re.findall(r"```python\n(.*?)```", text, re.S) if "launched_ranks" in b)
+    (tmp_path / "run.py").write_text(program)
+    shutil.copy(scan_file, tmp_path / "scan.h5")
+    for launcher, ranks in (([MPIEXEC, "-n", "2"], 2), ([], 1)):
+        words = [*launcher, sys.executable, "-m", "mpi4py", "run.py"]
+        done = subprocess.run(words, env=QUIET, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        assert read_volume(tmp_path / "volume.h5").provenance["ranks"] == ranks
+
+
+def test_the_benchmark_runs(tmp_path) -> None:
+    script, out = Path(__file__).parents[2] / "benchmarks" / "mpi_scaling.py", tmp_path / "facts.json"
+    done = run([sys.executable, str(script), "--quick", "--ranks", "1,2", "--json", str(out)])
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(out.read_text())
+    assert (
+        [one["ranks"] for one in facts["strong"]]
+        == [len(one["by_rank"]) for one in facts["strong"]]
+        == [1, 2]
+    )
+    assert all(rank["kernels_ms"] > 0 for one in facts["weak"] for rank in one["by_rank"])
+    assert 0 < facts["exchange_share_of_two"] < 1 and "64" in facts["predicted"]["400 Gbit/s"]

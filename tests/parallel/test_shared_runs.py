@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tolerances import DOMAIN_GRADIENT, RANK_GRADIENT, RANK_VOLUME
+from tolerances import DOMAIN_GRADIENT, DOMAIN_VOLUME, RANK_GRADIENT, RANK_VOLUME
 
 from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
 from phyradgs_cl.errors import InputError, PhyradgsError
@@ -153,6 +153,27 @@ def test_a_domain_too_large_for_one_device(ranks_of, scan) -> None:
     assert max(peak for _, peak in found) <= MEMORY_BYTES
     np.testing.assert_array_equal(found[0][0], expected.volume)
     assert [volume.shape[0] for volume, _ in found] == [16, 0, 0, 0]
+
+
+# Round Gaussians do not change when they turn: the gradient of their rotation is rounding alone, which Adam makes steps of.
+STILL = replace(SplatOptions().rates, rotation=(1e-9, 1e-9))
+
+
+def test_a_domain_too_large_for_one_device_is_the_undivided_one(ranks_of, scan) -> None:
+    """Every slice, those at the borders of the parts among them; density control takes part."""
+    options = replace(LARGE, rates=STILL)
+    undivided = replace(options, split="frames", batch=1, parts=1)
+    with pytest.raises(PhyradgsError, match="memory"):
+        reconstruct(scan, "phyradgs", Runtime(memory=MEMORY_BYTES), undivided, seed=1)
+    alone = Runtime()
+    expected = reconstruct(scan, "phyradgs", alone, undivided, seed=1)
+    assert alone.peak_bytes > 2 * MEMORY_BYTES
+
+    def work(ranks) -> np.ndarray:
+        return reconstruct(scan, "phyradgs", Runtime(memory=MEMORY_BYTES, ranks=ranks), options, seed=1).volume
+
+    error = np.abs(ranks_of(4, work)[0] - expected.volume).max(axis=(1, 2))
+    assert error.shape == (16,) and error.max() <= DOMAIN_VOLUME * expected.volume.max()
 
 
 @pytest.mark.parametrize("split", ["frames", "domain"])

@@ -105,7 +105,9 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
 def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
     target = tmp_path / "short.h5"
     changes = {"iterations": 12, "gaussians": 50, "tv_weight": 0.0}
-    run_reconstruction(ReconstructionJob(files[0], target, changes=changes), lambda: rt, lambda progress: None)
+    run_reconstruction(
+        ReconstructionJob(files[0], target, changes=changes), lambda: rt, lambda progress: None
+    )
     record = load_run(target).record
     assert [line["iteration"] for line in record] == list(range(1, 13))
     page = parse(report_page(load_run(target)))

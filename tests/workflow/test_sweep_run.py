@@ -193,6 +193,14 @@ def test_the_command_needs_no_dask_for_one_run_after_the_other(job, no_dask, cap
     assert "one device" in capsys.readouterr().err
 
 
+def test_what_is_wrong_with_a_grid_is_one_line_without_dask_too(job, no_dask, capsys) -> None:
+    grid = job.folder.parent / "grid.toml"
+    grid.write_text(TEXT.replace("iterations", "iteration"))
+    for name in (grid, grid.with_name("none.toml")):
+        assert load_cli().run(["sweep", str(name), "-o", str(job.folder)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_bench_says_what_to_install(tmp_path, no_dask, capsys) -> None:
     options = ["--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out"), "--scheduler", "local"]
     assert load_cli().run(["bench", "quick", *options]) == 2

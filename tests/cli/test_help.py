@@ -1,0 +1,60 @@
+"""The help as a manual page: every command in the list with its whole sentence, and the Tab key."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from phyradgs_cl.__main__ import load_cli
+
+PROGRAM = "import sys; sys.argv[0] = 'phyradgs'; from phyradgs_cl.__main__ import main; sys.exit(main())"
+
+
+@pytest.fixture(scope="module")
+def commands() -> dict:
+    return typer.main.get_command(load_cli().app).commands
+
+
+def test_the_list_of_commands_cuts_no_sentence(capsys, commands, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert load_cli().run(["--help"]) == 0
+    lines = capsys.readouterr().out.split("Commands:\n")[1].splitlines()
+    assert [line.split()[0] for line in lines] == list(commands)
+    assert all(line.endswith(".") and "..." not in line for line in lines)
+
+
+def test_every_command_has_an_example_and_names_its_arguments_as_the_documentation_does(
+    capsys, commands
+) -> None:
+    for name, command in commands.items():
+        assert load_cli().run([name, "--help"]) == 0
+        told = capsys.readouterr().out
+        assert f"Example: phyradgs {name}" in told
+        for parameter in command.params:
+            if parameter.param_type_name == "argument" and name != "bench":  # which has a choice of words
+                assert parameter.metavar.isupper()
+            assert getattr(parameter, "help", None), f"{name}: {parameter.name} says nothing"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("phyradgs re", {"reconstruct", "report"}),
+        ("phyradgs export v.h5 --to n", {"nii", "nrrd", "npy", "npz"}),
+        ("phyradgs check --fi", {"--fix-offset"}),
+    ],
+)
+def test_the_tab_key_in_bash(words, expected) -> None:
+    asked = {"_PHYRADGS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env={**os.environ, **asked},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert set(done.stdout.split()) == expected, done.stderr

@@ -1,0 +1,96 @@
+"""Checkpoint archives: read as they were written, or refused with what to do."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import read_checkpoint, write_checkpoint
+
+ARRAYS = {"volume": np.arange(24.0, dtype=np.float32).reshape(2, 3, 4), "note": np.array("text")}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    write_checkpoint(tmp_path / "c.npz", ARRAYS, "print")
+    return tmp_path / "c.npz"
+
+
+def members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def rewrite(path: Path, changes: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> None:
+    content = members(path) | changes
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+
+
+def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, array, version)
+    return stream.getvalue()
+
+
+def refused(path: Path, words: str) -> None:
+    with pytest.raises(InputError, match=words) as error:
+        read_checkpoint(path, "print")
+    assert "without --resume" in str(error.value)
+
+
+def test_what_was_written_is_read(path) -> None:
+    found = read_checkpoint(path, "print")
+    assert sorted(found) == sorted(ARRAYS)
+    for name, values in ARRAYS.items():
+        np.testing.assert_array_equal(found[name], values)
+
+
+def test_columns_first_keep_their_order(path) -> None:
+    rewrite(path, {"volume.npy": npy(np.asfortranarray(ARRAYS["volume"]))})
+    np.testing.assert_array_equal(read_checkpoint(path, "print")["volume"], ARRAYS["volume"])
+
+
+def test_none_another_runs_or_another_formats(path) -> None:
+    refused(path.with_name("none.npz"), "no checkpoint")
+    with pytest.raises(InputError, match="another scan or other options"):
+        read_checkpoint(path, "other")
+    rewrite(path, {"format.npy": npy(np.array(2))})
+    refused(path, "another checkpoint format")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"volume.npy": npy(ARRAYS["volume"], (2, 0))},
+        {"volume.npy": npy(np.zeros(3, complex))},
+        {"volume.npy": npy(ARRAYS["volume"]).replace(b"(2, 3, 4)", b"(9, 9, 9)")},
+        {"volume.npy": npy(ARRAYS["volume"])[:-8]},
+        {"volume.npy": b"no array"},
+        {"volume.txt": b"hello"},
+        {f"{number}.npy": npy(np.array(1)) for number in range(70)},
+    ],
+    ids=["a later version", "complex", "too large", "cut off", "no array", "a text", "too many"],
+)
+def test_archives_that_no_run_writes(path, changes) -> None:
+    rewrite(path, changes)
+    refused(path, "a damaged checkpoint")
+
+
+def test_nothing_is_unfolded(path) -> None:
+    rewrite(path, {"volume.npy": npy(np.zeros(1 << 16))}, zipfile.ZIP_DEFLATED)
+    refused(path, "a damaged checkpoint")
+
+
+def test_one_that_cannot_be_opened_says_why(path, monkeypatch) -> None:
+    def closed(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(zipfile, "ZipFile", closed)
+    refused(path, r"a damaged checkpoint \(Permission denied\)")
