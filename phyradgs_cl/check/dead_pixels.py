@@ -63,8 +63,15 @@ def _constant(frames: np.ndarray) -> np.ndarray:
     sides = np.zeros_like(constant)
     sides[:, [0, -1]] = constant[:, [0, -1]]
     if sides[:, [0, -1]].mean() > _STILL_SIDES:
-        constant = constant & ~binary_propagation(sides, _AROUND, mask=constant)
+        constant = constant & ~binary_propagation(sides, _AROUND, mask=constant & _as_air(frames[0], sides))
     return constant & (median_filter(swing, size=3) > 0)
+
+
+def _as_air(frame: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Pixels (v, u) of a frame whose value is one of those at the sides, give or take what flats leave of a pattern."""
+    air = float(np.median(frame[sides]))
+    pattern = _NORMAL_MAD * float(np.median(np.abs(frame[sides] - air)))
+    return np.abs(frame - air) <= _DEVIATIONS * pattern
 
 
 def _apart(frames: np.ndarray) -> np.ndarray:

@@ -32,10 +32,12 @@ from phyradgs_cl.commands.options import (
     file_argument,
     given_options,
 )
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
 from phyradgs_cl.rank_plan import plan_ranks
 from phyradgs_cl.reconstructors import Reconstruction, method_options
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.memory import memory_limit
 from phyradgs_cl.settings import run_settings
 from phyradgs_cl.workflow import load_scan
 
@@ -98,7 +100,11 @@ def estimate_command(
     loaded.check_timing()
     if ranks is not None:
         checks.within("--ranks", ranks, 1, MOST_RANKS)
-        say(plan_ranks(loaded, settings.method, options, ranks).text())
+        if device is not None:
+            raise InputError(
+                "--device", repr(device), "none with --ranks", "leave it out: a plan needs no device"
+            )
+        say(plan_ranks(loaded, settings.method, options, ranks).text(memory_limit(settings.memory)))
         return
     with settings.naming_origins():
         rt = Runtime(settings.device, memory=settings.memory)

@@ -159,7 +159,7 @@ Seed = Annotated[
 Preset = Annotated[
     str | None,
     typer.Option(
-        help="Constants: default, paper or released (phyradgs); published (r2); the window of fdk.",
+        help="Constants: default, quick, paper or released (phyradgs); published (r2); the window of fdk.",
         show_default="the method's first",
     ),
 ]

@@ -53,9 +53,14 @@ def look(thing):
                 look(thing[name])
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError):
         pass  # damage that HDF5 survives: met again, and named, by the reading itself
+def held_bytes():
+    if not resource:
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 if resource:
     limit(resource.RLIMIT_CORE, 0)
     limit(resource.RLIMIT_AS, memory)
+start = held_bytes()
 print("ready", flush=True)
 for line in sys.stdin:
     if resource:
@@ -66,7 +71,7 @@ for line in sys.stdin:
             look(file)
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError):
         pass
-    print("done", flush=True)
+    print("large" if held_bytes() - start > memory >> 5 else "done", flush=True)
 """
 _SIGXCPU = 24
 _log = logging.getLogger(__name__)
@@ -117,6 +122,8 @@ class _Scout:
         if answer == "done":
             return ""
         self.leave()
+        if answer == "large":
+            return f"a file whose headers ask HDF5 for more than {_MOST_MEMORY_BYTES >> 25} MiB"
         if timed_out.is_set() or process.returncode == -_SIGXCPU:
             return "a file that HDF5 does not finish reading"
         return "a file so damaged that the HDF5 library crashes on it"

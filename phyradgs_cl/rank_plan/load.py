@@ -31,8 +31,8 @@ class RankPlan:
     facts: tuple[str, ...]
     loads: dict[str, Load]
 
-    def text(self) -> str:
-        """The shares, then a table of bytes."""
+    def text(self, limit_bytes: int | None = None) -> str:
+        """The shares, then tables of bytes; whether they are within ``limit_bytes`` of a device."""
         lines = [f"{self.method} over {self.ranks} ranks", *(f"  {fact}" for fact in self.facts)]
         for title, rows_of in (
             ("device memory a rank", lambda load: load.device),
@@ -40,6 +40,13 @@ class RankPlan:
         ):
             lines += [f"{title:<44}" + "".join(f"{heading:>22}" for heading in self.loads)]
             lines += _table([rows_of(load) for load in self.loads.values()])
+        if limit_bytes is not None:
+            found = [
+                "fits" if load.device_bytes <= limit_bytes else "too much" for load in self.loads.values()
+            ]
+            lines.append(
+                f"{f'in {size_text(limit_bytes)} of a device':<44}" + "".join(f"{word:>22}" for word in found)
+            )
         return "\n".join(lines)
 
 

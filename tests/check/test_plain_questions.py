@@ -161,9 +161,9 @@ def test_air_without_noise_is_not_dead(clean) -> None:
     p = np.where(moving, noise, 0).astype(np.float32)
     finding, dead = check_dead_pixels(replace(clean, projections=p))
     assert finding.verdict == OK and not dead.any()
-    p[:, 8, 9] = 0.0
+    p[:, 8, 9], p[:, 5, 28] = 0.0, 0.7  # one behind the object, one that is stuck beside it
     finding, dead = check_dead_pixels(replace(clean, projections=p))
-    assert finding.verdict == SUSPICIOUS and list(zip(*np.nonzero(dead), strict=True)) == [(8, 9)]
+    assert finding.verdict == SUSPICIOUS and list(zip(*np.nonzero(dead), strict=True)) == [(5, 28), (8, 9)]
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0])

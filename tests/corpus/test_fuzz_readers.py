@@ -2,7 +2,7 @@
 
 Hypothesis draws the changes and, where one is wrong, shrinks it; its bytes are to be kept in ``kept/``, which is read
 first. `make stress` goes on for STRESS × 36 s, half an hour at STRESS=50. How many files each reader was given stands in
-pytest's XML report (--junit-xml), as property ``files``.
+pytest's XML report (--junit-xml).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def test_what_once_went_wrong(good, worker, path) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_changed_bytes(good, worker, name, record_property) -> None:
+def test_changed_bytes(good, worker, name, record_testsuite_property) -> None:
     content, before = _content(good, name), worker.asked
     goes_on_s = STRESS * SECONDS_OF_STRESS / len(READERS) if STRESS > 1 else 0.0
     until_s = time.monotonic() + goes_on_s
@@ -134,7 +134,7 @@ def test_changed_bytes(good, worker, name, record_property) -> None:
             if time.monotonic() >= until_s:
                 break
     finally:
-        record_property("files", worker.asked - before)
+        record_testsuite_property(f"files for {name}", worker.asked - before)
 
 
 def _fuzz(worker: Runner, good: Path, name: str, content: bytes, examples: int) -> None:

@@ -131,6 +131,9 @@ def test_more_ranks_than_parts_are_refused_before_anyone_starts_them(scan) -> No
         (["--ranks", "2", "--method", "fista-tv"], 0, "slab of the total variation"),
         (["--ranks", "2", "--method", "fdk"], 2, "leave --ranks out"),
         (["--ranks", "0"], 2, "--ranks: found 0"),
+        (["--ranks", "2", "--device", "cpu"], 2, "a plan needs no device"),
+        (["--ranks", "2", "--memory", "1GiB"], 0, "fits"),
+        (["--ranks", "2", "--memory", "10M"], 0, "too much"),
     ],
 )
 def test_the_command_prints_the_plan_without_a_trial(
