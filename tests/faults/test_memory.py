@@ -114,5 +114,5 @@ def test_a_loss_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypat
     monkeypatch.setattr(ImageLoss, "value", lambda self: value(self) * np.float32("nan"))
     words = ["--iterations", "60", "--gaussians", "20"]
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
-    assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: loss: found nan at iteration 50")
+    assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: loss: found nan at iteration 3;")
     assert os.listdir(tmp_path) == []
