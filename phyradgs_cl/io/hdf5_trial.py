@@ -65,8 +65,11 @@ def held_bytes():
 if resource:
     limit(resource.RLIMIT_CORE, 0)
     limit(resource.RLIMIT_AS, memory)
+def answer(word):
+    sys.stdout.write(word + "\\n")
+    sys.stdout.flush()
 start = held_bytes()
-print("ready", flush=True)
+answer("ready")
 for line in sys.stdin:
     if resource:
         limit(resource.RLIMIT_CPU, int(time.process_time()) + 1 + seconds)
@@ -76,7 +79,7 @@ for line in sys.stdin:
             look(file)
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError):
         pass
-    print("large" if held_bytes() - start > memory >> 5 else "done", flush=True)
+    answer("large" if held_bytes() - start > memory >> 5 else "done")
 """
 _SIGXCPU = 24
 _log = logging.getLogger(__name__)
