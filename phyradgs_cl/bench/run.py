@@ -186,19 +186,20 @@ def reference_lines(
 def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
     """Makes a run and keeps its slices; the line has its error where numbers overflowed."""
     scan = case.scan(run.acquisition)
-    started = time.perf_counter()
+    started, used = time.perf_counter(), time.process_time()
     try:
         result = reconstruct(scan, str(run.row.method), rt, run.options, seed=run.seed, report=progress)
     except NumericalError as error:  # one method that overflows must not cost a night's other runs
         log.warning("%s: %s", run.title, error)
         return {**run.facts, "error": str(error), **environment(rt)}
-    seconds = time.perf_counter() - started
+    seconds, processor_s = time.perf_counter() - started, time.process_time() - used
     refuse_interrupted(result)
     write_slices(job.output, run.facts, case.slices(result.volume))
     return {
         **run.facts,
         "metrics": {name: _number(value) for name, value in case.measure(result.volume).items()},
         "seconds": round(seconds, 3),
+        "processor_s": round(processor_s, 3),  # of all threads: comparable beside other work, unlike seconds
         "gaussians": result.facts.get("gaussians"),
         **environment(rt),
     }
