@@ -6,21 +6,6 @@
      backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes one voxel */
 #include "common/lanes.h"
 
-/* Element by element into a register: through an array in memory the wide load waits for all narrow stores. */
-#if LANES == 1
-#define GATHER(p, i) ((p)[i])
-#elif LANES == 4
-#define GATHER(p, i) ((vf)((p)[(i).s0], (p)[(i).s1], (p)[(i).s2], (p)[(i).s3]))
-#else
-#define GATHER_4(p, i, a, b, c, d) (p)[(i).a], (p)[(i).b], (p)[(i).c], (p)[(i).d]
-#if LANES == 8
-#define GATHER(p, i) ((vf)(GATHER_4(p, i, s0, s1, s2, s3), GATHER_4(p, i, s4, s5, s6, s7)))
-#else
-#define GATHER(p, i) ((vf)(GATHER_4(p, i, s0, s1, s2, s3), GATHER_4(p, i, s4, s5, s6, s7), \
-                           GATHER_4(p, i, s8, s9, sa, sb), GATHER_4(p, i, sc, sd, se, sf)))
-#endif
-#endif
-
 __kernel void backproject(
     __global const float *projections, /* views of (guard, (rows, pitch)) */
     __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */

@@ -56,8 +56,8 @@ __kernel void rays_forward(
                     LANE(float, v01, lane) = corner[sc];
                     LANE(float, v11, lane) = corner[sb + sc];
                 }
-                const vf near = v00 + wb * (v10 - v00), far = v01 + wb * (v11 - v01);
-                p += V_PICK(0.0f, near + wc * (far - near), (w.first <= i) & (w.last >= i));
+                const vf near = fma(wb, v10 - v00, v00), far = fma(wb, v11 - v01, v01);
+                p += V_PICK(0.0f, fma(wc, far - near, near), (w.first <= i) & (w.last >= i));
             }
         }
         p *= r.step_mm;

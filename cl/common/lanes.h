@@ -49,3 +49,18 @@ static inline float v_sum(vf v)
 }
 #endif
 #endif
+
+/* Element by element into a register: through an array in memory the wide load waits for all narrow stores. */
+#if LANES == 1
+#define GATHER(p, i) ((p)[i])
+#elif LANES == 4
+#define GATHER(p, i) ((vf)((p)[(i).s0], (p)[(i).s1], (p)[(i).s2], (p)[(i).s3]))
+#else
+#define GATHER_4(p, i, a, b, c, d) (p)[(i).a], (p)[(i).b], (p)[(i).c], (p)[(i).d]
+#if LANES == 8
+#define GATHER(p, i) ((vf)(GATHER_4(p, i, s0, s1, s2, s3), GATHER_4(p, i, s4, s5, s6, s7)))
+#else
+#define GATHER(p, i) ((vf)(GATHER_4(p, i, s0, s1, s2, s3), GATHER_4(p, i, s4, s5, s6, s7), \
+                           GATHER_4(p, i, s8, s9, sa, sb), GATHER_4(p, i, sc, sd, se, sf)))
+#endif
+#endif

@@ -8,6 +8,7 @@ import numpy as np
 
 from phyradgs_cl.operators.bricks import Brick, cut, whole
 from phyradgs_cl.operators.rays import RayLayout, owner_steps
+from phyradgs_cl.operators.rays_upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _FRAMES_SHARE = 0.25  # of the room, for frames beside a brick
@@ -16,12 +17,14 @@ _FRAMES_SHARE = 0.25  # of the room, for frames beside a brick
 class RayMemory:
     """Buffers for frames of ``layout`` and its volume, planned when they are first needed.
 
-    A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. Operators may
-    share one, in turns: each call writes what it reads.
+    A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. ``upright``: it
+    is wanted turned as well, where both fit. Operators may share one, in turns: each call writes what it reads.
     """
 
-    def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int) -> None:
+    def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, upright: bool = False) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
+        self._columns_bytes = 4 * columns_floats(layout.grid) if upright else 0
+        self._columns: DeviceArray | None = None
         self._bricks: list[Brick] = []
         self._batch = 0
         self._volume: DeviceArray | None = None
@@ -31,7 +34,7 @@ class RayMemory:
     def plan(self, share: float = 1.0) -> list[Brick]:
         """The bricks. A share below 1 plans anew, for so much of the room."""
         if not self._bricks or share < 1:
-            self._volume = self._frames = None
+            self._volume = self._frames = self._columns = None
             self._padded.clear()
             self._bricks, self._batch = self._planned(share)
         return self._bricks
@@ -47,7 +50,10 @@ class RayMemory:
         everything = whole(layout.grid.shape)
         volume_bytes = 4 * layout.of(everything).volume_floats
         if share == 1 and room.holds(volume_bytes, 4 * layout.frames_floats(1)):
-            return [everything], batch(room.free_bytes - volume_bytes)
+            if not room.holds(volume_bytes, 4 * layout.frames_floats(1), self._columns_bytes):
+                self._columns_bytes = 0
+            return [everything], batch(room.free_bytes - volume_bytes - self._columns_bytes)
+        self._columns_bytes = 0
         steps = owner_steps(self.rt)
         smallest = tuple(
             min(n, step) for n, step in zip(layout.grid.shape, (*steps, layout.grid.shape[2]), strict=True)
@@ -83,6 +89,15 @@ class RayMemory:
         layout.inside(padded)[...] = volume[brick.box]
         self.rt.write(on_device, padded)
         return layout, on_device
+
+    def turned(self, layout: RayLayout, volume: DeviceArray) -> DeviceArray | None:
+        """A whole volume with z along a row, where there is room for that."""
+        if not self._columns_bytes:
+            return None
+        if self._columns is None:
+            self._columns = self.rt.zeros(self._columns_bytes // 4)
+        turn_volume(self.rt, layout, volume, self._columns)
+        return self._columns
 
     def frames(self, count: int) -> DeviceArray:
         """Memory for ``count`` frames of one batch, whatever was in it."""

@@ -15,6 +15,7 @@ from phyradgs_cl.operators.cell_layers import averaged, layered
 from phyradgs_cl.operators.layout import pad_rows, unpad_rows
 from phyradgs_cl.operators.ray_memory import RayMemory
 from phyradgs_cl.operators.rays import RayCells, RayLayout, launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays_upright import launch_upright, upright_block
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
 
 
@@ -62,7 +63,9 @@ class RayOperator:
         self.volume_shape = grid.shape
         self._axis = tables[0].axis
         layout = RayLayout.of_scan(grid, detector_shape, self._axis)
-        self.memory = memory or RayMemory(rt, layout, len(tables))
+        # a GPU's work-items are pixels, whose loads the general kernel has side by side
+        self._upright = 0 if rt.pixel_items else upright_block(grid, tables, layout.width, rt.lanes)
+        self.memory = memory or RayMemory(rt, layout, len(tables), upright=self._upright > 0)
         self._tables = list(tables)
         self._cells = RayCells.upload(rt, grid, self._tables)
         self._choose(np.arange(len(tables)))
@@ -102,12 +105,20 @@ class RayOperator:
             for k, brick in enumerate(bricks):
                 if k + part.start == 0 or len(bricks) > 1:
                     layout, on_device = self.memory.write_volume(volume, brick)
+                    columns = self._turned(layout, on_device, average)
+                if columns is not None:
+                    launch_upright(self.rt, layout, self._cells, listed, columns, frames, self._upright)
+                    continue
                 launch_forward(
                     self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
                 )
             by_line = unpad_rows(self.rt.download(frames), layout.frames_shape(listed.size))
             result[part] = self._lines_first(by_line)
         return result
+
+    def _turned(self, layout: RayLayout, volume: DeviceArray, average: str) -> DeviceArray | None:
+        """The volume for the kernel of upright rays; None where that does not apply."""
+        return self.memory.turned(layout, volume) if self._upright and average == "log" else None
 
     def _project_layers(self, volume: np.ndarray, average: str) -> np.ndarray:
         """Averages that need a whole ray at a time, where no brick has one: every layer of cells by itself."""

@@ -8,12 +8,14 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.operators.rays import RayLayout
+from phyradgs_cl.operators.rays_upright import columns_floats, upright_block
 from phyradgs_cl.parallel import span
 from phyradgs_cl.rank_plan.load import Load, RankPlan, size_text
 from phyradgs_cl.reconstructors.shared_tv import tv_device_bytes
 
 _CELL_BYTES, _LINE_BYTES = 120, 8  # of the tables of rays
 _FLAG_BYTES = 4
+_CPU_LANES = 16
 
 
 def voxel_plan(scan: Scan, method: str, options: Any, ranks: int) -> RankPlan:
@@ -22,9 +24,12 @@ def voxel_plan(scan: Scan, method: str, options: Any, ranks: int) -> RankPlan:
     layout = RayLayout.of_scan(scan.grid, scan.geometry.detector_shape, scan.shutter.axis)
     own = -(-frames // ranks)
     volume_bytes, frame_bytes = 4 * int(np.prod(shape)), scan.projections[0].nbytes
-    cells = sum(options.motion.cells(scan, frame).count for frame in range(frames))
+    tables = [options.motion.cells(scan, frame) for frame in range(frames)]
+    cells = sum(table.count for table in tables)
+    turned = upright_block(scan.grid, tables, layout.width, _CPU_LANES) > 0
     device = {
         "volume, or a brick of it": 4 * layout.volume_floats,
+        "volume with z along a row, on CPUs": 4 * columns_floats(scan.grid) if turned else 0,
         "frames, or as many as fit": 4 * layout.frames_floats(frames),
         "tables of time cells": _CELL_BYTES * cells + _LINE_BYTES * layout.lines * frames,
         "slab of the total variation": tv_device_bytes(
