@@ -25,6 +25,22 @@ static inline void add_by_centre(v3 *by_mean, __global const coefficient *m, con
     by_mean->z += cu * COEFFICIENT(m[2]) + cv * COEFFICIENT(m[6]) + cz * COEFFICIENT(m[10]);
 }
 
+static inline v3 turning(v3 a, v3 b) { return v3_make(a.y * b.z, a.z * b.x, a.x * b.y); }
+
+static inline vf torque_about(const vf forth, const vf back, const vf s2, const vf s3, const vf inv2, const vf inv3)
+{
+    return 0.5f * (forth * (s2 * inv3) + back * (s3 * inv2)) * out_of_round(s2, s3, inv2, inv3);
+}
+
+/* The torque is forth - back, the gradients by all vectors crossed with them. Line integrals depend on vectors over scales
+   alone, in which any turn leaves them as they are: forth s2 / s3 = back s3 / s2. What is left has no rounding of a difference. */
+static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 inv)
+{
+    return v3_make(torque_about(forth.x, back.x, s.y, s.z, inv.y, inv.z),
+                   torque_about(forth.y, back.y, s.z, s.x, inv.z, inv.x),
+                   torque_about(forth.z, back.z, s.x, s.y, inv.x, inv.y));
+}
+
 __kernel void splat_chain(
     __global const float *gaussians,      /* (11, stride) */
     __global const float *cells,          /* (C, CELL) */
@@ -49,7 +65,8 @@ __kernel void splat_chain(
     const vf det = scale.x * scale.y * scale.z;
 
     const vf zero = (vf)(0.0f);
-    v3 by_mean = v3_make(zero, zero, zero), by_scale = by_mean, torque = by_mean;
+    v3 by_mean = v3_make(zero, zero, zero), by_scale = by_mean;
+    v3 forth = by_mean, back = by_mean; /* sums of (gradient)_2 x_3 and (gradient)_3 x_2, cyclically: see torque_of */
     vf by_log_density = zero, by_u0 = zero, by_v0 = zero;
 
     for (int c = 0; c < cell_count; ++c) {
@@ -146,7 +163,6 @@ __kernel void splat_chain(
         v3 by_white = v3_make(zero, zero, zero);
 #if AFFINE
         const vf b1 = zero, b2 = zero;
-        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray)));
 #else
         /* b_i = z white.(e_i / scale) / kappa */
         const v3 wu = v3_mul(eu, inv_scale), wv = v3_mul(ev, inv_scale);
@@ -164,6 +180,11 @@ __kernel void splat_chain(
         by_white = v3_add(by_white, v3_scale(white, 2.0f * by_kappa));
         const v3 by_white_s = v3_mul(by_white, inv_scale);
         by_ray = v3_add(by_ray, by_white_s);
+        forth = v3_add(forth, v3_add(turning(by_ray, ray), v3_add(turning(by_eu, eu), turning(by_ev, ev))));
+        back = v3_add(back, v3_add(turning(ray, by_ray), v3_add(turning(eu, by_eu), turning(ev, by_ev))));
+#if AFFINE
+        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* a length, which no turn changes */
+#endif
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
 
 #if MOVING
@@ -173,7 +194,6 @@ __kernel void splat_chain(
         const vf g_u0 = -(2.0f * (seen11 * s_u + seen12 * s_v) + b1 * s_b);
         const vf g_v0 = -(2.0f * (seen12 * s_u + seen22 * s_v) + b2 * s_b);
 #endif
-        torque = v3_add(torque, v3_add(v3_cross(by_ray, ray), v3_add(v3_cross(by_eu, eu), v3_cross(by_ev, ev))));
         by_scale = v3_add(by_scale, by_s);
         by_log_density += w;
         by_u0 += g_u0;
@@ -198,7 +218,7 @@ __kernel void splat_chain(
 #endif
     }
     __global float *out = gradients + first;
-    gradient_store(out, stride, 0, by_mean, by_scale, torque, qw, qx, qy, qz, by_log_density / density);
+    gradient_store(out, stride, 0, by_mean, by_scale, torque_of(forth, back, scale, inv_scale), qw, qx, qy, qz, by_log_density / density);
     V_STORE(by_u0 * half_width, out + (size_t)ROW_STATISTIC * stride);
     V_STORE(by_v0 * half_lines, out + (size_t)(ROW_STATISTIC + 1) * stride);
 }

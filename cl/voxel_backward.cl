@@ -95,7 +95,9 @@ __kernel void voxel_chain(
     const v3 diagonal = v3_make(v3_dot(axes.a, na), v3_dot(axes.b, nb), v3_dot(axes.c, nc));
     const v3 by_mean = to_world(axes, v3_mul(n, inv2));
     const v3 by_scale = v3_mul(v3_mul(diagonal, inv2), inv);
-    const v3 torque = v3_make(-bc * (inv2.y - inv2.z), -ac * (inv2.z - inv2.x), -ab * (inv2.x - inv2.y));
+    const v3 torque = v3_make(-bc * (inv.y * inv.z) * out_of_round(scale.y, scale.z, inv.y, inv.z),
+                              -ac * (inv.z * inv.x) * out_of_round(scale.z, scale.x, inv.z, inv.x),
+                              -ab * (inv.x * inv.y) * out_of_round(scale.x, scale.y, inv.x, inv.y));
     gradient_store(gradients + first, stride, add, by_mean, by_scale, torque, qw, qx, qy, qz,
                    w / V_LOAD(g + 10 * stride));
 }

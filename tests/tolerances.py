@@ -129,5 +129,5 @@ RANK_GRADIENT = 1e-6
 DOMAIN_GRADIENT = 1e-5
 # Voxel methods on several ranks, which add up their own frames first; measured up to 7e-7 after 8 iterations.
 RANK_VOLUME = 1e-5
-# A volume of Gaussians by domain against the undivided run's, of its largest voxel, where nothing moves by rounding alone.
+# A volume of Gaussians by domain against the undivided run's, of its largest voxel.
 DOMAIN_VOLUME = 1e-4

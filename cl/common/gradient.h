@@ -4,6 +4,15 @@
 #include "common/gaussian.h"
 
 #define ROW_STATISTIC 11
+#define ROUND 4e-6f /* of the sum of two scales: a difference that rounding makes */
+
+/* s3 / s2 - s2 / s3, the share of the moment of both axes that turns a Gaussian about the third one. Two scales that differ
+   by rounding alone count as equal: the torque would be rounding too, of which Adam makes steps as long as any other. */
+static inline vf out_of_round(const vf s2, const vf s3, const vf inv2, const vf inv3)
+{
+    const vf more = s3 - s2, both = s3 + s2;
+    return V_PICK(0.0f, more * both * (inv2 * inv3), fabs(more) > ROUND * both);
+}
 
 static inline void gradient_store(__global float *out, const int stride, const int add, v3 mean, v3 scale,
                            v3 torque, vf w, vf x, vf y, vf z, vf density)

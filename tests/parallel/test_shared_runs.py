@@ -155,13 +155,9 @@ def test_a_domain_too_large_for_one_device(ranks_of, scan) -> None:
     assert [volume.shape[0] for volume, _ in found] == [16, 0, 0, 0]
 
 
-# Round Gaussians do not change when they turn: the gradient of their rotation is rounding alone, which Adam makes steps of.
-STILL = replace(SplatOptions().rates, rotation=(1e-9, 1e-9))
-
-
 def test_a_domain_too_large_for_one_device_is_the_undivided_one(ranks_of, scan) -> None:
     """Every slice, those at the borders of the parts among them; density control takes part."""
-    options = replace(LARGE, rates=STILL)
+    options = replace(LARGE, iterations=60, control=replace(CONTROL, max_gaussians=1000))
     undivided = replace(options, split="frames", batch=1, parts=1)
     with pytest.raises(PhyradgsError, match="memory"):
         reconstruct(scan, "phyradgs", Runtime(memory=MEMORY_BYTES), undivided, seed=1)
@@ -174,6 +170,16 @@ def test_a_domain_too_large_for_one_device_is_the_undivided_one(ranks_of, scan) 
 
     error = np.abs(ranks_of(4, work)[0] - expected.volume).max(axis=(1, 2))
     assert error.shape == (16,) and error.max() <= DOMAIN_VOLUME * expected.volume.max()
+
+
+@pytest.mark.parametrize("motion", [Motion("static"), Motion("micro-views", 4, 2), Motion("exact")])
+def test_round_gaussians_do_not_turn_by_rounding(scan, motion) -> None:
+    """Two runs that round in different ways stay together: Adam would make whole steps of the rounding."""
+    few = replace(CONTROL, max_gaussians=420)
+    divided = replace(OPTIONS, motion=motion, split="domain", parts=4, iterations=60, control=few)
+    whole = reconstruct(scan, "phyradgs", Runtime(), replace(divided, split="frames", batch=1, parts=1), seed=1)
+    found = reconstruct(scan, "phyradgs", Runtime(), divided, seed=1)
+    assert np.abs(found.volume - whole.volume).max() <= DOMAIN_VOLUME * whole.volume.max()
 
 
 @pytest.mark.parametrize("split", ["frames", "domain"])
