@@ -72,8 +72,17 @@ def _of_file(path: Path) -> list[str]:
     with open(path, "rb") as file:
         is_hdf5 = file.read(len(_HDF5)) == _HDF5
     if is_hdf5:
-        with opened(path) as source:
-            exchange = isinstance(source.find("/exchange"), h5py.Group)
-        return ["data-exchange" if exchange else "nxtomo"]
+        return [_of_hdf5(path)]
     kind = _BY_SUFFIX.get(path.suffix.lower())
     return [kind] if kind else []
+
+
+def _of_hdf5(path: Path) -> str:
+    with opened(path) as source:
+        if isinstance(source.find("/exchange"), h5py.Group):
+            return "data-exchange"
+        for member in ("/entry/reconstruction", "/volume"):
+            if source.find(member) is not None and source.find("/entry/instrument") is None:
+                remedy = "'phyradgs export' writes volumes in other formats, 'phyradgs simulate --volume' projects one"
+                raise InputError(f"{path}:{member}", "a volume", "projections with their geometry", remedy)
+    return "nxtomo"

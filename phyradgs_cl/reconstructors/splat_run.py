@@ -38,6 +38,7 @@ from phyradgs_cl.reconstructors.splat_start import box_of
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY, LEAST_RECORDED = 50, 20
+_SILENT_S = 10.0
 
 
 def record_interval(iterations: int) -> int:
@@ -77,7 +78,7 @@ class SplatRun:
         self.record: list[dict[str, float]] = []
         self.seconds_before = 0.0
         self.control_seconds, self.control_rounds = 0.0, 0
-        self._started = time.perf_counter()
+        self._started = self._reported = time.perf_counter()
         self._queue: list[int] = []
         self._load(population)
 
@@ -93,7 +94,7 @@ class SplatRun:
                 self.step()
                 if self._passes(record_interval(total), before):
                     self._keep_record()
-                if self._passes(REPORT_EVERY, before):
+                if self._passes(REPORT_EVERY, before) or self._was_silent_long():
                     self._report(report)
                 if self.rt.ranks.any(request.is_set) and self.iteration < total:
                     self.interrupted_at = self.iteration
@@ -101,6 +102,10 @@ class SplatRun:
     def _passes(self, every: int, before: int) -> bool:
         """Whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
         return self.iteration // every > before // every or self.iteration == self.options.iterations
+
+    def _was_silent_long(self) -> bool:
+        """Whether iterations are so slow that a user wonders; ranks would have to agree on a time, and report by number."""
+        return self.rt.ranks.size == 1 and time.perf_counter() - self._reported > _SILENT_S
 
     def _facts(self) -> dict[str, float]:
         seconds = time.perf_counter() - self._started
@@ -110,7 +115,7 @@ class SplatRun:
         self.record.append({"iteration": self.iteration, **self._facts()})
 
     def _report(self, report: ProgressReport) -> None:
-        facts = self._facts()
+        facts, self._reported = self._facts(), time.perf_counter()
         now = Progress(
             self.iteration, self.options.iterations, **facts, state=self.state, volume=self.present_volume
         )

@@ -6,6 +6,7 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import typer
@@ -124,3 +125,12 @@ def test_images_without_a_description_are_told_what_they_lack(run, tmp_path, nam
     (tmp_path / "a.tif").write_bytes(b"II*")
     done = run(tmp_path / name, "-o", tmp_path / "scan.h5")
     assert isinstance(done.exception, InputError) and "no TOML" in str(done.exception)
+
+
+@pytest.mark.parametrize("member", ["/entry/reconstruction", "/volume"])
+def test_a_volume_is_told_from_a_scan(run, tmp_path, member) -> None:
+    with h5py.File(tmp_path / "volume.h5", "w") as file:
+        file[member] = np.zeros((2, 2, 2), np.float32)
+    done = run(tmp_path / "volume.h5", "-o", tmp_path / "scan.h5")
+    assert isinstance(done.exception, InputError) and "found a volume" in str(done.exception)
+    assert f"volume.h5:{member}" in str(done.exception) and "phyradgs export" in str(done.exception)

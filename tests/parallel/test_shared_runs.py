@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import Progress, method_options, reconstruct
+from phyradgs_cl.reconstructors import Progress, method_options, reconstruct, splat_run
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splat_run import SplatRun
@@ -166,7 +166,9 @@ def test_a_domain_too_large_for_one_device_is_the_undivided_one(ranks_of, scan) 
     assert alone.peak_bytes > 2 * MEMORY_BYTES
 
     def work(ranks) -> np.ndarray:
-        return reconstruct(scan, "phyradgs", Runtime(memory=MEMORY_BYTES, ranks=ranks), options, seed=1).volume
+        return reconstruct(
+            scan, "phyradgs", Runtime(memory=MEMORY_BYTES, ranks=ranks), options, seed=1
+        ).volume
 
     error = np.abs(ranks_of(4, work)[0] - expected.volume).max(axis=(1, 2))
     assert error.shape == (16,) and error.max() <= DOMAIN_VOLUME * expected.volume.max()
@@ -177,7 +179,9 @@ def test_round_gaussians_do_not_turn_by_rounding(scan, motion) -> None:
     """Two runs that round in different ways stay together: Adam would make whole steps of the rounding."""
     few = replace(CONTROL, max_gaussians=420)
     divided = replace(OPTIONS, motion=motion, split="domain", parts=4, iterations=60, control=few)
-    whole = reconstruct(scan, "phyradgs", Runtime(), replace(divided, split="frames", batch=1, parts=1), seed=1)
+    whole = reconstruct(
+        scan, "phyradgs", Runtime(), replace(divided, split="frames", batch=1, parts=1), seed=1
+    )
     found = reconstruct(scan, "phyradgs", Runtime(), divided, seed=1)
     assert np.abs(found.volume - whole.volume).max() <= DOMAIN_VOLUME * whole.volume.max()
 
@@ -234,3 +238,22 @@ def test_more_ranks_than_parts_are_refused(ranks_of, scan, split) -> None:
 def test_methods_that_do_not_share_say_so(ranks_of, scan) -> None:
     with pytest.raises(InputError, match="2 ranks; expected one"):
         ranks_of(2, lambda ranks: reconstruct(scan, "fdk", Runtime(ranks=ranks)))
+
+
+def test_slow_iterations_are_reported_one_by_one(ranks_of, scan, monkeypatch) -> None:
+    """Ranks would have to agree on what is slow: there it goes by number, whatever the clock says."""
+    monkeypatch.setattr(splat_run, "_SILENT_S", 0.0)
+    alone: list[int] = []
+    options = replace(OPTIONS, iterations=60, batch=1, control=replace(CONTROL, max_gaussians=400))
+    reconstruct(
+        scan, "phyradgs", Runtime(), options, report=lambda progress: alone.append(progress.iteration)
+    )
+    assert alone == list(range(1, 61))
+    shared: list[int] = []
+    ranks_of(
+        2,
+        lambda ranks: reconstruct(
+            scan, "phyradgs", Runtime(ranks=ranks), options, report=lambda p: shared.append(p.iteration)
+        ),
+    )
+    assert shared == [50, 60]
