@@ -1,11 +1,13 @@
 """The floors of the house: a room imports lower floors only, and pyopencl lives in one room.
 
-Rooms on one floor do not see each other. A new module has to be given a room here before the tests pass.
+Rooms on one floor do not see each other. Which room is on which floor says the table of docs/architecture.md; a new module
+has to have a room there before the tests pass.
 """
 
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,20 +16,18 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "phyradgs_cl"
 NAME = PACKAGE.name
 
-# A scan holds the grid that it asks for, so the fields lie under the acquisition.
-FLOORS: tuple[frozenset[str], ...] = (
-    frozenset({"__init__", "errors", "checks", "resources", "signals"}),
-    frozenset({"fields", "parallel"}),
-    frozenset({"acquisition"}),
-    frozenset({"phantoms", "detector", "metrics", "io", "runtime"}),
-    frozenset({"operators", "objective", "optim", "neural"}),
-    frozenset({"simulation", "reconstructors", "importers", "exporters", "cluster"}),
-    frozenset({"check", "estimate", "rank_plan", "workflow", "bench", "settings", "progress", "api", "report"}),
-    frozenset({"commands"}),
-    frozenset({"cli"}),
-    frozenset({"__main__"}),
-)
-FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+ARCHITECTURE = PACKAGE.parent / "docs" / "architecture.md"
+
+
+def floors_of_the_page() -> dict[str, int]:
+    """Every room with its floor, from the table of docs/architecture.md."""
+    rows = re.findall(r"^\| (\d+) \| (.+?) \|", ARCHITECTURE.read_text(encoding="utf-8"), re.MULTILINE)
+    found = [(name, int(floor)) for floor, cell in rows for name in re.findall(r"`(\w+)(?:\.py|/)?`", cell)]
+    assert len(found) == len(dict(found)), "a room stands on two floors"
+    return dict(found)
+
+
+FLOOR_OF = {"__init__": 0, **floors_of_the_page()}
 # Within floor 0: errors know nothing, checks raise them.
 GROUND_FLOOR = {
     "__init__": set(),
@@ -85,9 +85,9 @@ def forbidden(room: str, other: str) -> bool:
 @pytest.mark.parametrize("path", module_files(), ids=lambda p: str(p.relative_to(PACKAGE.parent)))
 def test_a_module_imports_only_lower_floors(path: Path) -> None:
     room = room_of(path)
-    assert room in FLOOR_OF, f"{path} belongs to no room of FLOORS"
+    assert room in FLOOR_OF, f"{path} belongs to no room of docs/architecture.md"
     for line, other in imported_rooms(path):
-        assert other in FLOOR_OF, f"{path}:{line}: imports {other}, which is no room of FLOORS"
+        assert other in FLOOR_OF, f"{path}:{line}: imports {other}, which is no room of docs/architecture.md"
         assert not forbidden(room, other), (
             f"{path}:{line}: {room} (floor {FLOOR_OF[room]}) imports {other} (floor {FLOOR_OF[other]})"
         )
@@ -96,6 +96,13 @@ def test_a_module_imports_only_lower_floors(path: Path) -> None:
 def test_the_table_names_only_rooms_that_exist() -> None:
     found = {room_of(path) for path in module_files()}
     assert set(FLOOR_OF) <= found, f"no such room: {set(FLOOR_OF) - found}"
+
+
+def test_the_page_is_read_as_it_is_meant() -> None:
+    assert (
+        FLOOR_OF["fields"] == FLOOR_OF["parallel"] == 1 and FLOOR_OF["cli"] == 8 and FLOOR_OF["__main__"] == 9
+    )
+    assert sorted(set(FLOOR_OF.values())) == list(range(10))
 
 
 def test_the_rule_sees_upward_and_sideways_imports() -> None:
