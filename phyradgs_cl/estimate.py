@@ -89,17 +89,20 @@ def estimate(
         whole_s, each_s = _of_schedule(trials, options, *_SPLAT_TRIALS)
     else:
         whole_s, each_s = _of_alike(trials, total, *_ITERATIVE_TRIALS)
-        if whole_s <= _AS_WELL_RUN_S and getattr(options, "noise_stop", 0) > 0:
-            whole_s = trials.run(total)  # it may stop by itself, and only a run tells when
+        if whole_s <= _AS_WELL_RUN_S and METHODS[method].stops_itself(options):
+            whole_s = trials.run(total)  # only a run tells when
     around_s = around(trials.last) if around else 0.0
     spent_s, held = time.perf_counter() - started, peak_host_bytes()
     return Estimate(
-        whole_s + around_s, held, rt.peak_bytes, total, each_s, trials.iterations, spent_s, around_s
+        whole_s + around_s, held, trials.device_bytes, total, each_s, trials.iterations, spent_s, around_s
     )
 
 
 class _Trials:
-    """Short runs of one reconstruction; ``last`` is the latest result, ``iterations`` how many they had in all."""
+    """Short runs of one reconstruction; ``last`` is the latest and longest, ``iterations`` how many they had in all.
+
+    ``device_bytes``: of the last alone, since clouds grow most in the shortest.
+    """
 
     def __init__(
         self, scan: Scan, method: str, options: Any, rt: Runtime, before: InputOptions | None
@@ -111,9 +114,11 @@ class _Trials:
         """Seconds of so many iterations, or of the method as a whole."""
         short = self.options if iterations is None else shortened(self.options, iterations)
         self.iterations += iterations or 0
+        self.rt.reset_peak()
         begun = time.perf_counter()
         self.last = reconstruct(self.scan, self.method, self.rt, short, before=self.before)
-        return time.perf_counter() - begun
+        seconds, self.device_bytes = time.perf_counter() - begun, self.rt.peak_bytes
+        return seconds
 
     @property
     def control_s(self) -> float:

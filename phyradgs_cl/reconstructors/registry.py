@@ -37,14 +37,15 @@ _MODELS_WITH = {
 
 @dataclass(frozen=True)
 class Method:
-    """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed, and can
-    several ranks share its work.
+    """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed, can
+    several ranks share its work, and whether it may end before its last iteration with some options.
     """
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
     is_resumable: bool = True
     is_shared: bool = False
+    stops_itself: Callable[[Any], bool] = lambda options: False
 
 
 METHODS = {
@@ -53,7 +54,9 @@ METHODS = {
     "sart": Method(sart, {"default": SartOptions()}, is_shared=True),
     "os-sart": Method(os_sart, {"default": OS_SART}, is_shared=True),
     "sirt": Method(sirt, {"default": SirtOptions()}, is_shared=True),
-    "cgls": Method(cgls, {"default": CglsOptions()}, is_shared=True),
+    "cgls": Method(
+        cgls, {"default": CglsOptions()}, is_shared=True, stops_itself=lambda options: options.noise_stop > 0
+    ),
     "asd-pocs": Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True),
     "fista-tv": Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True),
     "naf": Method(naf, NAF_PRESETS),
