@@ -113,6 +113,17 @@ def test_gradients(any_rt, make_cloud, finite_differences, grid) -> None:
         assert error <= GRADIENT, name
 
 
+def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud) -> None:
+    rows, grid = make_cloud(5, 48, scale=(0.1, 0.3)), GRIDS[0]
+    rows[SCALE] = rows[SCALE][:1] * (1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]]))
+    h = np.random.default_rng(9).normal(size=grid.shape).astype(np.float32)
+    voxeliser = Voxeliser(any_rt, grid.shape)
+    found = voxeliser.voxelise_adjoint(rows, grid, h)
+    assert not found[QUATERNION].any() and found[SCALE].any()
+    rows[SCALE] *= 1 + 1e-4 * np.array([[1.0], [0.0], [0.0]])
+    assert voxeliser.voxelise_adjoint(rows, grid, h)[QUATERNION].any()
+
+
 def test_backward_adds_with_a_weight(rt, make_cloud) -> None:
     """The objective lays the total variation's gradient onto the image's."""
     rows, grid = make_cloud(3, 46), GRIDS[0]
