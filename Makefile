@@ -2,7 +2,7 @@
 # make test    style, tests on a CPU device; a skipped kernel test is a failure
 # make docs     the documentation as a site, in site/
 # make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
-# make coverage   which lines the tests run; fails below 95 %
+# make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
 # make mutants    small defects put into three rooms, one after the other: which do their tests not notice?
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB)
 # make test-neural    the tests of naf and sax-nerf, with PyTorch in an environment of its own
@@ -70,18 +70,19 @@ docs: $(VENV)/.installed-test
 stress: $(VENV)/.installed-test
 	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/workflow/test_watch_kills.py tests/faults tests/corpus tests/laws
 
-# PyTorch and Dask have test runs of their own (test-neural, test-cluster), and so have their rooms.
+# One environment with every extra: the tests of all rooms run, those in processes of their own and under mpiexec too.
 $(VENV)-coverage/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-coverage
 	$(VENV)-coverage/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-coverage/bin/python -m pip install --quiet --editable ".[cpu,test]" "coverage>=7.10"
+	$(VENV)-coverage/bin/python -m pip install --quiet --editable ".[cpu,test,neural,cluster,mpi]" "$(TORCH)" \
+		"coverage>=7.10"
 	@touch $@
 
 coverage: $(VENV)-coverage/.installed
 	$(VENV)-coverage/bin/python -m coverage erase
 	$(VENV)-coverage/bin/python -m coverage run -m pytest
 	$(VENV)-coverage/bin/python -m coverage combine --quiet
-	$(VENV)-coverage/bin/python -m coverage report --fail-under=95 --omit="phyradgs_cl/neural/*,phyradgs_cl/cluster/*"
+	$(VENV)-coverage/bin/python -m coverage report --fail-under=95
 
 mutants: $(VENV)/.installed-test
 	for room in acquisition objective optim; do $(BIN)/python -m tests.mutation $$room || exit 1; done

@@ -30,8 +30,13 @@ _SPLAT_TRIALS = (20, 200)  # iterations
 _ITERATIVE_TRIALS = (1, 3)
 _LEAST_DIFFERENCE_S = 0.3  # between the trials of methods whose iterations are alike
 _MOST_ALIKE = 200
-_AS_WELL_RUN_S = 20.0  # a whole run that takes no longer is the best estimate of a method that may stop by itself
-_GROWN, _GROWTH_TRIALS = 1.1, 3  # by how much a cloud has to grow for a longer trial, and how much longer it is
+_AS_WELL_RUN_S = (
+    20.0  # a whole run that takes no longer is the best estimate of a method that may stop by itself
+)
+_GROWN, _GROWTH_TRIALS = (
+    1.1,
+    3,
+)  # by how much a cloud has to grow for a longer trial, and how much longer it is
 _FEWEST_BETWEEN = 5  # iterations from one round of density control to the next, in a trial
 
 

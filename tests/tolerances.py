@@ -68,7 +68,9 @@ DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.
 
 # --- rays through a neural field ---------------------------------------------------------------------------------
 RAY_SAMPLES = 1e-3  # goal; of the peak (smooth fields, one draw) or of the norm (sharp edge, mean of draws)
-RAY_SAMPLES_SHARP = 0.05  # of the norm, one draw: a step inside an interval is counted or not (0.02; 0.03 a sample)
+RAY_SAMPLES_SHARP = (
+    0.05  # of the norm, one draw: a step inside an interval is counted or not (0.02; 0.03 a sample)
+)
 
 # --- FDK -----------------------------------------------------------------------------------------------------
 BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1

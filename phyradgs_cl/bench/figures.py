@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,9 @@ from phyradgs_cl.bench.case import FLY, Images
 from phyradgs_cl.bench.job import BenchJob
 from phyradgs_cl.bench.results import Line, key_of
 from phyradgs_cl.bench.summary import lines_of
-from phyradgs_cl.errors import OutputError
+from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import written_beside
+from phyradgs_cl.io.npz import read_npz
 from phyradgs_cl.metrics import panels_png
 
 _MOST_BYTES = 1 << 28  # three slices of 4096² pixels and more
@@ -33,15 +33,12 @@ def write_slices(folder: Path, facts: Mapping[str, Any], images: Images) -> None
 
 def read_slices(folder: Path, facts: Mapping[str, Any]) -> Images | None:
     """The slices of a run; None where there are none, or they are damaged."""
-    path = slices_path(folder, facts)
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > _MOST_BYTES:
-                return None
-        with np.load(path) as stored:
-            return [stored[name] for name in sorted(stored.files, key=lambda name: int(name[4:]))]
-    except Exception:  # zipfile, zlib and NumPy's parser of headers hand on whatever they stumble over
+        stored = read_npz(slices_path(folder, facts), "file of slices", "", most_bytes=_MOST_BYTES)
+    except InputError:
         return None
+    names = [f"arr_{number}" for number in range(len(stored))]
+    return [stored[name] for name in names] if set(names) == set(stored) else None
 
 
 def slices_path(folder: Path, facts: Mapping[str, Any]) -> Path:

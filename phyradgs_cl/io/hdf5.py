@@ -128,7 +128,9 @@ class Hdf5Source:
     def near_miss(self, parent: str, name: str, known: Collection[str], cutoff: float = 0.6) -> str:
         """What to do about a name that is nearly ``name`` and means nothing else; "" if there is none."""
         group = self.find(parent)
-        strangers = [n for n in group if n != name and n not in known] if isinstance(group, h5py.Group) else []
+        strangers = (
+            [n for n in group if n != name and n not in known] if isinstance(group, h5py.Group) else []
+        )
         by_lower = {n.lower(): n for n in strangers}
         close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
         return f"rename {by_lower[close[0]]!r} to {name!r}" if close else ""

@@ -1,9 +1,9 @@
 """A first look at an HDF5 file by another process, which may crash or hang in place of this one.
 
 The HDF5 library follows damaged headers without looking: a flipped bit can end the process that reads it, or keep it for
-ever. The other process opens every object, reads every attribute and every small dataset; a file that it does not survive
-is refused. Damage inside large datasets is met, and reported, by the reading itself. One process, started with the first
-file, looks at all of them; it leaves with this one.
+ever. The other process (`hdf5_look`) opens every object, reads every attribute and every small dataset; a file that it does
+not survive is refused. Damage inside large datasets is met, and reported, by the reading itself. One process, started with
+the first file, looks at all of them; it leaves with this one.
 """
 
 from __future__ import annotations
@@ -24,63 +24,7 @@ from phyradgs_cl.errors import InputError
 CPU_SECONDS, SECONDS = 3, 60.0
 """What a look may take: of a processor, where the system counts that, and by the clock, for a slow disk."""
 _SMALL_BYTES, _MOST_OBJECTS, _MOST_MEMORY_BYTES = 1 << 17, 5_000, 8 << 30
-_LOOK = """
-import json, sys, time, h5py
-small, most, memory, seconds = map(int, sys.argv[1:])
-try:
-    import resource
-except ImportError:
-    resource = None
-def limit(what, to):
-    if resource:
-        most = resource.getrlimit(what)[1]
-        resource.setrlimit(what, (to if most < 0 else min(to, most), most))
-def look(thing):
-    global left
-    left -= 1
-    if left < 0:
-        return
-    try:
-        for name in thing.attrs:
-            thing.attrs[name]
-        if isinstance(thing, h5py.Dataset):
-            fixed = thing.dtype.kind != "O" or thing.size == 1
-            if fixed and not thing.is_virtual and not thing.external and thing.nbytes <= small:
-                thing[()]
-            return
-        for name in thing:
-            if isinstance(thing.get(name, getlink=True), h5py.HardLink):
-                look(thing[name])
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError):
-        pass  # damage that HDF5 survives: met again, and named, by the reading itself
-def held_bytes():
-    try:  # in Linux the system's call would also tell what the process held that started this one
-        with open("/proc/self/status") as status:
-            return 1024 * int(status.read().partition("VmHWM:")[2].split()[0])
-    except (OSError, ValueError, IndexError):
-        pass
-    if not resource:
-        return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-if resource:
-    limit(resource.RLIMIT_CORE, 0)
-    limit(resource.RLIMIT_AS, memory)
-def answer(word):
-    sys.stdout.write(word + "\\n")
-    sys.stdout.flush()
-start = held_bytes()
-answer("ready")
-for line in sys.stdin:
-    if resource:
-        limit(resource.RLIMIT_CPU, int(time.process_time()) + 1 + seconds)
-    left = most
-    try:
-        with h5py.File(json.loads(line), "r") as file:
-            look(file)
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError):
-        pass
-    answer("large" if held_bytes() - start > memory >> 5 else "done")
-"""
+_LOOK = Path(__file__).with_name("hdf5_look")
 _SIGXCPU = 24
 _log = logging.getLogger(__name__)
 
@@ -159,7 +103,7 @@ class _Scout:
         limits = [str(n) for n in (_SMALL_BYTES, _MOST_OBJECTS, _MOST_MEMORY_BYTES, CPU_SECONDS)]
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _LOOK, *limits],
+                [sys.executable, str(_LOOK), *limits],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

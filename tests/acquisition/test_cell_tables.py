@@ -16,7 +16,10 @@ from phyradgs_cl.acquisition import (
     FrameSweeps,
     Motion,
     PoseTable,
+    Protocol,
+    Scan,
     Shutter,
+    SpeedRamp,
     pixel_centres,
 )
 from phyradgs_cl.acquisition.cells import (
@@ -29,10 +32,15 @@ from phyradgs_cl.acquisition.cells import (
     static_cells,
 )
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 
 LINES = 10
 GEOMETRY = ConeGeometry(50.0, 70.0, (LINES, 7), (0.6, 0.5), (1.0, -2.0))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.25))
+
+
+def a_scan() -> Scan:
+    return Scan(np.zeros((1, LINES, 7)), GEOMETRY, ORBIT, Shutter(0.8), np.zeros(1), Grid.cube(4, 2.0))
 
 
 def micro_views(strips: int, sub_intervals: int):
@@ -141,6 +149,17 @@ def test_a_panel_that_turns_about_itself_needs_segments_too(steps) -> None:
     )
 
 
+def test_a_source_that_turns_alone_needs_as_many_segments() -> None:
+    class Turning:
+        def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+            pose = ORBIT.pose(frame, time_s)
+            pose[:, 3:] = GEOMETRY.pose(0.0)[3:]
+            return pose
+
+    where = (Shutter(0.8, 0.6), 0, 3.0, 0.001)
+    assert segments_for(Turning(), *where) == segments_for(ORBIT, *where)
+
+
 def test_one_segment_of_a_gantry_at_rest() -> None:
     at_rest = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0))
     assert exact_cells(at_rest, Shutter(0.8, 0.6), 0, 3.0, LINES, 1).end_poses is None
@@ -152,9 +171,14 @@ def test_one_segment_of_a_gantry_at_rest() -> None:
         GEOMETRY,
         ORBIT,
         ORBIT.kinematics,
+        SpeedRamp(0.0, 1.0, 0.5),
+        EncoderTable(np.arange(2.0), np.arange(2.0)),
+        FrameSweeps(np.zeros(1), 1.0, np.zeros(1), np.ones(1)),
         PoseTable(np.arange(2.0), GEOMETRY.pose(np.arange(2.0))),
         Motion(),
+        Protocol(),
         Shutter(0.8),
+        a_scan(),
         static_cells(ORBIT, Shutter(0.8), 0, 3.0, LINES),
     ],
 )
@@ -170,6 +194,8 @@ def test_what_holds_arrays_is_compared_by_what_it_is() -> None:
     made += [
         lambda: PoseTable(times, GEOMETRY.pose(times)),
         lambda: CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0)),
+        lambda: static_cells(ORBIT, Shutter(0.8), 0, 3.0, LINES),
+        a_scan,
     ]
     for make in made:
         one, other = make(), make()

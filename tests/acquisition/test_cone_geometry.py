@@ -65,6 +65,7 @@ def test_transposed_poses_see_the_transposed_image() -> None:
     pose = GEOMETRY.pose(0.7)
     turned = pixel_centres(transpose_pose(pose), (10, 7))
     np.testing.assert_allclose(turned, pixel_centres(pose, (7, 10)).swapaxes(0, 1), atol=TOLERANCE_MM)
+    np.testing.assert_array_equal(transpose_pose(transpose_pose(pose)), pose)
 
 
 @pytest.mark.parametrize(
@@ -72,6 +73,7 @@ def test_transposed_poses_see_the_transposed_image() -> None:
     [
         {"source_to_axis_mm": 0.0},
         {"source_to_axis_mm": math.nan},
+        {"source_to_detector_mm": 0.0},
         {"source_to_detector_mm": -1.0},
         {"detector_shape": (0, 5)},
         {"pixel_size_mm": (0.5, 0.0)},
@@ -88,3 +90,8 @@ def test_nonsense_is_refused_by_name(change) -> None:
     }
     with pytest.raises(InputError, match=next(iter(change))):
         ConeGeometry(**(good | change))
+
+
+def test_machines_may_be_smaller_than_a_millimetre() -> None:
+    small = ConeGeometry(0.25, 0.5, (4, 4), (0.01, 0.01))
+    assert (small.source_to_axis_mm, small.magnification) == (0.25, 2.0)

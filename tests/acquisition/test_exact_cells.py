@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from tolerances import FLOAT64
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, EncoderTable, Motion, Shutter
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    EncoderTable,
+    Motion,
+    Shutter,
+    SpeedRamp,
+)
 from phyradgs_cl.acquisition.cells import exact_cells, layer_numbers, segments_for, static_cells
 from phyradgs_cl.errors import InputError
 
@@ -83,6 +91,18 @@ def test_the_fastest_part_of_a_frame_counts() -> None:
     steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 0.5))
     where = (Shutter(0.8, 0.6), 0, START_S, 0.002)
     assert segments_for(jerky, *where) == segments_for(steady, *where) > 1
+
+
+def test_the_fastest_is_sought_in_32_parts() -> None:
+    """A gantry that speeds up from rest turns by a/2 (1 − (31/32)²) in the last part; 64 parts would give 76 segments."""
+    ramp = CircularOrbit(GEOMETRY, SpeedRamp(0.0, 0.0, 3.0))
+    fastest_rad = 32 * 1.5 * (1 - (31 / 32) ** 2)
+    assert segments_for(ramp, Shutter(0.4, 0.6), 0, 0.0, 0.0005) == 75
+    assert 74 < fastest_rad * np.sqrt(0.32 / 0.0005) < 75
+
+
+def test_there_are_never_more_than_1000_segments() -> None:
+    assert segments_for(ORBIT, Shutter(0.8, 0.6), 0, START_S, 1e-9) == 1000
 
 
 @pytest.mark.parametrize(

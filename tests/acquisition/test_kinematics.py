@@ -56,6 +56,18 @@ def test_rounding_of_stored_times_is_forgiven() -> None:
     np.testing.assert_allclose(poses.pose(0, asked_s), poses.table, atol=RIGID_TOLERANCE_MM)
 
 
+@pytest.mark.parametrize(("times_s", "slack_s"), [([0.0, 0.25, 0.5], 1e-9), ([0.0, 1.0, 1000.0], 1e-6)])
+def test_the_slack_is_a_billionth_of_the_last_time_and_at_least_a_nanosecond(times_s, slack_s) -> None:
+    encoder = EncoderTable(times_s, [0.0, 0.1, 0.2])
+    last_s = times_s[-1]
+    for share in (0.9, 1.0):
+        asked_s = np.array([-share * slack_s, last_s + share * slack_s])
+        np.testing.assert_array_equal(encoder.angle_rad(0, asked_s), [0.0, 0.2])
+    for beyond_s in (-1.1 * slack_s, last_s + 1.1 * slack_s):
+        with pytest.raises(InputError, match="encoder table"):
+            encoder.angle_rad(0, np.array([beyond_s]))
+
+
 @pytest.mark.parametrize(
     "time_s, angle",
     [

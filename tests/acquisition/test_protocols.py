@@ -57,10 +57,11 @@ def test_one_constant_speed_joins_all_frames(exposure_s) -> None:
         assert angles_deg(protocol, frame, [0.0])[0] == pytest.approx(expected, abs=ANGLE_TOLERANCE_DEG)
 
 
-def test_stop_and_shoot_stands_at_the_mid_window_angles_of_the_fly_scan() -> None:
-    static, fly = make_protocol("static"), make_protocol("rapid")
+@pytest.mark.parametrize("exposure_s", [1.0, 2.5])
+def test_stop_and_shoot_stands_at_the_mid_window_angles_of_the_fly_scan(exposure_s) -> None:
+    static, fly = (make_protocol(name, exposure_s=exposure_s) for name in ("static", "rapid"))
     for frame in (0, 5, 24):
-        middle = angles_deg(fly, frame, [1.86 / 2])[0]
+        middle = angles_deg(fly, frame, [1.86 * exposure_s / 2])[0]
         np.testing.assert_allclose(
             angles_deg(static, frame, [0, 0.4, 1.86]), [middle] * 3, atol=ANGLE_TOLERANCE_DEG
         )
@@ -113,6 +114,8 @@ def test_the_gantry_wanders_in_straight_lines_between_a_knot_a_frame() -> None:
     wander = encoder.angle_rad_table - np.deg2rad(7.0) - np.deg2rad(10.0) * encoder.time_s
     expected = np.interp(encoder.time_s, np.linspace(0, end_s, 6), knots)
     np.testing.assert_allclose(wander, expected, rtol=0, atol=1e-12)
+    at_knots = np.interp(np.linspace(0, end_s, 6), encoder.time_s, wander)
+    np.testing.assert_allclose(at_knots, knots, rtol=0, atol=1e-12)  # no corner is cut
     assert (encoder.time_s[0], encoder.time_s[-1]) == (0.0, end_s)
 
 
@@ -139,6 +142,15 @@ def test_pulses_without_light_are_refused(pulse) -> None:
         Protocol(readout_ratio=0.86, pulse=pulse)
     with pytest.raises(InputError, match="pulse"):
         Shutter(1.0, 0.86, pulse_s=pulse)
+
+
+def test_a_pulse_that_meets_the_window_is_kept() -> None:
+    for pulse in ((-0.5, 0.6), (1.4, 5.0)):
+        assert Protocol(readout_ratio=0.5, pulse=pulse).shutter().pulse_s == pulse
+
+
+def test_defaults_are_the_papers_rapid_protocol() -> None:
+    assert Protocol() == Protocol(25, 14.4, 0.86, 0.0, 1.0, True, None) == make_protocol("rapid")
 
 
 def test_options_replace_and_nonsense_is_refused() -> None:
@@ -176,6 +188,15 @@ def scan(**changes) -> Scan:
 def test_scans_that_contradict_themselves_are_refused(change) -> None:
     with pytest.raises(InputError):
         scan(**change)
+
+
+def test_a_scan_counts_its_frames_and_bounds_its_lag() -> None:
+    assert scan().frames == 3
+    for lag in (0.0, 0.9):
+        assert scan(lag=lag).lag == lag
+    for lag in (-0.001, 0.901, np.nan):
+        with pytest.raises(InputError, match="lag"):
+            scan(lag=lag)
 
 
 def test_timing_names_the_first_frame_that_a_table_misses() -> None:

@@ -62,6 +62,22 @@ def test_lines_that_the_pulse_misses_have_no_share_and_one_moment() -> None:
     np.testing.assert_array_equal(windows_s[5:], 1.0)
 
 
+@pytest.mark.parametrize("exposure_s", [1.0, 4.0])
+@pytest.mark.parametrize(("seen", "share"), [(0.5e-9, 0.0), (1.5e-9, 1.5e-9)])
+def test_a_billionth_of_a_window_is_rounding(exposure_s, seen, share) -> None:
+    """The last line opens when the pulse has all but ended."""
+    lit = Shutter(exposure_s, exposure_s, pulse_s=(0.0, exposure_s * (1 + seen))).lit_share(3)
+    np.testing.assert_allclose(lit, [1.0, 0.5, share], rtol=1e-6)
+
+
+def test_exactly_a_billionth_is_dark() -> None:
+    seen_s = 2.0**-40
+    shutter = Shutter(1.0, 1.0, pulse_s=(1 - seen_s, seen_s + seen_s / 1e-9))
+    first_s, last_s = np.diff(shutter.line_windows_s(2))[:, 0]
+    assert first_s == seen_s == 1e-9 * last_s
+    np.testing.assert_array_equal(shutter.lit_share(2), [0.0, 1.0])
+
+
 @pytest.mark.parametrize("motion", ["micro-views", "per-row", "static", "static-start"])
 @pytest.mark.parametrize("direction", [1, -1])
 def test_every_time_lies_in_the_pulse_and_weights_stay_whole(motion, direction) -> None:
@@ -132,7 +148,7 @@ def test_a_protocol_pulses_in_shares_of_the_exposure(is_fly) -> None:
 
 
 @pytest.mark.parametrize(
-    "pulse", [(0.0, 0.0), (0.0, -1.0), (2.0, 1.0), (-3.0, 1.0), (np.nan, 1.0), (0.0, np.inf)]
+    "pulse", [(0.0, 0.0), (0.0, -1.0), (1.5, 1.0), (2.0, 1.0), (-3.0, 1.0), (np.nan, 1.0), (0.0, np.inf)]
 )
 def test_pulses_that_no_frame_sees_are_refused(pulse) -> None:
     with pytest.raises(InputError, match="pulse"):

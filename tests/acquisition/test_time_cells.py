@@ -7,8 +7,10 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Scan, Shutter
 from phyradgs_cl.acquisition.cells import (
+    exact_cells,
     micro_view_cells,
     per_line_cells,
+    segments_for,
     static_cells,
     static_start_cells,
 )
@@ -35,6 +37,7 @@ def test_micro_views_have_the_times_of_eq_2_on_every_line(axis, direction, strip
     lines = shutter.lines(SHAPE)
     cells = micro_view_cells(ORBIT, shutter, 0, START_S, lines, strips, sub_intervals)
     assert cells.axis == axis and cells.lines == lines
+    assert cells.count == min(strips, lines) * sub_intervals  # none for strips without a line
     np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
     for line in range(lines):
         reading_order = line if direction > 0 else lines - 1 - line
@@ -134,6 +137,7 @@ def scan(is_fly: bool) -> Scan:
         (Motion("static-start"), 1, 1),
         (Motion("micro-views", 4, 3), 12, 1),
         (Motion("per-row", sub_intervals=3), 30, 1),
+        (Motion("exact", segments=5), 5, 1),
     ],
 )
 def test_motion_models_of_moving_and_standing_scans(motion, fly_count, standing_count) -> None:
@@ -144,6 +148,17 @@ def test_motion_models_of_moving_and_standing_scans(motion, fly_count, standing_
     assert moving.lines == 10 and moving.axis == "columns"
     first_s, last_s = moving.time_s.min(), moving.time_s.max()
     assert START_S <= first_s <= last_s <= START_S + 1.1
+
+
+@pytest.mark.parametrize("peak", [0.0, 40.0])
+def test_without_a_number_segments_follow_from_the_time_error(peak) -> None:
+    fly = scan(True)
+    where = (ORBIT, fly.shutter, 1, START_S)
+    segments = segments_for(*where, 0.001, peak)
+    expected = exact_cells(*where[:3], START_S, 10, segments)
+    found = Motion("exact", time_error=0.001).cells(fly, 1, peak)
+    np.testing.assert_array_equal(found.line_times, expected.line_times)
+    np.testing.assert_array_equal(found.pose, expected.pose)
 
 
 def test_unknown_motion_is_refused() -> None:

@@ -77,7 +77,9 @@ def test_time_is_that_of_a_run_whose_iterations_are_alike(rt, scan, clock, metho
 
 
 @pytest.mark.parametrize(("growth", "longest"), [(1.0, 200), (2.0, 600)])
-def test_rounds_of_density_control_count_as_often_as_they_come(rt, scan, monkeypatch, growth, longest) -> None:
+def test_rounds_of_density_control_count_as_often_as_they_come(
+    rt, scan, monkeypatch, growth, longest
+) -> None:
     """A trial has as many rounds as the whole run in a fraction of its iterations; a cloud that grows has a longer trial."""
     made = Clock(2.0, 0.25, control=3.0, growth=growth)
     monkeypatch.setattr(room, "time", made)

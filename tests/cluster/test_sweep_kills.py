@@ -67,16 +67,17 @@ def test_workers_killed_at_random_and_the_sweep_itself_once(sweep_folder, start,
     rng, log = np.random.default_rng(0), tmp_path / "log.txt"
     run = command(sweep_folder, "--workers", "2", "--device", "cpu")
     sweep = start(*run, log=log)
-    kills, restarted = 0, False
+    kills, restarted, before = 0, False, 0
     deadline = time.monotonic() + 1500
     while sweep.poll() is None:
         assert time.monotonic() < deadline, log.read_text()
         time.sleep(float(rng.uniform(1.0, 4.0)))
         done = len(lines_of(sweep_folder))
-        if done and kills < 10:
+        if done > before and kills < 10:  # all at work, not starting: that is tried three times only
             kills += kill_a_worker(sweep, rng)
+            before = done
         if done > RUNS // 2 and not restarted:
-            restarted = True
+            restarted, before = True, done
             workers = workers_of(sweep)
             sweep.kill()  # its workers see that it has gone
             sweep.wait()

@@ -77,16 +77,38 @@ def test_one_process_looks_at_all_files_once(scout, good, tmp_path) -> None:
     assert process.returncode == 0
 
 
-def test_a_look_that_waits_for_ever_is_given_up(scout, good, monkeypatch) -> None:
+def test_a_look_that_waits_for_ever_is_given_up(scout, good, tmp_path, monkeypatch) -> None:
     """On a disk that does not answer no processor is used: the clock counts."""
-    monkeypatch.setattr(hdf5_trial, "_LOOK", "import time; print('ready', flush=True); time.sleep(600)")
+    waits = tmp_path / "waits.py"
+    waits.write_text("import time; print('ready', flush=True); time.sleep(600)")
+    monkeypatch.setattr(hdf5_trial, "_LOOK", waits)
     monkeypatch.setattr(hdf5_trial, "SECONDS", 0.3)
     assert "does not finish reading" in refusal_of(good)
 
 
-@pytest.mark.parametrize("start", [("_LOOK", "raise SystemExit(1)"), ("sys.executable", "/no/such/python")])
-def test_where_no_process_can_be_had_files_are_read_without(scout, good, monkeypatch, start) -> None:
-    name, value = start
-    owner = hdf5_trial.sys if "." in name else hdf5_trial
-    monkeypatch.setattr(owner, name.rpartition(".")[2], value)
+@pytest.mark.parametrize("lacks", ["a program", "an interpreter"])
+def test_where_no_process_can_be_had_files_are_read_without(
+    scout, good, tmp_path, monkeypatch, lacks
+) -> None:
+    if lacks == "a program":
+        monkeypatch.setattr(hdf5_trial, "_LOOK", tmp_path / "none.py")
+    else:
+        monkeypatch.setattr(hdf5_trial.sys, "executable", "/no/such/python")
     assert value_of(good) == 3.0 and scout._process is None
+
+
+def test_modules_in_the_folder_at_hand_are_not_run(scout, good, tmp_path, monkeypatch) -> None:
+    """A scan may lie in a stranger's folder."""
+    for name in ("h5py", "json", "resource", "numpy"):
+        (tmp_path / f"{name}.py").write_text("open('canary', 'w')")
+    monkeypatch.chdir(tmp_path)
+    assert value_of(good) == 3.0 and scout._process is not None
+    assert not (tmp_path / "canary").exists()
+
+
+def test_links_to_elsewhere_and_to_the_file_itself_are_not_followed(scout, good, tmp_path) -> None:
+    with h5py.File(good, "a") as file:
+        file["outside"] = h5py.ExternalLink(str(CRASHES), "/")
+        file["soft"] = h5py.SoftLink("/outside")
+        file["group/again"] = file["/"]  # a circle: as many objects as are looked at
+    assert value_of(good) == 3.0 and scout._process is not None

@@ -96,6 +96,22 @@ def test_without_a_weight_transmissions_change_no_bit(rt) -> None:
     beside = on_device(rt, rendered, measured, mask, 0.2, np.full((24, 31), 7.0))
     assert plain[0] == beside[0]
     np.testing.assert_array_equal(plain[1], beside[1])
+    twin = image_loss(rendered, measured, mask, 0.2)
+    twin_beside = image_loss(rendered, measured, mask, 0.2, transmission=np.full((24, 31), 7.0))
+    assert twin[0] == twin_beside[0]
+    np.testing.assert_array_equal(twin[1], twin_beside[1])
+
+
+def test_without_transmissions_a_weight_changes_no_bit(rt) -> None:
+    rendered, measured = images((24, 31), 2)
+    mask = mask_of((24, 31), "some")
+    for loss in (
+        lambda **data: on_device(rt, rendered, measured, mask, 0.2, **data),
+        lambda **data: image_loss(rendered, measured, mask, 0.2, **data),
+    ):
+        plain, weighed = loss(), loss(poisson_weight=3.0)
+        assert plain[0] == weighed[0]
+        np.testing.assert_array_equal(plain[1], weighed[1])
 
 
 def test_masked_pixels_pull_at_nothing(any_rt) -> None:

@@ -27,8 +27,9 @@ def test_kernel_is_its_twin(any_rt, shape) -> None:
     assert np.count_nonzero(flat) == np.count_nonzero(unpad_rows(flat, shape))
 
 
-def test_twin_is_the_mean_difference_along_every_axis() -> None:
-    volume = volume_of((5, 6, 7))
+@pytest.mark.parametrize("shape", [(5, 6, 7), (2, 3, 2)])
+def test_twin_is_the_mean_difference_along_every_axis(shape) -> None:
+    volume = volume_of(shape)
     expected = sum(np.abs(np.diff(volume, axis=axis)).mean() for axis in range(3))
     assert total_variation(volume)[0] == pytest.approx(expected, rel=FLOAT64)
 

@@ -55,6 +55,16 @@ def test_total_variation_by_hand() -> None:
     assert isotropic_tv(volume, (2.0, 1.0, 1.0)) == pytest.approx(3 * 4 + 4 * np.sqrt(6), rel=1e-12)
 
 
+@pytest.mark.parametrize(("axis_weights", "step"), [((1.0, 1.0, 1.0), 1 / 12), ((3.0, 2.0, 1.0), 1 / 56)])
+def test_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
+    """One over 4 Σ weights², the largest step that is sure to converge: by so much two unequal neighbours approach."""
+    volume = np.array([[[0.0, 1.0]]])
+    found = TvProx(any_rt, volume.shape, axis_weights)(volume, 1.0, 1, nonnegative=False)
+    twin = tv_prox(volume, 1.0, 1, nonnegative=False, axis_weights=axis_weights)
+    for values in (found, twin):
+        np.testing.assert_allclose(values, [[[step, 1 - step]]], rtol=1e-6)
+
+
 def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
     volume = volume_of((5, 6, 7)).astype(np.float32)
     goal = tv_prox(volume, 0.4, 4000, nonnegative=False)
@@ -97,3 +107,19 @@ def test_descent_twin_is_differentiated_right(finite_differences) -> None:
 def test_a_flat_volume_stays(rt) -> None:
     flat = np.full((4, 5, 6), 2.5, np.float32)
     np.testing.assert_array_equal(TvDescent(rt, flat.shape)(flat, 0.1, 3), flat)
+
+
+@pytest.mark.parametrize("step, share", [(1e-8, 1 / 2), (3e-8, 3 / 4), (1.0, 1.0)])
+def test_steps_of_the_size_of_rounding_count_less(any_rt, step, share) -> None:
+    """The length of a difference is counted 1e-8 too long, as in TIGRE."""
+    volume = np.array([[[0.0, step]]])
+    for gradient in (tv_gradient(volume), TvDescent(any_rt, volume.shape).gradient(volume)):
+        np.testing.assert_allclose(gradient, [[[-share, share]]], rtol=1e-6)
+
+
+def test_descent_leaves_the_volume_it_was_given(rt) -> None:
+    volume = volume_of((3, 4, 5)).astype(np.float32)
+    before = volume.copy()
+    descent = TvDescent(rt, volume.shape)
+    assert np.any(descent(volume, 0.05, 2) != before)
+    np.testing.assert_array_equal(volume, before)

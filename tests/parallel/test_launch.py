@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.commands import ranks as commands
+from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.parallel import Launch, Shares, launched, sorted_columns, span
 from phyradgs_cl.runtime import device as devices
 
@@ -138,3 +139,28 @@ def test_without_mpi4py_one_line_says_what_to_install(tmp_path, rank) -> None:
         'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
     ]
     assert done.stderr.splitlines() == (said if rank == 0 else [])
+
+
+@pytest.mark.parametrize(
+    ("error", "words", "status"),
+    [
+        (InputError("scan.h5", "nothing", "a scan"), "scan.h5: found nothing; expected a scan\n", 2),
+        (OutputError("volume.h5", "no room"), "volume.h5: found no room\n", 4),
+        (KeyboardInterrupt(), "interrupted, nothing written\n", 130),
+    ],
+)
+@pytest.mark.parametrize("rank", [0, 2])
+def test_the_last_words_of_a_rank(error, words, status, rank, monkeypatch, capfd) -> None:
+    monkeypatch.setenv("PMI_RANK", str(rank))
+    monkeypatch.setenv("PMI_SIZE", "3")
+    monkeypatch.setattr(commands.signals, "farewell", commands.signals.NOTHING)
+    monkeypatch.setattr(commands.signals, "number", 2)
+    assert commands.last_words(error) == status
+    assert capfd.readouterr().err == f"phyradgs: {'rank 2: ' if rank else ''}{words}"
+
+
+def test_a_defect_is_said_with_where_it_was(monkeypatch, capfd) -> None:
+    assert commands.last_words(ZeroDivisionError("a defect")) == 1
+    assert capfd.readouterr().err.startswith("phyradgs: ZeroDivisionError: a defect")
+    monkeypatch.setattr(commands.os, "write", lambda *_: (_ for _ in ()).throw(BrokenPipeError()))
+    assert commands.last_words(InputError("scan.h5")) == 2  # a stderr that is gone costs no status

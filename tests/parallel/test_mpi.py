@@ -114,7 +114,7 @@ def ranks_of(launcher: subprocess.Popen) -> dict[int, int]:
     for pid in descendants(launcher.pid):
         words = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
         given = dict(word.split(b"=", 1) for word in words if b"=" in word)
-        if b"PMI_RANK" in given and b"phyradgs" in Path(f"/proc/{pid}/cmdline").read_bytes():
+        if b"PMI_RANK" in given and b"reconstruct" in Path(f"/proc/{pid}/cmdline").read_bytes():
             found[int(given[b"PMI_RANK"])] = pid
     return found
 

@@ -1,0 +1,79 @@
+"""Runs of a sweep or a watched folder: they go on from their own checkpoint, and from no other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import checkpoint_path
+from phyradgs_cl.reconstructors import Progress
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.workflow import ReconstructionJob
+from phyradgs_cl.workflow.resumable import go_on, is_whole
+
+
+class Report:
+    """Notes the iterations that were reported, and presses Ctrl-C at one of them."""
+
+    def __init__(self, stop_at: int | None = None) -> None:
+        self.stop_at = stop_at
+        self.seen: list[int] = []
+
+    def __call__(self, progress: Progress) -> None:
+        self.seen.append(progress.iteration)
+        if progress.iteration == self.stop_at:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture
+def job(tiny_scan: Path, tmp_path: Path) -> ReconstructionJob:
+    return ReconstructionJob(tiny_scan, tmp_path / "volume.h5", method="sirt", changes={"iterations": 6})
+
+
+def stopped(job: ReconstructionJob, rt: Runtime) -> bytes:
+    """The checkpoint of a run that was stopped in the middle."""
+    result, _ = go_on(job, lambda: rt, Report(stop_at=3))
+    assert not is_whole(result)
+    return checkpoint_path(job.output).read_bytes()
+
+
+def test_a_stopped_run_goes_on_to_the_same_bits(job, rt, tmp_path) -> None:
+    stopped(job, rt)
+    rest = Report()
+    result, _ = go_on(job, lambda: rt, rest)
+    assert is_whole(result) and min(rest.seen) > 3
+    alone, _ = go_on(replace(job, output=tmp_path / "alone.h5"), lambda: rt, Report())
+    np.testing.assert_array_equal(result.volume, alone.volume)
+    assert not checkpoint_path(job.output).exists()
+
+
+@pytest.mark.parametrize("what", ["damaged", "of another seed", "empty"])
+def test_a_checkpoint_that_does_not_fit_is_set_aside(job, rt, what) -> None:
+    content = stopped(job, rt)
+    if what == "of another seed":
+        job = replace(job, seed=1)
+    else:
+        content = content[: len(content) // 2 if what == "damaged" else 0]
+        checkpoint_path(job.output).write_bytes(content)
+    whole = Report()
+    result, _ = go_on(job, lambda: rt, whole)
+    assert is_whole(result) and min(whole.seen) <= 3
+    aside = Path(f"{checkpoint_path(job.output)}.bak")
+    assert aside.read_bytes() == content
+
+
+def test_what_is_wrong_with_the_scan_is_said(job, rt) -> None:
+    stopped(job, rt)
+    with pytest.raises(InputError, match="none.h5"):
+        go_on(replace(job, scan=job.scan.with_name("none.h5")), lambda: rt, Report())
+    assert checkpoint_path(job.output).exists()
+
+
+def test_a_method_without_checkpoints_begins_anew(job, rt) -> None:
+    stopped(job, rt)
+    result, _ = go_on(replace(job, method="fdk", changes={}), lambda: rt, Report())
+    assert is_whole(result)
