@@ -14,7 +14,10 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.parallel.communicator import Alone, Communicator
 from phyradgs_cl.parallel.launch import Launch, launched
 
-_PATIENCE_S, _LATER_S = 5.0, 0.5  # of rank 0, and how much later each next one gives up: one alone is to speak
+_PATIENCE_S, _LATER_S = (
+    5.0,
+    0.5,
+)  # of rank 0, and how much later each next one gives up: one alone is to speak
 _MOST_VALUES = 1 << 26  # of one call: counts of MPI before its version 4 end at 2³¹
 
 

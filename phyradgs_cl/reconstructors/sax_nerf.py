@@ -7,28 +7,15 @@ from __future__ import annotations
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.neural import LineOptions
+from phyradgs_cl.reconstructors.naf import NAF_PUBLISHED
 from phyradgs_cl.reconstructors.neural_run import reconstruct_neural
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.runtime import Runtime
 
-# The released configuration Lineformer/chest_50
-SAX_PUBLISHED = LineOptions(
-    iterations=1500,
-    rays=1024,
-    samples=256,
-    jitter="sample",
-    positive_only=True,
-    voxel_points=1,
-    levels=16,
-    base_resolution=16,
-    table_log2=19,
-    density_bound=1.0,
-    first_share=0.5,
-    rate=1e-3,
-    rate_factor=0.1,
-    rate_step=1500,
-)
-SAX_PRESETS = {"default": LineOptions(rays=128, windows=2), "published": SAX_PUBLISHED}
+# The released configuration Lineformer/chest_50: that of NAF, with 256 samples for 128 voxels
+SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
+# Windows do not change the expected gradient of a squared error, and of few pixels a step they leave it to noise
+SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
 
 
 def sax_nerf(

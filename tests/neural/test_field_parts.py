@@ -135,6 +135,25 @@ def test_a_voxel_is_the_mean_over_its_points() -> None:
     assert not np.allclose(whole, voxel_values(field, grid, CPU, 10**6), rtol=0.01)
 
 
+def test_a_volume_does_not_depend_on_how_its_axes_are_called() -> None:
+    """Attention couples neighbours, and voxels are to have them along every axis alike."""
+    field = first_field(LineOptions(), 8, 0)
+    with torch.no_grad():
+        field.encoding.table.uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+
+    class Renamed(torch.nn.Module):
+        segment = field.segment
+
+        def forward(self, positions: torch.Tensor) -> torch.Tensor:
+            return field(positions[:, [1, 2, 0]])  # its x is the field's z, its y the field's x
+
+    grid = Grid((2, 4, 6), (1 / 3, 1 / 3, 1 / 3))
+    found = voxel_values(Renamed(), Grid((4, 6, 2), grid.voxel_size_mm), CPU, 1000)  # y, x, z of the field's
+    expected = voxel_values(field, grid, CPU, 1000)
+    assert np.allclose(found.transpose(2, 0, 1), expected, rtol=1e-5)
+    assert expected.std() > 0.01 * expected.mean()
+
+
 def test_the_field_starts_at_its_share_of_the_bound() -> None:
     positions = torch.rand(100, 3) * 2 - 1
     for share in (0.05, 0.5):
@@ -180,6 +199,15 @@ def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
     assert usable[tuple(pixels.T)].all()
     every = windows_and_scattered_pixels(usable, 10_000, 100, 4, rng)
     assert len(every) == usable.sum()
+
+
+def test_windows_favour_no_pixel() -> None:
+    """Every pixel is as likely as any other, so that windows change a step's noise and not what it fits."""
+    rng, usable, counts = np.random.default_rng(0), np.ones((16, 12), bool), np.zeros((16, 12))
+    for _ in range(4000):
+        counts[tuple(windows_and_scattered_pixels(usable, 40, 2, 4, rng).T)] += 1
+    likely = (40 + 2 * 16) / usable.size
+    assert np.abs(counts / 4000 - likely).max() < 5 * np.sqrt(likely * (1 - likely) / 4000)
 
 
 def test_times_are_drawn_evenly_and_without_repeats() -> None:
