@@ -28,9 +28,7 @@ def read_npz(
     except OSError as error:
         reason = f" ({error.strerror})" if error.strerror else ""
         raise InputError(str(path), f"a damaged {what}{reason}", "a whole one", remedy) from error
-    except (
-        Exception
-    ) as error:  # zipfile, zlib and NumPy's parser of headers hand on whatever they stumble over
+    except Exception as error:  # zipfile, zlib and NumPy's parser hand on whatever they stumble over
         raise InputError(str(path), f"a damaged {what}", "a whole one", remedy) from error
 
 
