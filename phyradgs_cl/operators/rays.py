@@ -19,7 +19,7 @@ from phyradgs_cl.operators.layout import GUARD, pitch_of, projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _RAY_CELL_FLOATS = 16
-_BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
+BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
 _WIDEST = 16  # cells are read as vectors, which may run past the last one
 # voxels (x, y, z) of one owner where work-items are bricks; kept in local memory, with a border of 1 around
 _BRICK = (32, 32, 8)
@@ -56,7 +56,7 @@ class RayLayout:
     @property
     def volume_floats(self) -> int:
         nz, ny, nx = self.brick.shape
-        return 2 * GUARD + (nz + 2 * _BORDER) * (ny + 2 * _BORDER) * pitch_of(nx)
+        return 2 * GUARD + (nz + 2 * BORDER) * (ny + 2 * BORDER) * pitch_of(nx)
 
     def frames_floats(self, count: int) -> int:
         return 2 * GUARD + count * self.lines * pitch_of(self.width)
@@ -67,8 +67,8 @@ class RayLayout:
     def inside(self, flat: np.ndarray) -> np.ndarray:
         """The volume (z, y, x) as a view of its padded floats."""
         nz, ny, nx = self.brick.shape
-        padded = flat[GUARD:-GUARD].reshape(nz + 2 * _BORDER, ny + 2 * _BORDER, pitch_of(nx))
-        return padded[_BORDER:-_BORDER, _BORDER:-_BORDER, :nx]
+        padded = flat[GUARD:-GUARD].reshape(nz + 2 * BORDER, ny + 2 * BORDER, pitch_of(nx))
+        return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
     def pad_volume(self, volume: np.ndarray) -> np.ndarray:
         flat = np.zeros(self.volume_floats, np.float32)

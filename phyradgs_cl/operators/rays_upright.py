@@ -12,14 +12,13 @@ import numpy as np
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.layout import GUARD, pitch_of
-from phyradgs_cl.operators.rays import RayCells, RayLayout, lines_first, ray_constants
+from phyradgs_cl.operators.rays import BORDER, RayCells, RayLayout, lines_first, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _LINES = 128  # of a detector column for a work-item
 _VOXELS = 512  # of a column of the volume that they may meet in one slice
 _UPRIGHT = 1e-6  # voxels: how far a ray may lean over the whole detector
 _TURN = 16  # voxels along x and z that are turned at a time; as in cl/rays_upright.cl
-_BORDER = 1
 
 
 def upright_block(grid: Grid, tables: Sequence[TimeCells], width: int, lanes: int) -> int:
@@ -52,7 +51,7 @@ def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray
 def columns_floats(grid: Grid) -> int:
     """What the turned volume takes."""
     nz, ny, nx = grid.shape
-    return 2 * GUARD + (ny + 2 * _BORDER) * (nx + 2 * _BORDER) * pitch_of(nz)
+    return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 
 
 def launch_upright(
