@@ -125,10 +125,14 @@ class _Trials:
         seconds, self.device_bytes = time.perf_counter() - begun, self.rt.peak_bytes
         return seconds
 
+    def least(self, iterations: int) -> float:
+        """The shorter of two runs, without density control: what else the machine does can only add to one."""
+        return min(self.run(iterations) - self.control_s for _ in range(2))
+
     @property
     def control_s(self) -> float:
-        """Seconds of the last run in density control."""
-        return float(self.last.facts["density_control_seconds"])
+        """Seconds of the last run in density control, which only clouds have."""
+        return float(self.last.facts.get("density_control_seconds", 0.0))
 
     @property
     def has_grown(self) -> bool:
@@ -150,7 +154,7 @@ def shortened(options: Any, iterations: int) -> Any:
 def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) -> tuple[float, float]:
     """(seconds of a whole run, seconds of one of its iterations), of a run that changes on its way.
 
-    ``few`` iterations, twice, tell what a run takes beside its iterations; ``more`` go through all of its schedule. Those
+    ``few`` iterations, repeated, tell what a run takes beside its iterations; ``more`` go through all of its schedule. Those
     have as many rounds of density control as the whole run, so that what these take is kept apart. A cloud that grows does
     so faster in a short run, where gradients are larger: then a longer one, up to a fifth of the whole, says more.
     """
@@ -163,13 +167,15 @@ def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) ->
         warm_s = trials.run(total)  # the first has built the kernels, for this one too
         return first_s + (1 - few / total) * warm_s, warm_s / total
     first_s -= early_control_s
-    again_s = trials.run(few) - trials.control_s
-    through_s = trials.run(more)
+    again_s = trials.least(few)
+    through_s = trials.run(more) - trials.control_s
     if trials.has_grown and total > _GROWTH_TRIALS * more:
         more *= _GROWTH_TRIALS
-        through_s = trials.run(more)
+        through_s = trials.run(more) - trials.control_s
+    else:
+        through_s = min(through_s, trials.run(more) - trials.control_s)
     rounds = trials.last.facts["density_control_rounds"]
-    each_s = max(through_s - trials.control_s - again_s, 0.0) / (more - few)
+    each_s = max(through_s - again_s, 0.0) / (more - few)
     control_s = trials.control_s * _rounds(options) / max(rounds, 1)
     return first_s + (total - few) * each_s + control_s, each_s + control_s / total
 
@@ -185,10 +191,10 @@ def _of_alike(trials: _Trials, total: int, few: int, more: int) -> tuple[float, 
     if total <= few:  # the first has built the kernels, which the run will find built
         whole_s = trials.run(total)
         return first_s, whole_s / max(total, 1)
-    again_s = trials.run(few)
+    again_s = trials.least(few)
     while True:
         more = min(more, total)
-        more_s = trials.run(more)
+        more_s = trials.least(more)
         if more_s - again_s >= _LEAST_DIFFERENCE_S or more == total or more >= _MOST_ALIKE:
             break
         more *= 4
