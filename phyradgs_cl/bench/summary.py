@@ -50,26 +50,31 @@ def lines_of(job: BenchJob, lines: Sequence[Line]) -> list[Line]:
 
 
 def summarise(lines: Sequence[Line]) -> Summary | None:
-    """Means of each number over volumes, then over seeds; None without lines."""
+    """Means over volumes of means over seeds; None without lines.
+
+    Few volumes may have been run with several seeds. A spread is that of the mean over those volumes that have them all:
+    that of other volumes, which have one, would tell of volumes and not of seeds.
+    """
     if not lines:
         return None
-    by_seed: dict[int, list[dict[str, float]]] = defaultdict(list)
-    for line in lines:
-        numbers = {name: value for name, value in line["metrics"].items() if value is not None}
-        if "seconds" in line:  # lines about the truth have none
-            numbers["seconds"] = line["seconds"]
-        by_seed[line["seed"]].append(numbers)
-    names = {name for runs in by_seed.values() for run in runs for name in run}
+    found = [(line["volume"], line["seed"], _numbers(line)) for line in lines]
+    names = {name for _, _, numbers in found for name in numbers}
     mean, spread = {}, {}
     for name in names:
-        per_seed = [_mean(runs, name) for runs in by_seed.values()]
-        known = [value for value in per_seed if value is not None]
-        mean[name] = float(np.mean(known))
-        if len(known) > 1:
-            spread[name] = float(np.std(known, ddof=1))
-    return Summary(mean, spread, len({line["volume"] for line in lines}), len(by_seed))
+        values: dict[str, dict[int, float]] = defaultdict(dict)
+        for volume, seed, numbers in found:
+            if name in numbers:
+                values[volume][seed] = numbers[name]
+        mean[name] = float(np.mean([np.mean(list(of_seeds.values())) for of_seeds in values.values()]))
+        seeds = {seed for of_seeds in values.values() for seed in of_seeds}
+        several = [of_seeds for of_seeds in values.values() if set(of_seeds) == seeds]
+        if len(seeds) > 1 and several:
+            per_seed = [np.mean([of_seeds[seed] for of_seeds in several]) for seed in sorted(seeds)]
+            spread[name] = float(np.std(per_seed, ddof=1))
+    return Summary(mean, spread, len({volume for volume, _, _ in found}), len({seed for _, seed, _ in found}))
 
 
-def _mean(runs: Sequence[dict[str, float]], name: str) -> float | None:
-    values = [run[name] for run in runs if name in run]
-    return float(np.mean(values)) if values else None
+def _numbers(line: Line) -> dict[str, float]:
+    """A line's measures, with the times it has: lines about the truth have none, those of early versions one."""
+    numbers = {name: value for name, value in line["metrics"].items() if value is not None}
+    return numbers | {name: line[name] for name in ("seconds", "processor_s") if name in line}

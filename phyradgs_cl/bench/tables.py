@@ -18,7 +18,7 @@ from phyradgs_cl.io import written_beside
 
 METRICS = (
     "psnr_db", "ssim", "psnr_2d_db", "ssim_2d", "psnr_db_pseudo", "ssim_pseudo", "roundness", "roundness_rms",
-    "centre_shift_mm", "edge_rise_mm", "bias_balls", "bias_holder", "seconds",
+    "centre_shift_mm", "edge_rise_mm", "bias_balls", "bias_holder", "seconds", "processor_s",
 )  # fmt: skip
 _FACTS = ("study", "size", "voxels", "pixels", "iterations", "axis", "protocol", "row", "acquisition")
 Cell = Callable[[Summary], str]
@@ -160,7 +160,7 @@ _SYNTHETIC_COLUMNS: dict[str, Cell] = {
     "SSIM": _number("ssim", 3),
     "2D PSNR (dB)": _number("psnr_2d_db", 2),
     "2D SSIM": _number("ssim_2d", 3),
-    "seconds": _number("seconds", 1),
+    "processor s": _number("processor_s", 1),
 }
 _PHANTOM_COLUMNS: dict[str, Cell] = {
     "PSNR to pseudo-truth (dB)": _number("psnr_db_pseudo", 2),
@@ -174,7 +174,7 @@ _PHANTOM_COLUMNS: dict[str, Cell] = {
     "rise (mm)": _number("edge_rise_mm", 2),
     "bias balls (%)": _number("bias_balls", 1, 100),
     "bias holder (%)": _number("bias_holder", 1, 100),
-    "seconds": _number("seconds", 1),
+    "processor s": _number("processor_s", 1),
 }
 
 
@@ -242,7 +242,7 @@ def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
     machines = sorted({f"{line['device']} ({line['platform']})" for line in lines})
     return [
         f"{scan} Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is "
-        "the standard deviation over seeds where there are several.",
+        "the standard deviation over seeds of the mean over those volumes that were run with all of them.",
         "",
         f"All splatting rows start with {job.gaussians:,} Gaussians (or one for every voxel that attenuates, where "
         f"those are fewer) and run {size.iterations:,} iterations of one frame each; {_FAIRNESS}",
@@ -256,8 +256,9 @@ _FAIRNESS = (
     "the other methods run as many as their own defaults say. Rows of R2-Gaussian keep its published learning rates and "
     'weights, made for 30,000 iterations; the row "R2-Gaussian (settings of PhyRadGS)" (--rows) has ours. The column '
     "stop-and-shoot is the same method with a static model on a scan from the mid-window angles of the fly-scan: what "
-    "motion correction could reach at best. Seconds are those of the reconstruction, kernel builds of a first run "
-    "included. 2D numbers compare projections with noise-free ones half-way between the training angles, at true scale. "
+    "motion correction could reach at best. Processor seconds are of all threads of a reconstruction, kernel builds of a "
+    "first run included, and can be compared where other work ran beside; lines of early versions have none. 2D numbers "
+    "compare projections with noise-free ones half-way between the training angles, at true scale. "
     "The paper's numbers are of other volumes, sizes and hardware."
 )
 _SYNTHETIC_NOTE = (

@@ -27,6 +27,7 @@ from phyradgs_cl.bench import rows as bench_rows
 from phyradgs_cl.bench.figures import read_slices, slices_path, write_slices
 from phyradgs_cl.bench.published import TABLE1, TABLE2
 from phyradgs_cl.bench.results import KEY, Present, append_line, read_lines
+from phyradgs_cl.bench.summary import summarise
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError, OutputError
 
@@ -227,3 +228,18 @@ def test_every_default_row_has_options() -> None:
 def test_sizes_of_ones_own_are_checked() -> None:
     with pytest.raises(InputError, match="voxels of a benchmark size"):
         BenchSize("T", 1, 8, 1)
+
+
+def test_a_spread_tells_of_seeds_and_not_of_volumes() -> None:
+    """Three volumes with one seed, one of them with two: its two seeds are the spread, and it weighs as any other."""
+    found = [("a", 0, 20.0), ("b", 0, 30.0), ("c", 0, 40.0), ("a", 1, 22.0)]
+    lines = [{"volume": v, "seed": seed, "metrics": {"psnr_db": db, "ssim": None}} for v, seed, db in found]
+    lines[-1]["processor_s"] = 3.0
+    summary = summarise(lines)
+    assert summary is not None
+    assert summary.mean == {"psnr_db": pytest.approx((21 + 30 + 40) / 3), "processor_s": 3.0}
+    assert summary.spread == {"psnr_db": pytest.approx(np.std([20, 22], ddof=1))}
+    assert (summary.volumes, summary.seeds) == (3, 2)
+    apart = summarise([lines[1], lines[3]])  # seeds of different volumes: their difference is that of volumes
+    assert apart is not None and apart.spread == {}
+    assert summarise([]) is None
