@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
 _LARGEST_SHARE = 0.1  # of the largest line integral
@@ -27,8 +27,8 @@ def check_coverage(scan: Scan) -> Finding:
     object, or another sign; line integrals beyond 30 are something else.
     """
     p = np.asarray(scan.projections)
-    if p.shape[2] < 8:
-        return Finding(_QUESTION, CANNOT_TELL, 0.0, 0.0, "line integral", "fewer than 8 columns")
+    if p.shape[2] < FEWEST_COLUMNS:
+        return too_narrow(_QUESTION, "line integral")
     valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, p.shape)
     largest = float(np.percentile(p if valid is None else p[valid], 99.9))
     noise = _NOISES * noise_level(p, valid)

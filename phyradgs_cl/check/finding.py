@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
+FEWEST_COLUMNS = 8  # four gave false alarms, five did not
 
 
 @dataclass(frozen=True)
@@ -28,3 +29,8 @@ class Finding:
     def facts(self) -> dict[str, object]:
         """The fields as plain values, for JSON."""
         return asdict(self)
+
+
+def too_narrow(question: str, unit: str) -> Finding:
+    """The answer to a question about columns, of a panel that has too few."""
+    return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")

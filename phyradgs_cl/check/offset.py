@@ -21,7 +21,7 @@ _MOST_STEPS = 8
 _TOLERATED = 0.2  # coarse pixels
 _LEAST_TOLERATED = 0.5  # pixels
 _DEVIATIONS = 4.0
-_QUESTION = "centre of rotation"
+CENTRE = "centre of rotation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +72,12 @@ def check_offset(offset: Offset, block: int, pitch_mm: float) -> Finding:
     """The shift against half a pixel, a fifth of a coarse pixel of ``block``, and four standard deviations."""
     threshold = max(_LEAST_TOLERATED, _TOLERATED * block, _DEVIATIONS * offset.spread)
     if not (math.isfinite(offset.pixels) and math.isfinite(offset.spread)):
-        return Finding(_QUESTION, CANNOT_TELL, 0.0, _LEAST_TOLERATED, "pixels", "no shift fits best")
+        return Finding(CENTRE, CANNOT_TELL, 0.0, _LEAST_TOLERATED, "pixels", "no shift fits best")
     shift_mm = offset.pixels * pitch_mm
     text = f"the panel is {offset.pixels:+.2f} ± {offset.spread:.2f} pixels ({shift_mm:+.4g} mm) from where it is said to be"
     value = (offset.pixels, threshold, "pixels", text)
     if abs(offset.pixels) <= threshold:
         verdict = OK if threshold <= block else CANNOT_TELL
-        return Finding(_QUESTION, verdict, *value, uncertainty=offset.spread)
+        return Finding(CENTRE, verdict, *value, uncertainty=offset.spread)
     advice = f"add {shift_mm:.4g} mm to detector_offset along u: --fix-offset writes a copy of the scan"
-    return Finding(_QUESTION, SUSPICIOUS, *value, advice, offset.spread)
+    return Finding(CENTRE, SUSPICIOUS, *value, advice, offset.spread)

@@ -8,7 +8,7 @@ from phyradgs_cl.check.statistics import gain, standing
 
 _ERRORS = 3.0
 _LEAST_GAIN, _CLEAR_GAIN = 1.02, 3.0
-_QUESTION = "sign of rotation"
+SIGN = "sign of rotation"
 
 
 def is_clear(stated: Offset, other: Offset) -> bool:
@@ -26,9 +26,9 @@ def check_rotation(stated: Offset, other: Offset) -> Finding:
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
     if errors >= _ERRORS and ratio >= _LEAST_GAIN:
-        return Finding(_QUESTION, OK, *values)
+        return Finding(SIGN, OK, *values)
     if errors <= -_ERRORS and ratio <= 1 / _LEAST_GAIN:
         advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
-        return Finding(_QUESTION, SUSPICIOUS, *values, advice)
+        return Finding(SIGN, SUSPICIOUS, *values, advice)
     advice = "look for a feature whose side is known: a mirror image would fit as well"
-    return Finding(_QUESTION, CANNOT_TELL, *values, advice)
+    return Finding(SIGN, CANNOT_TELL, *values, advice)

@@ -15,11 +15,11 @@ from phyradgs_cl.check.coarse import FINE, QUICK, coarse
 from phyradgs_cl.check.coverage import check_coverage
 from phyradgs_cl.check.dead_pixels import check_dead_pixels
 from phyradgs_cl.check.exposure import check_exposure
-from phyradgs_cl.check.finding import SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import FEWEST_COLUMNS, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.check.gain import best_level, check_gain, without_drift
-from phyradgs_cl.check.offset import Offset, best_offset, block_of, check_offset, rough_offset
+from phyradgs_cl.check.offset import CENTRE, Offset, best_offset, block_of, check_offset, rough_offset
 from phyradgs_cl.check.readout import check_readout
-from phyradgs_cl.check.rotation import check_rotation, is_clear
+from phyradgs_cl.check.rotation import SIGN, check_rotation, is_clear
 from phyradgs_cl.check.saturation import CountReader, check_saturation
 from phyradgs_cl.check.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
@@ -69,6 +69,26 @@ def check(
     scan = _without(scan, dead)
     add(check_coverage(scan))
     quick = coarse(scan, QUICK)
+    is_reversed, offset, centre = _turning(rt, quick, add)
+    pitch_mm = scan.geometry.pixel_size_mm[1]
+    quick = _under(quick, is_reversed, offset, centre)
+    drift, level = _gain(rt, quick, add)
+    if scan.is_fly and scan.shutter.readout_s > 0:
+        fine = _under(coarse(scan, FINE), is_reversed, offset, centre)
+        add(check_readout(rt, without_drift(fine, drift, level)))
+    if scan.is_fly and scan.shutter.exposure_s > 0:
+        add(check_exposure(rt, without_drift(quick, drift, level)))
+    return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
+
+
+def _turning(rt: Runtime, quick: Scan, add: Callable[[Finding], Finding]) -> tuple[bool, Offset, Finding]:
+    """(whether the gantry turns the other way, where its axis is on the panel, what was found about the axis).
+
+    A panel of few columns says neither: its reconstructions fit whatever the shift.
+    """
+    if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
+        add(too_narrow(SIGN, "standard errors"))
+        return False, Offset(math.nan, math.nan, np.empty(0)), add(too_narrow(CENTRE, "pixels"))
     turned = reversed_rotation(quick)
     stated, other = rough_offset(rt, quick), rough_offset(rt, turned)
     was_clear = is_clear(stated, other)
@@ -78,16 +98,8 @@ def check(
     offset = other if is_reversed else stated
     if was_clear:
         offset = best_offset(rt, turned if is_reversed else quick, offset)
-    pitch_mm = scan.geometry.pixel_size_mm[1]
-    centre = add(check_offset(offset, block_of(quick), pitch_mm))
-    quick = _under(quick, is_reversed, offset, centre)
-    drift, level = _gain(rt, quick, add)
-    if scan.is_fly and scan.shutter.readout_s > 0:
-        fine = _under(coarse(scan, FINE), is_reversed, offset, centre)
-        add(check_readout(rt, without_drift(fine, drift, level)))
-    if scan.is_fly and scan.shutter.exposure_s > 0:
-        add(check_exposure(rt, without_drift(quick, drift, level)))
-    return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
+    block = block_of(quick)
+    return is_reversed, offset, add(check_offset(offset, block, quick.geometry.pixel_size_mm[1] / block))
 
 
 def _usable(scan: Scan) -> Scan:

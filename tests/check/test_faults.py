@@ -51,6 +51,20 @@ def test_the_wrong_sign_of_rotation(rt, clean) -> None:
     assert [f.question for f in found.suspicious] == ["sign of rotation"]
 
 
+@pytest.mark.parametrize(
+    ("rows", "columns", "verdict"),
+    [(64, 1, CANNOT_TELL), (64, 4, CANNOT_TELL), (64, 8, OK), (1, 64, OK), (1, 1, CANNOT_TELL)],
+)
+def test_strips_of_a_panel_raise_no_false_alarm(rt, rows, columns, verdict) -> None:
+    """Blocks are no larger than the panel's shorter side, and few columns say nothing about the axis."""
+    geometry = ConeGeometry(5.0, 7.0, (rows, columns), (0.0625, 0.0625))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
+    options = SimulationOptions(protocol=make_protocol("rapid"), noise="tigre", time_samples=8)
+    found = check(simulate(scene.source, geometry, scene.grid, options), rt)
+    assert verdicts(found)["sign of rotation"] == verdicts(found)["centre of rotation"] == verdict
+    assert np.isnan(found.offset_mm) == (verdict == CANNOT_TELL)
+
+
 def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt) -> None:
     geometry = ConeGeometry(500.0, 700.0, (32, 32), (0.125, 0.125))
     scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
