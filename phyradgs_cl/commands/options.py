@@ -194,9 +194,3 @@ MedianFilter = Annotated[
     int | None,
     typer.Option(help="Median filter of the frames: 3 or 5 pixels a side, 0 none.", show_default="0"),
 ]
-
-
-def given_options(**values: Any) -> dict[str, Any]:
-    """Options by name as settings take them: the words of choices, and None for flags that are not raised."""
-    plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
-    return {name: None if value is False else value for name, value in plain.items()}

@@ -9,38 +9,13 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say
-from phyradgs_cl.commands.options import (
-    Assignments,
-    Batch,
-    Config,
-    Device,
-    GaussianCount,
-    IgnoreLag,
-    Iterations,
-    LineModel,
-    MedianFilter,
-    Memory,
-    Method,
-    MotionModel,
-    Output,
-    Parts,
-    Preset,
-    Seed,
-    Segments,
-    Split,
-    Strips,
-    SubIntervals,
-    TimeError,
-    file_argument,
-    file_option,
-    given_options,
-)
+from phyradgs_cl.commands.options import Output, file_argument, file_option
 from phyradgs_cl.commands.ranks import last_words
+from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import run_settings
 from phyradgs_cl.workflow import ReconstructionJob, profile_report, run_reconstruction
 
 EXAMPLE = (
@@ -49,27 +24,11 @@ EXAMPLE = (
 )
 
 
+@with_run_options()
 def reconstruct_command(
     scan: Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")],
     output: Output,
-    method: Method = None,
-    motion: MotionModel = None,
-    strips: Strips = None,
-    sub_intervals: SubIntervals = None,
-    segments: Segments = None,
-    time_error: TimeError = None,
-    iterations: Iterations = None,
-    gaussians: GaussianCount = None,
-    seed: Seed = None,
-    preset: Preset = None,
-    batch: Batch = None,
-    split: Split = None,
-    parts: Parts = None,
-    config: Config = None,
-    assignments: Assignments = None,
-    detector_model: LineModel = None,
-    ignore_lag: IgnoreLag = False,
-    median_filter: MedianFilter = None,
+    request: RunRequest,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoint of an interrupted run.")
     ] = False,
@@ -92,31 +51,9 @@ def reconstruct_command(
             "--profile", help="Say where the device's time went, kernel by kernel, beside its best rates."
         ),
     ] = False,
-    device: Device = None,
-    memory: Memory = None,
 ) -> None:
     """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
-    given = given_options(
-        method=method,
-        motion=motion,
-        strips=strips,
-        sub_intervals=sub_intervals,
-        segments=segments,
-        time_error=time_error,
-        iterations=iterations,
-        gaussians=gaussians,
-        seed=seed,
-        preset=preset,
-        batch=batch,
-        split=split,
-        parts=parts,
-        detector_model=detector_model,
-        ignore_lag=ignore_lag,
-        median_filter=median_filter,
-        device=device,
-        memory=memory,
-    )
-    settings = run_settings(config, given, assignments or [])
+    settings = request.settings()
     job = ReconstructionJob(
         scan,
         output,
@@ -125,7 +62,7 @@ def reconstruct_command(
         preset=settings.preset,
         changes=settings.changes,
         resume=resume,
-        config=config,
+        config=request.config,
         before=settings.before,
         checkpoint_every_s=checkpoint_every,
     )

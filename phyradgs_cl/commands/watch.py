@@ -9,23 +9,11 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say
-from phyradgs_cl.commands.options import (
-    Assignments,
-    Config,
-    Device,
-    Iterations,
-    Memory,
-    Method,
-    MotionModel,
-    Preset,
-    Seed,
-    file_argument,
-    given_options,
-)
+from phyradgs_cl.commands.options import file_argument
+from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import run_settings
 from phyradgs_cl.workflow import ReconstructionJob
 from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch
 
@@ -35,19 +23,14 @@ EXAMPLE = (
 )
 
 
+@with_run_options("batch", "split", "parts")
 def watch_command(
     folder: Annotated[Path, file_argument("FOLDER", "Folder in which scans arrive, as *.h5.")],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="DIR", help="Folder for a volume, or an error, of each scan."),
     ],
-    method: Method = None,
-    motion: MotionModel = None,
-    iterations: Iterations = None,
-    preset: Preset = None,
-    seed: Seed = None,
-    config: Config = None,
-    assignments: Assignments = None,
+    request: RunRequest,
     once: Annotated[
         bool, typer.Option("--once", help="End when every complete scan has its volume or its error.")
     ] = False,
@@ -66,20 +49,9 @@ def watch_command(
         float,
         typer.Option(metavar="SECONDS", help="Keep a checkpoint of the run under way so often."),
     ] = 600.0,
-    memory: Memory = None,
-    device: Device = None,
 ) -> None:
     """Reconstruct the scans of a folder as they arrive, each once; failures are set aside with their message."""
-    given = given_options(
-        method=method,
-        motion=motion,
-        iterations=iterations,
-        preset=preset,
-        seed=seed,
-        device=device,
-        memory=memory,
-    )
-    settings = run_settings(config, given, assignments or [])
+    settings = request.settings()
     template = ReconstructionJob(
         folder,
         output,
@@ -87,7 +59,7 @@ def watch_command(
         preset=settings.preset,
         changes=settings.changes,
         seed=settings.seed,
-        config=config,
+        config=request.config,
         before=settings.before,
         checkpoint_every_s=checkpoint_every,
     )
