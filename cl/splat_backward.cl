@@ -36,7 +36,7 @@
 typedef struct { vf of[SUM_COUNT]; } moving_sums;
 
 /* adds what the pixels u.. of a line contribute; h: gradient by the pixels */
-SPLAT_INLINE void moving_gather(moving_sums *sum, const moving_line s, const float amp, const float speed,
+ALWAYS_INLINE void moving_gather(moving_sums *sum, const moving_line s, const float amp, const float speed,
                                 const float middle, const float half_time, const float dv, const vf u, const vf du,
                                 const float limit, const vf h)
 {

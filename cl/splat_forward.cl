@@ -13,7 +13,7 @@
         V_STORE(V_LOAD(row + u) + V_PICK(0.0f, moving_value(rule, s, p), p.drawn), row + u);   \
     }
 
-SPLAT_INLINE void moving_add_line(const moving_line s, const int u_lo, const int u_hi, const int u_whole,
+ALWAYS_INLINE void moving_add_line(const moving_line s, const int u_lo, const int u_hi, const int u_whole,
                                   const float u_rest, const float limit, __global float *row)
 {
     if (s.rule == CLOSED)
@@ -26,7 +26,7 @@ SPLAT_INLINE void moving_add_line(const moving_line s, const int u_lo, const int
         ADD_PIXELS(3)
 }
 
-SPLAT_INLINE void moving_rows(__global const float *rec, __global const float *cell, __global const float *times,
+ALWAYS_INLINE void moving_rows(__global const float *rec, __global const float *cell, __global const float *times,
                               const int time_pitch, const int v_lo, const int v_hi, const float4 path_limits,
                               const float cutoff2, __global float *image, const int pitch)
 {

@@ -8,7 +8,7 @@
 #if FOOTPRINT
 /* A pixel averages over its area: its variance is added to the splat's, (S^-1 + E)^-1 = (S + E det S) / delta with
    delta = 1 + E tr S + E^2 det S. Returns what the amplitude is multiplied by so that the mass stays. */
-SPLAT_INLINE vf widened_by_pixel(vf *l11, vf *l12, vf *l22)
+ALWAYS_INLINE vf widened_by_pixel(vf *l11, vf *l12, vf *l22)
 {
     const vf det_s = (*l11 * *l22) * (*l11 * *l22);
     const vf trace = *l11 * *l11 + *l12 * *l12 + *l22 * *l22;
@@ -29,7 +29,7 @@ typedef struct { vf path_u, path_v, shift_u, shift_v; vi in_front; } moved_ends;
 
 /* The path of the centre over the segment, and what to add to the centre at mid-time so that the straight path is right
    in the mean: a path bent by s t^2 has the mean s/12. `whole`, `rest`: the centre at mid-time. */
-SPLAT_INLINE moved_ends moved_to_ends(__global const coefficient *m, const v3 mean, const vf u_whole, const vf u_rest,
+ALWAYS_INLINE moved_ends moved_to_ends(__global const coefficient *m, const v3 mean, const vf u_whole, const vf u_rest,
                                       const vf v_whole, const vf v_rest)
 {
     moved_ends r;
@@ -52,7 +52,7 @@ SPLAT_INLINE moved_ends moved_to_ends(__global const coefficient *m, const v3 me
 }
 
 /* narrows [lo, hi] to the pixels within `reach` of the centre's path between two times */
-SPLAT_INLINE void segment_box(const vf whole, const vf rest, const vf path, const vf reach, const vf early,
+ALWAYS_INLINE void segment_box(const vf whole, const vf rest, const vf path, const vf reach, const vf early,
                               const vf late, vi *lo, vi *hi)
 {
     const vf from = path * early, to = path * late, far = (vf)(4e6f);
@@ -62,7 +62,7 @@ SPLAT_INLINE void segment_box(const vf whole, const vf rest, const vf path, cons
 
 /* Earliest and latest time at which any of the lines lo..hi integrates. Windows open and close in the order of the
    lines, so that the two outermost lines tell. */
-SPLAT_INLINE void times_of_lines(__global const float *times, const int pitch, const vi lo, const vi hi,
+ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, const vi lo, const vi hi,
                                  vf *early, vf *late)
 {
     float from[LANES], to[LANES];

@@ -54,12 +54,14 @@ __kernel void voxel_forward(
                 const float a0 = rec[VOX_U12] * dy + rec[VOX_U13] * dz;
                 const float b = rec[VOX_U22] * dy + rec[VOX_U23] * dz, c = rec[VOX_U33] * dz;
                 const float k = b * b + c * c;
+                if (k > limit) /* a corner of the box */
+                    continue;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
                 for (int x = x_lo; x <= x_hi; x += LANES) {
                     const vf dx = ((float)(x - whole[VOX_WHOLE]) + V_IOTA) - rec[VOX_REST];
                     const vf a = rec[VOX_U11] * dx + a0;
                     const vf q = a * a + k;
-                    const vf value = rec[VOX_DENSITY] * exp2(MINUS_HALF_LOG2E * q);
+                    const vf value = rec[VOX_DENSITY] * falling_exp2(MINUS_HALF_LOG2E * q);
                     V_STORE(V_LOAD(row + x) + V_PICK(0.0f, value, q <= limit), row + x);
                 }
             }

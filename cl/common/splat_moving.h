@@ -29,12 +29,12 @@ typedef struct {
 } moving_line;
 
 /* which rule meets the bound: by the path within the line's window over the splat's width (limits: of 1, 2, 3 times) */
-SPLAT_INLINE int moving_rule(const float path, const float4 limits)
+ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
 {
     return path <= limits.x ? 1 : (path <= limits.y ? 2 : (path <= limits.z ? 3 : CLOSED));
 }
 
-SPLAT_INLINE moving_line moving_on_line(__global const float *rec, __global const float *cell, const float v,
+ALWAYS_INLINE moving_line moving_on_line(__global const float *rec, __global const float *cell, const float v,
                                         const float dv, const float middle, const float half_time, const float weight,
                                         const float4 limits)
 {
@@ -69,7 +69,7 @@ typedef struct { vf z, across, b, q, rq, fall, c2, d2; vi drawn; } moving_pixel;
 #define SQUARE_ROOT(x) sqrt(x)
 #endif
 
-SPLAT_INLINE moving_pixel moving_at(const moving_line s, const vf u, const vf du, const float limit)
+ALWAYS_INLINE moving_pixel moving_at(const moving_line s, const vf u, const vf du, const float limit)
 {
     moving_pixel p;
     p.z = s.z1 * du + s.z0;
@@ -93,7 +93,7 @@ SPLAT_INLINE moving_pixel moving_at(const moving_line s, const vf u, const vf du
 }
 
 /* 1 - erf|x| = 1/D, D = (1 + ...)^16 (Abramowitz and Stegun 7.1.28, 3e-7); beyond 5 that is 0 */
-SPLAT_INLINE vf erf_complement(const vf x)
+ALWAYS_INLINE vf erf_complement(const vf x)
 {
     const vf t = min(fabs(x), 5.0f);
     vf d = 1.0f + t * (0.0705230784f + t * (0.0422820123f + t * (0.0092705272f
@@ -105,20 +105,20 @@ SPLAT_INLINE vf erf_complement(const vf x)
 }
 
 /* erf(x1) - erf(x0) with one division */
-SPLAT_INLINE vf erf_between(const vf x0, const vf x1)
+ALWAYS_INLINE vf erf_between(const vf x0, const vf x1)
 {
     const vf d0 = erf_complement(x0), d1 = erf_complement(x1);
     const vf inv = 1.0f / (d0 * d1);
     return copysign(1.0f - d0 * inv, x1) - copysign(1.0f - d1 * inv, x0);
 }
 
-SPLAT_INLINE vf moving_exp(const vf z, const moving_pixel p)
+ALWAYS_INLINE vf moving_exp(const vf z, const moving_pixel p)
 {
     return falling_exp2((z * z + p.c2) * p.fall);
 }
 
 /* the line's integral over its window at a pixel; `rule` is a constant where this is inlined */
-SPLAT_INLINE vf moving_value(const int rule, const moving_line s, const moving_pixel p)
+ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_pixel p)
 {
     if (rule == CLOSED) {
         const vf k = ROOT_HALF * SQUARE_ROOT(p.rq);
@@ -138,7 +138,7 @@ SPLAT_INLINE vf moving_value(const int rule, const moving_line s, const moving_p
 /* means over the window of E = exp(-q/2) with z = along - speed t: E, E z, E z^2, E t, E t z */
 typedef struct { vf e, ez, ezz, et, etz; } moving_means;
 
-SPLAT_INLINE void moving_add(moving_means *m, const moving_line s, const moving_pixel p, const float weight,
+ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving_pixel p, const float weight,
                              const float step, const float time)
 {
     const vf z = p.z - s.half_path * step;
@@ -152,7 +152,7 @@ SPLAT_INLINE void moving_add(moving_means *m, const moving_line s, const moving_
 
 /* Closed form: with the values e at both ends, int E z = Q (e1 - e0)/speed and
    int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed); nothing here subtracts large numbers. */
-SPLAT_INLINE moving_means moving_closed(const moving_line s, const moving_pixel p, const float speed)
+ALWAYS_INLINE moving_means moving_closed(const moving_line s, const moving_pixel p, const float speed)
 {
     moving_means m;
     const vf z0 = p.z + s.half_path, z1 = p.z - s.half_path;
@@ -169,7 +169,7 @@ SPLAT_INLINE moving_means moving_closed(const moving_line s, const moving_pixel 
     return m;
 }
 
-SPLAT_INLINE moving_means moving_all_means(const moving_line s, const moving_pixel p, const float speed,
+ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pixel p, const float speed,
                                            const float middle, const float half_time)
 {
     if (s.rule == CLOSED)
@@ -191,7 +191,7 @@ SPLAT_INLINE moving_means moving_all_means(const moving_line s, const moving_pix
 
 /* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in
    whitened coordinates) and the flat sides between them. Lines that see nothing of the segment come out empty. */
-SPLAT_INLINE void moving_span(__global const float *rec, const vf dv, const vf middle, const vf half_time,
+ALWAYS_INLINE void moving_span(__global const float *rec, const vf dv, const vf middle, const vf half_time,
                               const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {
     __global const int *whole = (__global const int *)rec;

@@ -1,6 +1,6 @@
 /* What the voxeliser keeps of a Gaussian on a grid: with voxel offset D from the centre,
    value = density exp(-|U D|^2 / 2), U upper triangular. */
-#include "common/lanes.h"
+#include "common/falling_exp2.h"
 
 #define VOXEL_RECORD 20
 #define VOX_REST 0      /* 3: centre minus its nearest voxel, x y z */
@@ -14,5 +14,3 @@
 #define VOX_WHOLE 10    /* 3 ints */
 #define VOX_LO 13       /* 3 ints: x y z; empty when HI.z < LO.z */
 #define VOX_HI 16
-
-#define MINUS_HALF_LOG2E (-0.72134752044f)
