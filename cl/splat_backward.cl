@@ -73,6 +73,7 @@ ALWAYS_INLINE void moving_gather(moving_sums *sum, const moving_line s, const fl
 
 __kernel void splat_backward(
     __global const float *records,  /* (stride, C, RECORD) */
+    __global const uchar *seen,     /* (stride, C) */
     __global const float *cells,    /* (C, CELL) */
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */
     const int time_pitch, const float4 path_limits,
@@ -91,11 +92,11 @@ __kernel void splat_backward(
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int c = 0; c < cell_count; ++c) {
         const size_t at = (size_t)g * cell_count + c;
+        if (!seen[at])
+            continue;
         __global const float *rec = records + at * RECORD;
         __global const int *whole = (__global const int *)rec;
         const int v_lo = whole[REC_V_LO], v_hi = whole[REC_V_HI];
-        if (v_hi < v_lo)
-            continue;
         const int u_lo = whole[REC_U_LO], u_hi = whole[REC_U_HI];
         __global const float *image = images + LAYER_AT(cells + c * CELL, lines, pitch);
 #if MOVING

@@ -46,6 +46,7 @@ __kernel void splat_chain(
     __global const float *cells,          /* (C, CELL) */
     __global const coefficient *matrices, /* (C, POSES, 12) */
     __global const float *records,        /* (stride, C, RECORD) */
+    __global const uchar *is_drawn,       /* (stride, C) */
     __global const float *sums,           /* (stride, C, SUMS) */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
@@ -74,14 +75,13 @@ __kernel void splat_chain(
         int drawn = 0;
         for (int lane = 0; lane < LANES; ++lane) {
             const size_t at = (size_t)(first + lane) * cell_count + c;
-            __global const float *rec = records + at * RECORD;
-            __global const int *whole = (__global const int *)rec;
-            const int here = first + lane < count && whole[REC_V_HI] >= whole[REC_V_LO];
+            const int here = first + lane < count && is_drawn[at];
             drawn |= here;
             seen[lane] = here;
             for (int f = 0; f < SUM_COUNT; ++f)
                 fields[f * LANES + lane] = here ? sums[at * SUMS + f] : 0.0f;
 #if MOVING
+            __global const float *rec = records + at * RECORD;
             fields[12 * LANES + lane] = here ? rec[REC_ALONG_U] : 1.0f;
             fields[13 * LANES + lane] = here ? rec[REC_ALONG_V] : 0.0f;
             fields[14 * LANES + lane] = here ? rec[REC_ACROSS_U] : 0.0f;

@@ -53,6 +53,7 @@ ALWAYS_INLINE void moving_rows(__global const float *rec, __global const float *
 
 __kernel void splat_forward(
     __global const float *records,   /* (stride, C, RECORD) */
+    __global const uchar *seen,      /* (stride, C) */
     __global const float *cells,     /* (C, CELL) */
     __global const int *line_cells,  /* (lines, 2): first cell and cell after the last that serve a line */
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */
@@ -81,9 +82,11 @@ __kernel void splat_forward(
     const int c_first = line_cells[2 * v], c_stop = line_cells[2 * v + 1];
     float sum = 0.0f;
     for (int e = starts[tile]; e < starts[tile + 1]; ++e) {
-        __global const float *own = records + (size_t)entries[e] * cell_count * RECORD;
+        const size_t own = (size_t)entries[e] * cell_count;
         for (int c = c_first; c < c_stop; ++c) {
-            __global const float *rec = own + c * RECORD;
+            if (!seen[own + c])
+                continue;
+            __global const float *rec = records + (own + c) * RECORD;
             __global const int *whole = (__global const int *)rec;
             if (v < whole[REC_V_LO] || v > whole[REC_V_HI] || u < whole[REC_U_LO] || u > whole[REC_U_HI])
                 continue;
@@ -127,9 +130,11 @@ __kernel void splat_forward(
     const int c_first = line_cells[2 * top], c_stop = line_cells[2 * bottom + 1];
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int e = starts[tile]; e < starts[tile + 1]; ++e) {
-        __global const float *own = records + (size_t)entries[e] * cell_count * RECORD;
+        const size_t own = (size_t)entries[e] * cell_count;
         for (int c = c_first; c < c_stop; ++c) {
-            __global const float *rec = own + c * RECORD;
+            if (!seen[own + c])
+                continue;
+            __global const float *rec = records + (own + c) * RECORD;
             __global const int *whole = (__global const int *)rec;
             const int v_lo = max(whole[REC_V_LO], top), v_hi = min(whole[REC_V_HI], bottom);
             __global float *own_image = image + LAYER_AT(cells + c * CELL, lines, pitch);

@@ -102,7 +102,8 @@ __kernel void splat_prepare(
     const int stride,
     const int width,                      /* pixels across the lines */
     const float cutoff2,                  /* squared Mahalanobis radius; 0 = no cutoff */
-    __global float *records,              /* (stride, C, RECORD) */
+    __global float *records,              /* (stride, C, RECORD), left as it was where nothing is drawn */
+    __global uchar *seen,                 /* (stride, C): 1 where a record was written */
     __global int *extents)                /* (6, stride): u lo hi, v lo hi, 0 0 over all cells */
 {
     const int first = (int)get_global_id(0) * LANES;
@@ -256,19 +257,18 @@ __kernel void splat_prepare(
             VI_STORE(u_hi, bounds + 3 * LANES);
         }
         for (int lane = 0; lane < LANES; ++lane) {
-            __global float *rec = records + ((size_t)(first + lane) * cell_count + c) * RECORD;
-            __global int *whole = (__global int *)rec;
-            const int hi = bounds[5 * LANES + lane];
-            if (hi >= bounds[4 * LANES + lane]) {
+            const size_t at = (size_t)(first + lane) * cell_count + c;
+            const int is_drawn = bounds[5 * LANES + lane] >= bounds[4 * LANES + lane];
+            seen[at] = (uchar)is_drawn;
+            if (is_drawn) {
+                __global float *rec = records + at * RECORD;
+                __global int *whole = (__global int *)rec;
                 for (int f = 0; f < 9; ++f)
                     rec[f] = fields[f * LANES + lane];
                 for (int f = 9; f < FIELDS; ++f)
                     rec[f + 6] = fields[f * LANES + lane];
                 for (int f = 0; f < 6; ++f)
                     whole[9 + f] = bounds[f * LANES + lane];
-            } else {
-                whole[REC_V_LO] = 1;
-                whole[REC_V_HI] = 0;
             }
         }
     }

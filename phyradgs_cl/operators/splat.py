@@ -22,7 +22,7 @@ from phyradgs_cl.operators.layout import (
     pitch_of,
     unpad_rows,
 )
-from phyradgs_cl.operators.splat_count import Work, moving_work, still_work
+from phyradgs_cl.operators.splat_count import UNSEEN, Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
@@ -80,6 +80,7 @@ class SplatProjector:
         self.image = padded_zeros(rt, lines, width)
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
+        self._seen = rt.empty(1, np.uint8)
         self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
 
@@ -104,6 +105,7 @@ class SplatProjector:
             kernel,
             items,
             self._records,
+            self._seen,
             cells.cells,
             cells.line_cells,
             cells.line_times,
@@ -146,6 +148,7 @@ class SplatProjector:
             kernel,
             gaussians.count * group,
             self._records,
+            self._seen,
             cells.cells,
             cells.line_times,
             np.int32(cells.time_pitch),
@@ -166,6 +169,7 @@ class SplatProjector:
             cells.cells,
             cells.matrices,
             self._records,
+            self._seen,
             self._sums,
             np.int32(cells.count),
             np.int32(gaussians.count),
@@ -188,7 +192,8 @@ class SplatProjector:
         shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
         size = int(np.prod(shape))
         records = self.rt.download(DeviceArray(self._records.buffer, (size,), np.dtype(np.float32)))
-        records = records.reshape(shape)[: gaussians.count]
+        seen = self.rt.download(DeviceArray(self._seen.buffer, shape[:2], np.dtype(np.uint8)))
+        records = np.where(seen[..., None], records.reshape(shape), UNSEEN[: shape[2]])[: gaussians.count]
         if not cells.moving:
             return still_work(records, self.rt.lanes)
         times = self.rt.download(cells.line_times)
@@ -211,6 +216,9 @@ class SplatProjector:
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
             self._records = rt.empty(1)  # the old goes before the new comes
             self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
+        if self._seen.size < footprints:
+            self._seen = rt.empty(1, np.uint8)
+            self._seen = rt.empty(footprints, np.uint8)
         if self._sums.size < footprints * SUM_FLOATS:
             self._sums = rt.empty(1)
             self._sums = rt.empty(footprints * SUM_FLOATS)
@@ -231,6 +239,7 @@ class SplatProjector:
             np.int32(self.width),
             self.cutoff2,
             self._records,
+            self._seen,
             self._extents,
             group=rt.group(),
         )

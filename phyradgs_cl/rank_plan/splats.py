@@ -18,6 +18,7 @@ from phyradgs_cl.reconstructors.splat_options import SplatOptions
 _PARAMETERS = 59  # of a Gaussian: raw, two moments, gradients, statistics, parameters
 _SUMMED = 13  # rows of gradients and statistics
 _LISTED = 12  # entries of a Gaussian in the lists of tiles and bands, with their slack: from runs
+_SEEN_BYTES = 1  # whether a cell sees a Gaussian
 _FLAG_BYTES = 4
 
 
@@ -116,7 +117,7 @@ class SplatPlan:
                 cells_within(self.largest, span(self.lines, self.parts, part)).count
                 for part in range(self.parts)
             )
-        return 4 * stride * (cells * (RECORD_FLOATS[moving] + SUM_FLOATS) + 6 + _LISTED)
+        return stride * (cells * (4 * (RECORD_FLOATS[moving] + SUM_FLOATS) + _SEEN_BYTES) + 4 * (6 + _LISTED))
 
     def _frames_bytes(self) -> int:
         mask = self.scan.pixel_mask
