@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tolerances import DOMAIN_GRADIENT, DOMAIN_VOLUME, RANK_GRADIENT, RANK_VOLUME
+from tolerances import DOMAIN_GRADIENT, DOMAIN_JUMP, DOMAIN_JUMPS, DOMAIN_VOLUME, RANK_GRADIENT, RANK_VOLUME
 
 from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
 from phyradgs_cl.errors import InputError, PhyradgsError
@@ -170,8 +170,15 @@ def test_a_domain_too_large_for_one_device_is_the_undivided_one(ranks_of, scan) 
             scan, "phyradgs", Runtime(memory=MEMORY_BYTES, ranks=ranks), options, seed=1
         ).volume
 
-    error = np.abs(ranks_of(4, work)[0] - expected.volume).max(axis=(1, 2))
-    assert error.shape == (16,) and error.max() <= DOMAIN_VOLUME * expected.volume.max()
+    assert_undivided(ranks_of(4, work)[0], expected.volume)
+
+
+def assert_undivided(volume: np.ndarray, expected: np.ndarray) -> None:
+    """Every voxel, but for those at whose place a Gaussian ends: see tolerances.py."""
+    assert volume.shape == expected.shape
+    error = np.abs(volume - expected) / expected.max()
+    assert error.max() <= DOMAIN_JUMP
+    assert np.mean(error > DOMAIN_VOLUME) <= DOMAIN_JUMPS
 
 
 @pytest.mark.parametrize("motion", [Motion("static"), Motion("micro-views", 4, 2), Motion("exact")])
@@ -183,7 +190,7 @@ def test_round_gaussians_do_not_turn_by_rounding(scan, motion) -> None:
         scan, "phyradgs", Runtime(), replace(divided, split="frames", batch=1, parts=1), seed=1
     )
     found = reconstruct(scan, "phyradgs", Runtime(), divided, seed=1)
-    assert np.abs(found.volume - whole.volume).max() <= DOMAIN_VOLUME * whole.volume.max()
+    assert_undivided(found.volume, whole.volume)
 
 
 @pytest.mark.parametrize("split", ["frames", "domain"])
