@@ -37,8 +37,8 @@ typedef struct { vf of[SUM_COUNT]; } moving_sums;
 
 /* adds what the pixels u.. of a line contribute; h: gradient by the pixels */
 ALWAYS_INLINE void moving_gather(moving_sums *sum, const moving_line s, const float amp, const float speed,
-                                const float middle, const float half_time, const float dv, const vf u, const vf du,
-                                const float limit, const vf h)
+                                 const float middle, const float half_time, const float dv, const vf u, const vf du,
+                                 const float limit, const vf h)
 {
     const moving_pixel p = moving_at(s, u, du, limit);
     const moving_means m = moving_all_means(s, p, speed, middle, half_time);

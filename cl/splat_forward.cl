@@ -14,7 +14,7 @@
     }
 
 ALWAYS_INLINE void moving_add_line(const moving_line s, const int u_lo, const int u_hi, const int u_whole,
-                                  const float u_rest, const float limit, __global float *row)
+                                   const float u_rest, const float limit, __global float *row)
 {
     if (s.rule == CLOSED)
         ADD_PIXELS(CLOSED)
@@ -27,8 +27,8 @@ ALWAYS_INLINE void moving_add_line(const moving_line s, const int u_lo, const in
 }
 
 ALWAYS_INLINE void moving_rows(__global const float *rec, __global const float *cell, __global const float *times,
-                              const int time_pitch, const int v_lo, const int v_hi, const float4 path_limits,
-                              const float cutoff2, __global float *image, const int pitch)
+                               const int time_pitch, const int v_lo, const int v_hi, const float4 path_limits,
+                               const float cutoff2, __global float *image, const int pitch)
 {
     __global const int *whole = (__global const int *)rec;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;

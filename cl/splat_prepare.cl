@@ -30,7 +30,7 @@ typedef struct { vf path_u, path_v, shift_u, shift_v; vi in_front; } moved_ends;
 /* The path of the centre over the segment, and what to add to the centre at mid-time so that the straight path is right
    in the mean: a path bent by s t^2 has the mean s/12. `whole`, `rest`: the centre at mid-time. */
 ALWAYS_INLINE moved_ends moved_to_ends(__global const coefficient *m, const v3 mean, const vf u_whole, const vf u_rest,
-                                      const vf v_whole, const vf v_rest)
+                                       const vf v_whole, const vf v_rest)
 {
     moved_ends r;
     vf u[2], v[2];
@@ -53,7 +53,7 @@ ALWAYS_INLINE moved_ends moved_to_ends(__global const coefficient *m, const v3 m
 
 /* narrows [lo, hi] to the pixels within `reach` of the centre's path between two times */
 ALWAYS_INLINE void segment_box(const vf whole, const vf rest, const vf path, const vf reach, const vf early,
-                              const vf late, vi *lo, vi *hi)
+                               const vf late, vi *lo, vi *hi)
 {
     const vf from = path * early, to = path * late, far = (vf)(4e6f);
     *lo = max(*lo, V_INT(ceil(clamp(whole + (rest + min(from, to) - reach), -far, far))));
@@ -63,7 +63,7 @@ ALWAYS_INLINE void segment_box(const vf whole, const vf rest, const vf path, con
 /* Earliest and latest time at which any of the lines lo..hi integrates. Windows open and close in the order of the
    lines, so that the two outermost lines tell. */
 ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, const vi lo, const vi hi,
-                                 vf *early, vf *late)
+                                  vf *early, vf *late)
 {
     float from[LANES], to[LANES];
     int first[LANES], last[LANES];

@@ -30,13 +30,10 @@ _SPLAT_TRIALS = (20, 200)  # iterations
 _ITERATIVE_TRIALS = (1, 3)
 _LEAST_DIFFERENCE_S = 0.3  # between the trials of methods whose iterations are alike
 _MOST_ALIKE = 200
-_AS_WELL_RUN_S = (
-    20.0  # a whole run that takes no longer is the best estimate of a method that may stop by itself
-)
-_GROWN, _GROWTH_TRIALS = (
-    1.1,
-    3,
-)  # by how much a cloud has to grow for a longer trial, and how much longer it is
+# a whole run that takes no longer is the best estimate of a method that may stop by itself
+_AS_WELL_RUN_S = 20.0
+# by how much a cloud has to grow for a longer trial, and how much longer that is
+_GROWN, _GROWTH_TRIALS = 1.1, 3
 _FEWEST_BETWEEN = 5  # iterations from one round of density control to the next, in a trial
 
 
@@ -125,9 +122,13 @@ class _Trials:
         seconds, self.device_bytes = time.perf_counter() - begun, self.rt.peak_bytes
         return seconds
 
+    def run_beside_control(self, iterations: int) -> float:
+        """The seconds of a run, without those of density control."""
+        return self.run(iterations) - self.control_s
+
     def least(self, iterations: int) -> float:
-        """The shorter of two runs, without density control: what else the machine does can only add to one."""
-        return min(self.run(iterations) - self.control_s for _ in range(2))
+        """The shorter of two such runs: what else the machine does can only add to one."""
+        return min(self.run_beside_control(iterations) for _ in range(2))
 
     @property
     def control_s(self) -> float:
@@ -168,12 +169,12 @@ def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) ->
         return first_s + (1 - few / total) * warm_s, warm_s / total
     first_s -= early_control_s
     again_s = trials.least(few)
-    through_s = trials.run(more) - trials.control_s
+    through_s = trials.run_beside_control(more)
     if trials.has_grown and total > _GROWTH_TRIALS * more:
         more *= _GROWTH_TRIALS
-        through_s = trials.run(more) - trials.control_s
+        through_s = trials.run_beside_control(more)
     else:
-        through_s = min(through_s, trials.run(more) - trials.control_s)
+        through_s = min(through_s, trials.run_beside_control(more))
     rounds = trials.last.facts["density_control_rounds"]
     each_s = max(through_s - again_s, 0.0) / (more - few)
     control_s = trials.control_s * _rounds(options) / max(rounds, 1)

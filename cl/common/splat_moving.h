@@ -35,8 +35,8 @@ ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
 }
 
 ALWAYS_INLINE moving_line moving_on_line(__global const float *rec, __global const float *cell, const float v,
-                                        const float dv, const float middle, const float half_time, const float weight,
-                                        const float4 limits)
+                                         const float dv, const float middle, const float half_time, const float weight,
+                                         const float4 limits)
 {
     moving_line s;
     const float speed = rec[REC_SPEED];
@@ -139,7 +139,7 @@ ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_
 typedef struct { vf e, ez, ezz, et, etz; } moving_means;
 
 ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving_pixel p, const float weight,
-                             const float step, const float time)
+                              const float step, const float time)
 {
     const vf z = p.z - s.half_path * step;
     const vf e = weight * moving_exp(z, p), ez = e * z;
@@ -170,7 +170,7 @@ ALWAYS_INLINE moving_means moving_closed(const moving_line s, const moving_pixel
 }
 
 ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pixel p, const float speed,
-                                           const float middle, const float half_time)
+                                            const float middle, const float half_time)
 {
     if (s.rule == CLOSED)
         return moving_closed(s, p, speed);
@@ -192,7 +192,7 @@ ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pi
 /* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in
    whitened coordinates) and the flat sides between them. Lines that see nothing of the segment come out empty. */
 ALWAYS_INLINE void moving_span(__global const float *rec, const vf dv, const vf middle, const vf half_time,
-                              const vf weight, const int cuts, vi *u_lo, vi *u_hi)
+                               const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {
     __global const int *whole = (__global const int *)rec;
     *u_lo = (vi)(whole[REC_U_LO]);

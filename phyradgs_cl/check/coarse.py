@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 _MOST_FRAMES = 60
 _LEAST_VALID = 0.5  # of a block's pixels
 _MOST_VOXELS = 64  # a side
-_FEWEST_COLUMNS = 12  # of blocks, where the panel has as many
+_KEPT_COLUMNS = 12  # of blocks, where the panel has as many
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def coarse(scan: Scan, level: Level) -> Scan:
     on average. The reference is dropped.
     """
     shape = scan.geometry.detector_shape
-    block = min(math.ceil(max(shape) / level.columns), shape[0], max(1, shape[1] // _FEWEST_COLUMNS))
+    block = min(math.ceil(max(shape) / level.columns), shape[0], max(1, shape[1] // _KEPT_COLUMNS))
     small = binned(fewer_frames(scan, _MOST_FRAMES), block)
     return replace(small, grid=coarse_grid(scan.grid, small.geometry, level.voxels))
 
