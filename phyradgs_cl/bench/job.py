@@ -115,6 +115,10 @@ class BenchJob:
         """Volumes with TIGRE's noise, or the sphere phantom with raw counts."""
         return PHANTOM if self.kind == "phantom" else SYNTHETIC
 
+    def paper_column(self, protocol: str) -> str:
+        """Where the paper's tables have their numbers for a protocol of this study."""
+        return PHANTOM if self.study == PHANTOM else protocol
+
     @property
     def gaussians(self) -> int:
         """The first cloud of every splatting row: the default number for the grid."""

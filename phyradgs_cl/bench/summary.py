@@ -49,6 +49,12 @@ def lines_of(job: BenchJob, lines: Sequence[Line]) -> list[Line]:
     return list(chosen.values())
 
 
+def lines_of_run(lines: Sequence[Line], protocol: str, run: str, acquisition: str) -> list[Line]:
+    """Those lines that are of one run under a protocol and an acquisition, of whatever volumes and seeds."""
+    wanted = (protocol, run, acquisition)
+    return [line for line in lines if (line["protocol"], line["run"], line["acquisition"]) == wanted]
+
+
 def summarise(lines: Sequence[Line]) -> Summary | None:
     """Means over volumes of means over seeds; None without lines.
 

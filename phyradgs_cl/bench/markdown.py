@@ -1,0 +1,206 @@
+"""The Markdown of a benchmark's tables: means of every row, what a model of the motion gives, volumes one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from phyradgs_cl.bench.case import FLY, STILL
+from phyradgs_cl.bench.gains import Gain, gain_over_static
+from phyradgs_cl.bench.job import PHANTOM, BenchJob
+from phyradgs_cl.bench.published import published
+from phyradgs_cl.bench.results import Line
+from phyradgs_cl.bench.rows import Row
+from phyradgs_cl.bench.summary import REFERENCE, Summary, lines_of_run, summarise
+
+Cell = Callable[[Summary], str]
+
+
+def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
+    """A block for each protocol: the means of every row, and the volumes one by one."""
+    size = job.bench_size
+    text = [
+        f"# {_TITLES[job.kind]}: {size.voxels}³ voxels, {size.pixels}² pixels",
+        "",
+        *_notes(job, lines),
+        "",
+    ]
+    for protocol in job.chosen_protocols:
+        block = [line for line in lines if line["protocol"] == protocol]
+        if block:
+            text += [f"## {protocol}: {block[0]['views']} views", "", *_means(job, protocol, block), ""]
+            text += _motion_block(job, protocol, block)
+            volumes = sorted({line["volume"] for line in block})
+            if len(volumes) > 1:
+                text += [*_by_volume(job, block, volumes), ""]
+    return "\n".join(text)
+
+
+_TITLES = {
+    "table1": "Table 1, methods",
+    "table2": "Table 2, strips M and sub-intervals N",
+    "phantom": "Sphere phantom",
+    "quick": "Quick comparison",
+}
+
+
+def _number(name: str, digits: int, factor: float = 1.0) -> Cell:
+    def cell(summary: Summary) -> str:
+        if name not in summary.mean:
+            return "–"
+        spread = f" ± {factor * summary.spread[name]:.{digits}f}" if name in summary.spread else ""
+        return f"{factor * summary.mean[name]:.{digits}f}{spread}"
+
+    return cell
+
+
+_SYNTHETIC_COLUMNS: dict[str, Cell] = {
+    "PSNR (dB)": _number("psnr_db", 2),
+    "SSIM": _number("ssim", 3),
+    "2D PSNR (dB)": _number("psnr_2d_db", 2),
+    "2D SSIM": _number("ssim_2d", 3),
+    "processor s": _number("processor_s", 1),
+}
+_PHANTOM_COLUMNS: dict[str, Cell] = {
+    "PSNR to pseudo-truth (dB)": _number("psnr_db_pseudo", 2),
+    "SSIM": _number("ssim_pseudo", 3),
+    "PSNR to truth (dB)": _number("psnr_db", 2),
+    "SSIM to truth": _number("ssim", 3),
+    "2D PSNR (dB)": _number("psnr_2d_db", 2),
+    "out of round (%)": _number("roundness", 1, 100),
+    "RMS (%)": _number("roundness_rms", 1, 100),
+    "shift (mm)": _number("centre_shift_mm", 2),
+    "rise (mm)": _number("edge_rise_mm", 2),
+    "bias balls (%)": _number("bias_balls", 1, 100),
+    "bias holder (%)": _number("bias_holder", 1, 100),
+    "processor s": _number("processor_s", 1),
+}
+
+
+def _means(job: BenchJob, protocol: str, lines: Sequence[Line]) -> list[str]:
+    columns = _PHANTOM_COLUMNS if job.study == PHANTOM else _SYNTHETIC_COLUMNS
+    heads = ["method", *columns, "stop-and-shoot PSNR / SSIM", "paper PSNR / SSIM"]
+    text = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    most = len({line["volume"] for line in lines})
+    for name in ("truth", "pseudo-truth"):
+        summary = summarise(lines_of_run(lines, protocol, name, REFERENCE))
+        if summary is not None:
+            text.append(_row_text([name, *(cell(summary) for cell in columns.values()), "", ""]))
+    for row in job.chosen_rows:
+        cells = _row_cells(job, row, protocol, lines, columns, most)
+        text.append(_row_text([*cells, _paper_cell(row.label, job.paper_column(protocol))]))
+    return text
+
+
+def _row_cells(
+    job: BenchJob, row: Row, protocol: str, lines: Sequence[Line], columns: dict[str, Cell], most: int
+) -> list[str]:
+    summary = summarise(lines_of_run(lines, protocol, row.run, FLY))
+    still = summarise(lines_of_run(lines, protocol, row.standing().run, STILL))
+    label = row.label
+    if summary is None and (lacks := row.lacks(job.bench_size.voxels)):
+        label += f" ({lacks})"
+    if summary is not None and summary.volumes < most:
+        label += f" ({summary.volumes} of {most} volumes)"
+    cells = [cell(summary) if summary is not None else "–" for cell in columns.values()]
+    return [label, *cells, _both(still) if still is not None else "–"]
+
+
+def _motion_block(job: BenchJob, protocol: str, lines: Sequence[Line]) -> list[str]:
+    """What a model of the motion gives each method; nothing where no method was run both ways."""
+    gains = [(row, gain_over_static(lines, protocol, row)) for row in job.chosen_rows]
+    rows = [_gain_row(row, gain) for row, gain in gains if gain is not None]
+    if not rows:
+        return []
+    heads = [
+        "with the motion",
+        "static PSNR / SSIM",
+        "with the motion PSNR / SSIM",
+        "gain (dB)",
+        "least and greatest of the volumes (dB)",
+        "volumes",
+        "stop-and-shoot PSNR / SSIM",
+        "processor s, static and moving",
+    ]
+    title = (
+        "Each method with a model of the motion beside its static one, on the same scans, against the truth:"
+    )
+    return [title, "", _row_text(heads), "|---" * len(heads) + "|", *rows, ""]
+
+
+def _gain_row(row: Row, gain: Gain) -> str:
+    seconds = [summary.mean.get("processor_s") for summary in (gain.static, gain.moving)]
+    cells = [
+        row.label,
+        _both(gain.static),
+        _both(gain.moving),
+        f"{gain.mean_db:+.2f}",
+        f"{gain.least_db:+.2f}, {gain.greatest_db:+.2f}",
+        str(gain.volumes),
+        _both(gain.still) if gain.still is not None else "–",
+        ", ".join(f"{value:.1f}" if value is not None else "–" for value in seconds),
+    ]
+    return _row_text(cells)
+
+
+def _both(summary: Summary) -> str:
+    return f"{_number('psnr_db', 2)(summary)} / {_number('ssim', 3)(summary)}"
+
+
+def _paper_cell(label: str, column: str) -> str:
+    cell = published(label, column)
+    return f"{cell.psnr_db:.2f} / {cell.ssim:.3f}" if cell is not None else ""
+
+
+def _by_volume(job: BenchJob, lines: Sequence[Line], volumes: Sequence[str]) -> list[str]:
+    text = [_row_text(["PSNR (dB) / SSIM", *volumes]), "|---" * (len(volumes) + 1) + "|"]
+    for row in job.chosen_rows:
+        found = [x for x in lines if x["run"] == row.run and x["acquisition"] == FLY]
+        if found:
+            each = [summarise([x for x in found if x["volume"] == volume]) for volume in volumes]
+            text.append(_row_text([row.label, *(_both(s) if s is not None else "" for s in each)]))
+    return text
+
+
+def _row_text(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
+    size = job.bench_size
+    seeds = sorted({line["seed"] for line in lines})
+    last = lines[-1]
+    scan = _PHANTOM_NOTE if job.study == PHANTOM else _SYNTHETIC_NOTE
+    machines = sorted({f"{line['device']} ({line['platform']})" for line in lines})
+    return [
+        f"{scan} Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is "
+        "the standard deviation over seeds of the mean over those volumes that were run with all of them.",
+        "",
+        f"All splatting rows start with {job.gaussians:,} Gaussians (or one for every voxel that attenuates, where "
+        f"those are fewer) and run {size.iterations:,} iterations of one frame each; {_FAIRNESS}",
+        "",
+        f"Device {', '.join(machines)}; phyradgs-cl {last['version']}, Python {last['python']}, NumPy {last['numpy']}, "
+        f"pyopencl {last['pyopencl']}, PoCL {last['pocl'] or 'none'}.",
+    ]
+
+
+_FAIRNESS = (
+    "the other methods run as many as their own defaults say. Rows of R2-Gaussian keep its published learning rates and "
+    'weights, made for 30,000 iterations; the row "R2-Gaussian (settings of PhyRadGS)" (--rows) has ours. The column '
+    "stop-and-shoot is the same method with a static model on a scan from the mid-window angles of the fly-scan: what "
+    "motion correction could reach at best. Processor seconds are of all threads of a reconstruction, kernel builds of a "
+    "first run included, and can be compared where other work ran beside; lines of early versions have none. 2D numbers "
+    "compare projections with noise-free ones half-way between the training angles, at true scale. "
+    "The paper's numbers are of other volumes, sizes and hardware."
+)
+_SYNTHETIC_NOTE = (
+    "Volumes projected at their own resolution on R2-Gaussian's scanner (DSO 5, DSD 7, panel 4 × 4, box 2³), TIGRE's "
+    "noise with 10,000 photons and σ 10."
+)
+_PHANTOM_NOTE = (
+    "Double-layer sphere phantom in a 200 mm box on a C-arm (DSO 785 mm, DSD 1200 mm, shifted panel), averaged in "
+    "intensity, raw counts with 50,000 photons and σ 10, corrected by flats and darks; the gantry wanders by 0.1° and "
+    "the encoder knows. The pseudo-truth is R2-Gaussian from 64 stop-and-shoot projections. Out of round is "
+    "(r_max − r_min)/r_mean of the half-level contours in three sections of every ball; rise is the 10–90 % distance of "
+    "the balls' edges; shift is how far contours are displaced; bias is that of means inside. Stop-and-shoot numbers "
+    "compare with the truth, the paper's with a pseudo-truth of its own."
+)
