@@ -24,7 +24,7 @@ from phyradgs_cl.commands import (
     view,
     watch,
 )
-from phyradgs_cl.commands.console import complain, give_up_stdout, say
+from phyradgs_cl.commands.console import complain, give_up_stdout, say, usage_text
 from phyradgs_cl.commands.ranks import takes_part
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io.atomic import NO_SPACE
@@ -125,7 +125,7 @@ def run(arguments: list[str]) -> int:
     except PhyradgsError as error:
         return complain(str(error), error.exit_code)
     except _CLICK_ERROR as error:
-        return complain(str(error.format_message()))  # type: ignore[attr-defined]
+        return complain(usage_text(error, arguments))
     except OSError as error:  # one that no reader or writer has named
         text = f"{error.filename or 'operating system'}: {error.strerror or error}"
         return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)

@@ -74,7 +74,7 @@ def run_settings(
     for key, value in given.items():
         if value is not None:
             settings[key] = value
-            origins.pop(key, None)
+            origins[key] = f"--{key.replace('_', '-')}"
     chosen = _run_settings(settings, origins)
     with chosen.naming_origins():
         method_options(chosen.method, chosen.preset, chosen.changes)
@@ -102,12 +102,12 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
 
 
 def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
-    """Where the option that ``culprit`` names stands, with the way into its table; None for a named option."""
+    """Where the option that ``culprit`` names stands, with the way into its table; None where nobody gave it."""
     options = re.findall(r"option ([\w-]+)", culprit)
     words = options or re.sub(r"\(.*\)", "", culprit).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
-    if origin is None or origin.startswith("--set"):
+    if origin is None or origin.startswith("--"):
         return origin
     return ".".join([origin, *rest])
 

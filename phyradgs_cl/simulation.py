@@ -17,7 +17,7 @@ from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import load_volume
+from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.operators import RayProjector
 from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
@@ -276,7 +276,7 @@ def volume_scene(
     that line integrals do not depend on the scanner's size); one of our volumes keeps its own grid and 1/mm. Pixels see
     ``pixel_samples``² rays over their area.
     """
-    loaded = load_volume(path)
+    loaded = load_attenuation(path)
     volume, fine = loaded.volume, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from phyradgs_cl.io import written_beside
 from phyradgs_cl.io.npz import read_npz
 from phyradgs_cl.metrics import panels_png
 
+log = logging.getLogger(__name__)
 _MOST_BYTES = 1 << 28  # three slices of 4096² pixels and more
 _TRUTH = {"run": "truth", "acquisition": None, "protocol": None, "seed": None, "iterations": None}
 
@@ -61,6 +63,11 @@ def write_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
         _figure(job, protocol, [x for x in chosen if (x["protocol"], x["volume"]) == (protocol, volume)])
         for protocol, volume in cases
     ]
+    if cases and None in figures:
+        lacking = figures.count(None)
+        log.warning(
+            "%s: no slices of %d of %d pictures, which are left out", job.output, lacking, len(figures)
+        )
     return [path for path in figures if path is not None]
 
 

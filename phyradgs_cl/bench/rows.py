@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
 from typing import Any
@@ -135,7 +135,16 @@ def _extras() -> tuple[Row, ...]:
         Row(tuned, "r2", **same),
         Row("R2-Gaussian w/ ST (settings of PhyRadGS)", "r2", "micro-views", 8, 5, tuned, **same),
     )
-    return (*strips, *both)
+    rows = (*strips, *both)
+    return (*rows, *_others({row.method for row in (*_table1(), *rows)}))
+
+
+def _others(known: Set[str]) -> tuple[Row, ...]:
+    """Rows under their own name for methods that somebody has added to the registry."""
+    others = [name for name in METHODS if name not in known]
+    static = tuple(Row(name, name) for name in others)
+    exact = tuple(Row(f"{name} per-row", name, "per-row", still=name) for name in others)
+    return (*static, *exact)
 
 
 def _table2() -> tuple[Row, ...]:

@@ -23,7 +23,7 @@ from phyradgs_cl.bench.summary import REFERENCE
 from phyradgs_cl.bench.tables import write_tables
 from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import file_kind
+from phyradgs_cl.io import file_kind, load_attenuation
 from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, reconstruct
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
@@ -248,6 +248,8 @@ def _check_volumes(runs: Sequence[PlannedRun]) -> None:
         if path is not None and file_kind(path) == "scan":
             expected = "a dataset /volume (z, y, x), or one of our volumes"
             raise InputError(str(path), "a scan", expected, "take it out of the folder, or choose --names")
+        if path is not None:
+            load_attenuation(path, warn=False)  # it will, when the volume's turn comes
 
 
 def _results_file(folder: Path) -> Path:

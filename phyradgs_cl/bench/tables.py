@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.job import BenchJob
+from phyradgs_cl.bench.job import PHANTOM, SYNTHETIC, BenchJob
 from phyradgs_cl.bench.markdown import markdown
 from phyradgs_cl.bench.published import published
 from phyradgs_cl.bench.results import Line
@@ -36,12 +36,9 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     chosen = lines_of(job, lines)
     if not chosen or _misses_splats(job, chosen, lines):
         size = job.bench_size
-        sizes = sorted(
-            {f"{x.get('voxels')}³ ({x.get('study')}, iterations {x.get('iterations')})" for x in lines}
-        )
-        wanted = f"runs of {job.study} at {size.voxels}³ with {size.iterations} iterations"
-        remedy = "give the --size and --iterations of the runs"
-        raise InputError(str(job.output), f"results of {'; '.join(sizes)}", wanted, remedy)
+        remedy = f"choose --size {_size_names(lines)} and --iterations as in the runs, or another benchmark"
+        wanted = f"runs for {job.kind} at {size.voxels}³, of splats with {size.iterations} iterations"
+        raise InputError(str(job.output), f"only {'; '.join(_held(lines))}", wanted, remedy)
     written = {
         job.output / f"{job.stem}.md": markdown(job, chosen),
         job.output / f"{job.stem}.csv": comma_separated(job, chosen),
@@ -57,6 +54,21 @@ def _misses_splats(job: BenchJob, chosen: Sequence[Line], lines: Sequence[Line])
     iterations = job.bench_size.iterations
     others = any(x.get("study") == job.study and x.get("iterations") not in (None, iterations) for x in lines)
     return others and not any(line.get("iterations") == iterations for line in chosen)
+
+
+def _held(lines: Sequence[Line]) -> list[str]:
+    """The runs of a results file in words, a phrase for each benchmark, size and number of iterations."""
+    kinds = {SYNTHETIC: "volumes", PHANTOM: "the sphere phantom"}
+    held = set()
+    for line in lines:
+        iterations = line.get("iterations")
+        ending = f" with {iterations} iterations of splats" if iterations is not None else ""
+        held.add(f"{kinds.get(str(line.get('study')), 'others')} at {line.get('voxels')}³{ending}")
+    return sorted(held)
+
+
+def _size_names(lines: Sequence[Line]) -> str:
+    return " or ".join(sorted({str(line.get("size")) for line in lines}))
 
 
 def comma_separated(job: BenchJob, lines: Sequence[Line]) -> str:

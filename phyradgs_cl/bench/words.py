@@ -18,7 +18,7 @@ def listed(option: str, text: str | None) -> list[str] | None:
 
 def listed_seeds(option: str, text: str) -> list[int]:
     """The whole numbers of "0,1,2"."""
-    parts = listed(option, text) or []
+    parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdigit() for part in parts):
         raise InputError(option, repr(text), "whole numbers of at least 0", "write for example 0,1,2")
     return [int(part) for part in parts]
@@ -33,7 +33,11 @@ def result_text(progress: BenchProgress) -> str:
     else:
         psnr = numbers.get("psnr_db")
         found = f"PSNR {'inf' if psnr is None else format(psnr, '.2f')} dB, SSIM {numbers['ssim']:.3f}"
-        found += f", {line['seconds']:.1f} s"
+        found += (
+            f" to the truth, {line['seconds']:.1f} s"
+            if "psnr_db_pseudo" in numbers
+            else f", {line['seconds']:.1f} s"
+        )
     left = f"; about {_duration(progress.left_s)} left" if progress.left_s else ""
     return f"{progress.number}/{progress.runs} {progress.title}: {found}{left}"
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 import typer
 
@@ -28,6 +30,24 @@ def complain(text: str, status: int = 2) -> int:
     with suppress(OSError):  # nobody is left to be told
         typer.echo("phyradgs: " + " ".join(text.split()), err=True)
     return status
+
+
+def usage_text(error: Any, arguments: Sequence[str]) -> str:
+    """What Typer found wrong with the words of a command, with the value that it could not read."""
+    text = str(error.format_message()).replace("Value error, ", "")
+    value = _value_of(getattr(error, "param", None), arguments)
+    return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {value!r}"
+
+
+def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
+    """The word that was given for an option; None for an argument, whose place only Typer knows."""
+    for flag in (name for name in getattr(parameter, "opts", ()) if name.startswith("-")):
+        for word, following in zip(arguments, [*arguments[1:], None], strict=True):
+            if word == flag:
+                return following
+            if word.startswith(f"{flag}="):
+                return word.removeprefix(f"{flag}=")
+    return None
 
 
 def remark(text: str) -> None:

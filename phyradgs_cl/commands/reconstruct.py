@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -82,12 +83,24 @@ def reconstruct_command(
         report = Preview(preview, ticker.progress) if preview else ticker.progress
         result, metrics = run_reconstruction(job, runtime, report, ranks)
     interrupted = result.facts.get("interrupted_at")
-    say(f"{output}: {job.method}, {result.facts['seconds']:.1f} s" + _metrics_text(metrics))
+    say(
+        f"{output}: {job.method}{_early_stop(result.facts)}, {result.facts['seconds']:.1f} s"
+        + _metrics_text(metrics)
+    )
     if profile:
         say(profile_report(runtimes[-1], result))
     if interrupted is not None:
         complain(f"interrupted after iteration {interrupted}: repeat the command with --resume to go on")
         raise typer.Exit(signals.status())
+
+
+def _early_stop(facts: Mapping[str, Any]) -> str:
+    """Why a method ended before its last iteration by itself; nothing where it did not."""
+    asked = facts["options"].get("iterations")
+    reason = facts.get("stopped_by")
+    if reason in (None, "iterations", "interrupt") or facts.get("iterations") in (None, asked):
+        return ""
+    return f", stopped after {facts['iterations']} of {asked} iterations ({reason})"
 
 
 def _metrics_text(metrics: dict[str, float]) -> str:

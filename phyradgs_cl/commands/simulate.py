@@ -19,6 +19,7 @@ from phyradgs_cl.workflow import (
     load_scanner_for,
     make_scan_protocol,
     refuse_jitter,
+    refuse_noise_options,
     run_simulation,
 )
 
@@ -105,10 +106,13 @@ def simulate_command(
             help="tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."
         ),
     ] = Noise.none,
-    dose: Annotated[float, typer.Option(help="Photons a pixel without object.")] = 1e4,
+    dose: Annotated[
+        float | None, typer.Option(help="Photons a pixel without object, for --noise.", show_default="10000")
+    ] = None,
     electronic_noise: Annotated[
-        float, typer.Option(help="Standard deviation of electronic noise, counts.")
-    ] = 10.0,
+        float | None,
+        typer.Option(help="Standard deviation of electronic noise, counts, for --noise.", show_default="10"),
+    ] = None,
     jitter_deg: Annotated[
         float | None,
         typer.Option(
@@ -149,6 +153,7 @@ def simulate_command(
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
     readout_axis = readout.value if readout else None
     refuse_jitter(protocol.value, jitter_deg)
+    refuse_noise_options(noise.value, {"--dose": dose, "--electronic-noise": electronic_noise})
     wish = device_wish(device)
     job = SimulationJob(
         output,
@@ -176,8 +181,8 @@ def simulate_command(
         detector_model=detector_model.value,
         peak=peak,
         noise=noise.value,
-        dose=dose,
-        electronic_noise=electronic_noise,
+        dose=SimulationOptions.dose if dose is None else dose,
+        electronic_noise=SimulationOptions.electronic_noise if electronic_noise is None else electronic_noise,
         jitter_deg=0.0 if jitter_deg is None else jitter_deg,
         lag=described.lag if lag is None else lag,
         time_samples=time_samples,

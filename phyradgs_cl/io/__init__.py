@@ -9,7 +9,7 @@ from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
 from phyradgs_cl.io.scan_writer import write_scan
 from phyradgs_cl.io.scanner_file import Scanner, load_scanner, with_detector_count
 from phyradgs_cl.io.volume_file import StoredVolume, file_kind, read_volume, volume_summary, write_volume
-from phyradgs_cl.io.voxel_file import LoadedVolume, load_volume
+from phyradgs_cl.io.voxel_file import LoadedVolume, load_attenuation, load_volume
 
 __all__ = [
     "LoadedVolume",
@@ -21,6 +21,7 @@ __all__ = [
     "default_grid",
     "file_kind",
     "load_scanner",
+    "load_attenuation",
     "load_volume",
     "only_run",
     "read_checkpoint",

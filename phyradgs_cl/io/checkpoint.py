@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.atomic import written_beside
 from phyradgs_cl.io.npz import read_npz
 
 _FORMAT = 1
+_MOST_DIFFERENCES, _LONGEST_NAME = 3, 60
 _RESTART = "start without --resume"
 
 
@@ -20,7 +24,7 @@ def checkpoint_path(output: str | Path) -> Path:
 
 
 def write_checkpoint(path: str | Path, arrays: dict[str, np.ndarray], fingerprint: str) -> None:
-    """Writes arrays whole or not at all; ``fingerprint`` says which scan and options they belong to."""
+    """Writes arrays whole or not at all; ``fingerprint`` says as JSON which scan and options they are of."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, format=np.array(_FORMAT), fingerprint=np.array(fingerprint), **arrays)
 
@@ -32,9 +36,32 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
     arrays = read_npz(path, "checkpoint", _RESTART)  # nothing is compressed: together no larger than the file
     if not np.array_equal(arrays.pop("format", None), _FORMAT):
         raise InputError(str(path), "another checkpoint format", str(_FORMAT), _RESTART)
-    if str(arrays.pop("fingerprint", "")) != fingerprint:
+    found = str(arrays.pop("fingerprint", ""))
+    if found != fingerprint:
         remedy = f"use the same scan and options, or {_RESTART}"
         raise InputError(
-            str(path), "a checkpoint of another scan or other options", "one of this run", remedy
+            str(path), f"a checkpoint of {_other_run(found, fingerprint)}", "one of this run", remedy
         )
     return arrays
+
+
+def _other_run(found: str, wanted: str) -> str:
+    """What a checkpoint's run had otherwise, as far as its fingerprint tells."""
+    unknown = "another scan or other options"
+    try:
+        then, now = json.loads(found), json.loads(wanted)
+    except (ValueError, RecursionError):  # of an earlier version, or damaged
+        return unknown
+    differences = list(_differences(then, now)) if isinstance(then, dict) else []
+    told = differences[:_MOST_DIFFERENCES]
+    more = "; and more" if len(differences) > len(told) else ""
+    return f"a run with other {'; '.join(told)}{more}" if told else unknown
+
+
+def _differences(found: object, wanted: object, name: str = "") -> Iterator[str]:
+    """NAME (then, now) of every value that is not the same in two trees of tables."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in sorted({*found, *wanted}):
+            yield from _differences(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
+    elif found != wanted:
+        yield f"{name[:_LONGEST_NAME]} ({checks.shown(found)}, now {checks.shown(wanted)})"

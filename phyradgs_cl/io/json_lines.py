@@ -42,7 +42,8 @@ def read_lines(path: Path) -> list[Line]:
             str(path), "no result in any line", "a results file (JSON lines)", "choose another -o"
         )
     if damaged:
-        log.warning("%s: line %s is damaged and left out", path, ", ".join(map(str, damaged)))
+        where = ("line %s is" if len(damaged) == 1 else "lines %s are") % ", ".join(map(str, damaged))
+        log.warning("%s: %s damaged and left out", path, where)
     return lines
 
 

@@ -153,6 +153,12 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
     address = header.reference_address
     values = read_values(source, address, source.dataset(address))
     checks.finite(source.name(address), values)
+    if values.max() <= 0:
+        found, expected = (
+            f"no voxel above 0 (the largest is {values.max() + 0.0:g})",
+            "a truth to compare with",
+        )
+        raise InputError(source.name(address), found, expected, "take the reference out of the file")
     return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 

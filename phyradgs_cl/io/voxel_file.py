@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 
 _BARE = "/volume"
 _ENTRY = "/entry/reconstruction"
+log = logging.getLogger(__name__)
 _AXIS_TOLERANCE = 1e-3  # of a voxel: what float32 axes of a thousand voxels need
 
 
@@ -42,6 +44,29 @@ def load_volume(path: str | Path) -> LoadedVolume:
         volume = _read(source, name)
         grid = _read_grid(source, volume.shape) if name != _BARE else None
     return LoadedVolume(volume, grid)
+
+
+def load_attenuation(path: str | Path, *, warn: bool = True) -> LoadedVolume:
+    """``load_volume``, for a volume that rays are to be sent through.
+
+    Where a tenth as much lies below 0 as above, that is worth a warning: noise about 0 in air has less.
+
+    Raises:
+        InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units.
+    """
+    loaded = load_volume(path)
+    volume = loaded.volume
+    positive = float(np.sum(volume, where=volume > 0, dtype=np.float64))
+    negative = float(-np.sum(volume, where=volume < 0, dtype=np.float64))
+    found = f"values from {volume.min():g} to {volume.max():g}"
+    expected = "attenuation: 0 in air, above 0 in matter"
+    remedy = "of Hounsfield units it is µ(water) (1 + HU / 1000)"
+    if positive <= negative:
+        raise InputError(f"volume of {path}", found, expected, remedy)
+    if warn and negative > 0.1 * positive:
+        share = f"{100 * negative / positive:.0f} % as much below 0 as above"
+        log.warning("volume of %s: %s, %s; expected %s; %s", path, found, share, expected, remedy)
+    return loaded
 
 
 def _dataset_name(source: Hdf5Source) -> str:

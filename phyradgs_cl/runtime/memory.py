@@ -123,7 +123,7 @@ def bytes_of(wish: str | int, culprit: str) -> int:
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
     if match is None or factor is None or not 0 < float(match.group(1)) * factor < 2**63:
-        expected, remedy = "a size above 0 with a unit", "write for example 2GiB, 1.5GB or 512M"
+        expected, remedy = "a size above 0, in bytes or with a unit", "write for example 2GiB, 1.5GB or 512M"
         raise InputError(culprit, repr(wish), expected, remedy)
     return max(int(float(match.group(1)) * factor), 1)
 

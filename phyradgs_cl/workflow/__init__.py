@@ -8,6 +8,7 @@ from phyradgs_cl.workflow.simulate import (
     load_scanner_for,
     make_scan_protocol,
     refuse_jitter,
+    refuse_noise_options,
     run_simulation,
 )
 
@@ -20,6 +21,7 @@ __all__ = [
     "make_scan_protocol",
     "profile_report",
     "refuse_jitter",
+    "refuse_noise_options",
     "run_evaluation",
     "run_reconstruction",
     "run_simulation",

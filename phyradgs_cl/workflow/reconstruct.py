@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -236,9 +235,10 @@ def _provenance(
     }
 
 
-def _fingerprint(scan_hash: str, job: ReconstructionJob, options: object) -> str:
-    text = json.dumps([scan_hash, job.method, repr(options), repr(job.before), job.seed])
-    return hashlib.sha256(text.encode()).hexdigest()
+def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
+    """What a run that goes on must have in common with the one that it continues, as JSON."""
+    run = {"method": job.method, "seed": job.seed, "input": asdict(job.before), **asdict(options)}
+    return json.dumps({"scan": scan_hash[:16], **run}, sort_keys=True, default=repr)
 
 
 def _resumed(job: ReconstructionJob, fingerprint: str) -> State:

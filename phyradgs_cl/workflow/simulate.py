@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,13 @@ def refuse_jitter(protocol: str, jitter_deg: float | None) -> None:
     if jitter_deg and not PROTOCOLS[protocol].is_fly:
         remedy = "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", f"{jitter_deg} with --protocol {protocol}", "0", remedy)
+
+
+def refuse_noise_options(noise: str, given: Mapping[str, float | None]) -> None:
+    """Photons and electronic noise that are stated mean something with a model of noise only."""
+    stated = [f"{option} {value:g}" for option, value in given.items() if value is not None]
+    if noise == "none" and stated:
+        raise InputError(stated[0], "--noise none", "a model of noise with it", "add --noise tigre or beer")
 
 
 @np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line

@@ -30,6 +30,7 @@ from phyradgs_cl.bench.results import KEY, Present, append_line, read_lines
 from phyradgs_cl.bench.summary import summarise
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.reconstructors import METHODS
 
 FACTS = {**dict.fromkeys(KEY, 1), "options": {"motion": {"name": "static"}, "iterations": 5}, "metrics": {}}
 
@@ -145,6 +146,16 @@ def test_a_row_of_an_unknown_name_or_method_is_named(tmp_path: Path) -> None:
         Row("Magic", "magic").options(10, 10)
     with pytest.raises(InputError, match="row 'R2 exact': --motion"):
         Row("R2 exact", "r2", "per-row").options(10, 10)
+
+
+def test_a_method_of_ones_own_has_rows_under_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(METHODS, "landweber", METHODS["sirt"])
+    job = BenchJob("table1", tmp_path, rows=["landweber per-row", "landweber"])
+    assert [row.run for row in job.chosen_rows] == ["landweber static", "landweber per-row"]
+    assert job.chosen_rows[1].standing().run == "landweber static"
+    assert "landweber" not in [row.label for row in rows_of("table1")]
 
 
 def test_stop_and_shoot_is_planned_once_for_the_rows_that_share_it(tmp_path: Path) -> None:

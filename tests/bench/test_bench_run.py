@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -124,15 +125,37 @@ def test_tables_have_means_papers_numbers_and_rows_without_pytorch(
     assert f"{float(records[3]['psnr_db']):.2f} ± " in rows["PhyRadGS"]  # the bound stands beside the row
 
 
+def test_every_volume_is_looked_at_before_the_first_run(job: BenchJob, folder: Path) -> None:
+    with h5py.File(folder / "zero.h5", "w") as file:
+        file["volume"] = np.zeros((24, 24, 24), np.float32)
+    with pytest.raises(InputError, match=r"zero.h5: found values from 0 to 0"):
+        run_bench(job, no_runtime)
+    with h5py.File(folder / "zero.h5", "r+") as file:
+        file["volume"][3, 4, 5] = np.nan
+    with pytest.raises(InputError, match=r"zero.h5:/volume: found 1 voxels that are NaN"):
+        run_bench(job, no_runtime)
+
+
+def test_figures_without_slices_are_left_out_with_a_word(
+    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture
+) -> None:
+    run_bench(replace(job, names=["ball"], rows=["FDK"]), lambda: rt)
+    shutil.rmtree(job.output / "slices")
+    assert [path.suffix for path in remake_tables(job)] == [".md", ".csv"]
+    assert "no slices of 1 of 1 pictures" in caplog.text
+
+
 def test_tables_alone_need_no_device_but_results(job: BenchJob, rt: Runtime) -> None:
     with pytest.raises(InputError, match="no results"):
         remake_tables(job)
     run_bench(replace(job, rows=["FDK", "PhyRadGS"]), lambda: rt)
     assert "| PhyRadGS w/o ST | – |" in (remake_tables(job)[0]).read_text()
-    with pytest.raises(InputError, match="found results of 12³"):
+    with pytest.raises(InputError, match="found only volumes at 12³; volumes at 12³ with 8"):
         remake_tables(replace(job, size="S", rows=["PhyRadGS"]))
     before = remake_tables(job)[0].read_text()
-    with pytest.raises(InputError, match="iterations 8"):  # a table without its splats is not what is meant
+    with pytest.raises(
+        InputError, match="with 8 iterations"
+    ):  # a table without its splats is not what is meant
         remake_tables(replace(job, iterations=9))
     assert remake_tables(job)[0].read_text() == before
 

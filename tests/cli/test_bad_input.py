@@ -70,6 +70,10 @@ DAMAGE = {
         lambda p: _replace(p, "entry/phyradgs/reference/volume", np.zeros((2, 2, 2))),
         "reference",
     ),
+    "reference of nothing": (
+        lambda p: _replace(p, "entry/phyradgs/reference/volume", np.zeros((8, 8, 8), np.float32)),
+        "reference/volume: found no voxel above 0",
+    ),
     "wrong axis": (lambda p: _replace(p, "entry/phyradgs/readout_axis", "diagonal"), "readout_axis"),
 }
 
@@ -122,6 +126,17 @@ OPTIONS = {
     "no views": (["simulate", "--views", "0"], "views"),
     "negative exposure": (["simulate", "--exposure-deg", "-3"], "exposure"),
     "no dose": (["simulate", "--noise", "beer", "--dose", "0", "--size", "8", "--detector", "8"], "--dose"),
+    "dose without noise": (["simulate", "--dose", "100", *TINY], "--dose 100: found --noise none"),
+    "electronic noise without noise": (
+        ["simulate", "--electronic-noise", "5", *TINY],
+        "--electronic-noise 5",
+    ),
+    "median of three and a half": (
+        ["reconstruct", "{scan}", "--median-filter", "4"],
+        "--median-filter: found 4",
+    ),
+    "iterations that are no number": (["reconstruct", "{scan}", "--iterations", "1e3"], "'1e3'"),
+    "dose that is no number": (["simulate", "--noise", "beer", "--dose=1o", *TINY], "found '1o'"),
     "bad offset": (["simulate", "--detector-offset", "left"], "--detector-offset"),
     "bad size": (["simulate", "--size", "-4", "--detector", "8"], ""),
     "wrong direction": (

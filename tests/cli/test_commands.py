@@ -76,6 +76,15 @@ def test_each_method_writes_a_volume_that_evaluates(cli, scan, tmp_path, capsys,
     assert ("iterations asked" in told) == ("--iterations" in options)
 
 
+def test_a_method_that_ends_by_itself_says_when_and_why(cli, scan, tmp_path, capsys):
+    files = [str(scan), "-o", str(tmp_path / "v.h5")]
+    command = ["reconstruct", *files, "--method", "sirt", "--iterations", "9"]
+    assert cli.run([*command, "--set", "tolerance=0.9"]) == 0
+    assert "sirt, stopped after 2 of 9 iterations (tolerance), " in capsys.readouterr().out
+    assert cli.run(command) == 0
+    assert "stopped" not in capsys.readouterr().out
+
+
 def test_columns_and_intensity_and_jitter_are_simulated(cli, tmp_path):
     path = tmp_path / "scan.h5"
     options = [
@@ -133,7 +142,7 @@ def test_one_pose_a_line_and_methods_with_the_intensity_model_need_no_warning(cl
 def test_a_detector_model_belongs_to_the_methods_that_have_one(cli, scan, tmp_path, capsys):
     options = ["--method", "fdk", "--detector-model", "intensity"]
     assert cli.run(["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), *options]) == 2
-    assert "detector_model" in capsys.readouterr().err
+    assert "--detector-model: found no such option of --method fdk" in capsys.readouterr().err
 
 
 def test_pulse_and_lag_are_simulated_and_the_lag_may_be_ignored(cli, tmp_path):

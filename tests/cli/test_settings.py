@@ -73,7 +73,7 @@ def test_a_wrong_value_of_a_file_is_named_by_its_line(config: Path, text: str, e
 
 def test_a_wrong_option_of_the_command_line_is_not_the_files(config: Path) -> None:
     config.write_text("method = 'fdk'\niterations = 3\n")
-    with pytest.raises(InputError, match="^--method fdk: option iterations"):
+    with pytest.raises(InputError, match="^--iterations: found no such option of --method fdk"):
         run_settings(config, {"iterations": 5})
     with pytest.raises(InputError, match="^--set iterations=5: found no such option of --method fdk"):
         run_settings(None, {"method": "fdk"}, ["iterations=5"])

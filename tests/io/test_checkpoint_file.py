@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from pathlib import Path
 
@@ -63,6 +64,24 @@ def test_none_another_runs_or_another_formats(path) -> None:
         read_checkpoint(path, "other")
     rewrite(path, {"format.npy": npy(np.array(2))})
     refused(path, "another checkpoint format")
+
+
+def test_what_another_run_had_otherwise_is_named(path) -> None:
+    def told(then: str, now: str) -> str:
+        write_checkpoint(path, ARRAYS, then)
+        with pytest.raises(InputError) as error:
+            read_checkpoint(path, now)
+        return error.value.found
+
+    now = '{"iterations": 40, "rates": {"position": 1.0}, "scan": "a", "seed": 0}'
+    then = now.replace("40", "60").replace("1.0", "2.0")
+    words = "a checkpoint of a run with other iterations (60, now 40); rates.position (2.0, now 1.0)"
+    assert told(then, now) == words
+    many = json.dumps({f"option{n}": n for n in range(9)})
+    assert told(many, now).endswith("; and more")
+    assert told('{"seed": 1, "x%s": 2}' % ("y" * 9999), "{}").count("y") < 100
+    for damaged in ("0" * 64, "[" * 9999, '"text"', "[1, 2]"):
+        assert "another scan or other options" in told(damaged, now)
 
 
 @pytest.mark.parametrize(

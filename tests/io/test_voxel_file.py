@@ -10,7 +10,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
-from phyradgs_cl.io import load_volume
+from phyradgs_cl.io import load_attenuation, load_volume
 
 
 def _write(path: Path, data: object, name: str = "volume") -> Path:
@@ -107,3 +107,32 @@ def test_a_truncated_file_is_an_input_error(tmp_path: Path) -> None:
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match=r"v\.h5"):
         load_volume(path)
+
+
+@pytest.mark.parametrize("level", [0.0, -0.5])
+def test_what_does_not_attenuate_cannot_be_scanned(tmp_path: Path, level: float) -> None:
+    path = _write(tmp_path / "v.h5", np.full((2, 3, 4), level, np.float32))
+    with pytest.raises(InputError, match=r"v.h5: found values from .*; expected attenuation: 0 in air"):
+        load_attenuation(path)
+    assert load_volume(path).volume.min() == level
+
+
+def test_hounsfield_units_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    air_around = np.full((4, 4, 4), -1000.0, np.float32)
+    air_around[1:3, 1:3, 1:3] = 40.0
+    with pytest.raises(InputError, match="found values from -1000 to 40;.*Hounsfield"):
+        load_attenuation(_write(tmp_path / "head.h5", air_around))
+    mostly_bone = np.full((4, 4, 4), 900.0, np.float32)
+    mostly_bone[0] = -1000.0
+    path = _write(tmp_path / "bone.h5", mostly_bone)
+    load_attenuation(path, warn=False)
+    assert not caplog.records
+    load_attenuation(path)
+    assert "bone.h5: values from -1000 to 900, 37 % as much below 0 as above" in caplog.text
+
+
+def test_noise_about_nothing_is_no_reason_to_warn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    volume = np.random.default_rng(0).normal(0, 0.03, (8, 8, 8))
+    volume[2:6, 2:6, 2:6] += 1
+    assert load_attenuation(_write(tmp_path / "v.h5", volume)).volume.min() < 0
+    assert not caplog.records
