@@ -63,4 +63,6 @@ def gain_over_static(lines: Sequence[Line], protocol: str, row: Row) -> Gain | N
 
 
 def _by_scan(lines: Sequence[Line]) -> dict[tuple[str, int], Line]:
-    return {(line["volume"], line["seed"]): line for line in lines}
+    """Lines by volume and seed; a perfect volume has no number, and no gain either."""
+    measured = [line for line in lines if line["metrics"].get("psnr_db") is not None]
+    return {(line["volume"], line["seed"]): line for line in measured}

@@ -51,6 +51,12 @@ def test_scans_without_a_partner_do_not_count() -> None:
     assert gain_over_static(LINES, "rapid", ROWS["CGLS per-row"]) is None
 
 
+def test_perfect_volumes_have_no_gain() -> None:
+    perfect = {**line(MOVING, "b", 0, 0.0), "metrics": {"psnr_db": None, "ssim": 1.0}}
+    gain = gain_over_static([*LINES[:5], perfect], "rapid", MOVING)
+    assert gain is not None and (gain.volumes, gain.mean_db) == (1, 2.0)
+
+
 def test_a_static_row_has_no_gain_and_stop_and_shoot_is_of_the_same_scans() -> None:
     assert gain_over_static(LINES, "rapid", STATIC) is None
     still = [line(STATIC, volume, 0, psnr, acquisition=STILL) for volume, psnr in (("a", 40.0), ("c", 90.0))]
