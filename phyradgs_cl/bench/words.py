@@ -33,11 +33,9 @@ def result_text(progress: BenchProgress) -> str:
     else:
         psnr = numbers.get("psnr_db")
         found = f"PSNR {'inf' if psnr is None else format(psnr, '.2f')} dB, SSIM {numbers['ssim']:.3f}"
-        found += (
-            f" to the truth, {line['seconds']:.1f} s"
-            if "psnr_db_pseudo" in numbers
-            else f", {line['seconds']:.1f} s"
-        )
+        if "psnr_db_pseudo" in numbers:
+            found += " to the truth"
+        found += f", {line['seconds']:.1f} s"
     left = f"; about {_duration(progress.left_s)} left" if progress.left_s else ""
     return f"{progress.number}/{progress.runs} {progress.title}: {found}{left}"
 
