@@ -2,9 +2,11 @@
 
 PoCL 3.0 asks LLVM 14 for the host's name. For a processor that LLVM does not know the answer is
 "generic", which LLVM's own front end then refuses ("unknown target CPU 'generic'"), so that no kernel
-builds (pocl/pocl issue 1049). PoCL has no setting for it. What it does have is a device record that
-holds a pointer to that name; here the pointer is turned to the name of an older processor with the same
-instruction sets. The record is only read until exactly the string "generic" has been found in it.
+builds (pocl/pocl issue 1049). Others it takes for their elder: AMD's Zen 4 is "znver3" to it, which has no
+AVX-512, while PoCL looks at the instruction sets and links its library for AVX-512: LLVM then aborts the
+whole process ("Cannot select: i64 = fma"). PoCL has no setting for either. What it does have is a device
+record that holds a pointer to that name; here the pointer is turned to the name of an older processor with
+the same instruction sets. The record is only read until exactly one of the wrong names has been found in it.
 """
 
 from __future__ import annotations
@@ -25,8 +27,13 @@ from phyradgs_cl.parallel import Launch, launched
 log = logging.getLogger(__name__)
 
 _RECORD_BYTES = 2048
+_UNKNOWN = frozenset({b"generic"})
+# LLVM 14's names for processors of which there are some with AVX-512, though the name says that there is none
+_WITHOUT_AVX512 = frozenset({b"znver3", b"alderlake"})
+_LONGEST_NAME = max(map(len, _UNKNOWN | _WITHOUT_AVX512))
 _USER_SPACE = 1 << 47
 CACHE_VARIABLE = "POCL_CACHE_DIR"
+AVX512_TARGET = "skylake-avx512"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _unwritable: Path | None = None
 _kept_alive: list[ctypes.Array] = []
@@ -113,7 +120,7 @@ def equivalent_target() -> str | None:
         return None
     flags = _cpu_flags()
     if {"avx512f", "avx512dq", "avx512bw", "avx512vl", "avx512cd"} <= flags:
-        return "skylake-avx512"
+        return AVX512_TARGET
     if {"avx2", "fma", "bmi1", "bmi2"} <= flags:
         return "haswell"
     if "avx" in flags:
@@ -122,24 +129,31 @@ def equivalent_target() -> str | None:
 
 
 def repair_unknown_target(device_address: int) -> str | None:
-    """Names the equivalent processor in the record of a PoCL CPU device, if LLVM did not know the real one.
+    """Names the equivalent processor in the record of a PoCL CPU device, if LLVM does not know the real one.
 
     Returns the name that was set, or None when nothing had to be done (or nothing could be).
     """
     target = equivalent_target()
     if target is None or platform.system() != "Linux":
         return None
+    wrong = _UNKNOWN | _WITHOUT_AVX512 if target == AVX512_TARGET else _UNKNOWN
     with _own_memory() as read:
         record = read(device_address, _RECORD_BYTES)
         for offset in range(0, len(record) - 7, 8):
             (pointer,) = struct.unpack_from("<Q", record, offset)
-            if 4096 < pointer < _USER_SPACE and read(pointer, 8) == b"generic\0":
+            if 4096 < pointer < _USER_SPACE and _text(read(pointer, _LONGEST_NAME + 1)) in wrong:
                 name = ctypes.create_string_buffer(target.encode())
                 _kept_alive.append(name)
                 ctypes.c_uint64.from_address(device_address + offset).value = ctypes.addressof(name)
                 log.info("PoCL does not know this processor; its kernels are built for %s", target)
                 return target
     return None
+
+
+def _text(memory: bytes) -> bytes | None:
+    """The C string that a piece of memory begins with; None where it does not end in it."""
+    text, end, _ = memory.partition(b"\0")
+    return text if end else None
 
 
 @contextlib.contextmanager

@@ -34,8 +34,19 @@ def on_linux_x86(monkeypatch):
     monkeypatch.setattr(pocl, "equivalent_target", lambda: "haswell")
 
 
-@pytest.mark.parametrize("name", [b"skylake-avx512", b"znver3", b"generic-like", b""])
-def test_a_known_processor_is_left_alone(record, name) -> None:
+@pytest.mark.parametrize(
+    ("target", "name"),
+    [
+        ("haswell", b"skylake-avx512"),
+        ("haswell", b"znver3"),  # a Zen 3: its name says all that it has
+        ("haswell", b"generic-like"),
+        ("haswell", b""),
+        ("skylake-avx512", b"sapphirerapids"),
+        ("skylake-avx512", b"znver30"),
+    ],
+)
+def test_a_known_processor_is_left_alone(record, monkeypatch, target, name) -> None:
+    monkeypatch.setattr(pocl, "equivalent_target", lambda: target)
     memory, put = record
     put(400, name)
     before = bytes(memory)
@@ -54,6 +65,17 @@ def test_an_unknown_processor_gets_the_equivalents_name(record) -> None:
     after = bytes(memory)
     assert before[:400] + before[408:] == after[:400] + after[408:]  # nothing else is touched
     assert pocl.repair_unknown_target(ctypes.addressof(memory)) is None  # and it is done once
+
+
+@pytest.mark.parametrize("name", [b"generic", b"znver3", b"alderlake"])
+def test_a_name_without_avx512_is_replaced_where_there_is_avx512(record, monkeypatch, name) -> None:
+    """LLVM 14 takes Zen 4 for Zen 3; PoCL links its AVX-512 library all the same, and LLVM aborts the process."""
+    monkeypatch.setattr(pocl, "equivalent_target", lambda: "skylake-avx512")
+    memory, put = record
+    put(400, name)
+    assert pocl.repair_unknown_target(ctypes.addressof(memory)) == "skylake-avx512"
+    (pointer,) = struct.unpack_from("<Q", memory, 400)
+    assert ctypes.string_at(pointer) == b"skylake-avx512"
 
 
 def test_nothing_is_tried_elsewhere(record, monkeypatch) -> None:
