@@ -3,7 +3,7 @@
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl [--names a,b] [--size 64] [--seeds 7] [--faults none,rotation]
     python benchmarks/check_faults.py --table RESULTS.jsonl
 
-Volumes are as for benchmarks/quality.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. The
+Scans are those of benchmarks/scans.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. The
 last faults are planted in scans of their own: `short exposure` in one that exposes half of the time between frames, so
 that twice the exposure fits the timing and only the frames can tell, and `narrow cone` with the source 100 times as far,
 where a wrong sign of rotation leaves no trace and `cannot tell` is the right answer.
@@ -19,17 +19,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from quality import append, file_for, read_lines
+from scans import RAPID, append, file_for, make_scan, read_lines
 
 from phyradgs_cl import __version__
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Protocol, Scan, make_protocol
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Protocol, Scan, make_protocol
 from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, check
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import SimulationOptions, simulate, volume_scene
 
 DEAD_SHARE, DRIFT, OFFSET_PX = 0.01, 0.05, 3.0
-RAPID = make_protocol("rapid")
 SHORT = make_protocol("rapid", exposure_deg=7.2, readout_ratio=1.72)
 
 
@@ -100,15 +97,6 @@ FAULTS: dict[str, tuple[Plant, Protocol, float, tuple[str, ...], str]] = {
 }
 
 
-def make_scan(rt: Runtime, path: Path, size: int, protocol: Protocol, away: float, seed: int) -> Scan:
-    """The scan of one volume, as benchmarks/quality.py makes it; ``away`` moves the source and leaves the magnification."""
-    detector = 2 * size
-    geometry = ConeGeometry(5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2)
-    scene = volume_scene(rt, str(path), geometry, Grid.cube(size, 2.0), size, "rows")
-    options = SimulationOptions(protocol=protocol, readout_axis="rows", noise="tigre", seed=seed)
-    return simulate(scene.source, geometry, scene.grid, options, title=path.stem)
-
-
 def run_all(arguments: argparse.Namespace) -> None:
     rt = Runtime(arguments.device)
     folder, results = Path(arguments.volumes), Path(arguments.results)
@@ -125,7 +113,7 @@ def run_all(arguments: argparse.Namespace) -> None:
                 plant, protocol, away, _, _ = FAULTS[fault]
                 if (protocol, away) not in scans:
                     path = file_for(folder, name, arguments.size)
-                    scans[protocol, away] = make_scan(rt, path, arguments.size, protocol, away, seed)
+                    scans[protocol, away] = make_scan(rt, path, arguments.size, seed, protocol, away=away)
                 scan = plant(
                     scans[protocol, away], np.random.default_rng([seed, *f"{name} {fault}".encode()])
                 )

@@ -5,7 +5,7 @@
     python benchmarks/motion_models.py table RESULTS.jsonl
     python benchmarks/motion_models.py figure RESULTS.jsonl COST.json TIME_EXACT.json FIGURE.png
 
-Motions: static, MxN (micro-views), "exact BOUND". ``run`` scans the volumes as benchmarks/quality.py does (rapid, rows,
+Motions: static, MxN (micro-views), "exact BOUND". ``run`` scans the volumes as benchmarks/scans.py does (rapid, rows,
 TIGRE's noise at 1e4 photons and sigma 10) and goes on where it was interrupted. ``cost`` times whole iterations, density
 control left out, on one scan of the foot phantom: the median over rounds in which all motions take turns. TIME_EXACT.json
 is what benchmarks/time_exact.py writes: errors of one frame.
@@ -21,7 +21,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
-from quality import append, file_for, make_scan, read_lines
+from scans import append, file_for, make_scan, read_lines
 
 from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -69,7 +69,7 @@ def run(arguments: Namespace) -> None:
                 }
                 if key_of(facts) in done:
                     continue
-                scan = make_scan(rt, file_for(folder, name, arguments.size), arguments, seed)
+                scan = make_scan(rt, file_for(folder, name, arguments.size), arguments.size, seed)
                 line = {**facts, **run_one(rt, scan, motion, arguments.iterations, seed)}
                 append(results, line)
                 print(json.dumps(line), flush=True)
@@ -237,7 +237,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--device")
-    arguments = parser.parse_args(namespace=Namespace(axis="rows", protocol="rapid"))
+    arguments = parser.parse_args()
     paths = [Path(p) for p in arguments.paths]
     if arguments.what == "run":
         arguments.volumes, arguments.results = paths

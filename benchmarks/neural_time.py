@@ -3,7 +3,7 @@
     python benchmarks/neural_time.py run VOLUMES RESULTS.jsonl [--names cthead,walnut] [--size 64] [--methods a,b] ...
     python benchmarks/neural_time.py draw RESULTS.jsonl FIGURE.png
 
-Scans are those of quality.py. A run's volume is scored on the way, each time that a third more time has passed; scoring
+Scans are those of scans.py. A run's volume is scored on the way, each time that a third more time has passed; scoring
 (and the volume that it needs) is not counted. Seconds are those of processors in this process, all threads of it added up:
 with --threads 1, the default, what a core that does nothing else would take, also on a busy machine. They begin with the
 call: FDK and kernel builds are in them. A run is in the file once it is done; what the file has is not run again.
@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from quality import append, file_for, make_scan, read_lines
+from scans import append, file_for, make_scan, read_lines
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
@@ -104,7 +104,7 @@ def run_all(arguments: argparse.Namespace) -> None:
                 if values in done:
                     continue
                 path = file_for(Path(arguments.volumes), name, arguments.size)
-                scan = scan or make_scan(rt, path, arguments, arguments.seed)
+                scan = scan or make_scan(rt, path, arguments.size, arguments.seed)
                 facts = dict(zip(KEY, values, strict=True))
                 facts["threads"] = arguments.threads
                 append(results, {**facts, **run_one(rt, scan, label, factor, arguments.seed)})
@@ -159,8 +159,6 @@ def main() -> None:
     run.add_argument("--methods", default=",".join(METHODS))
     run.add_argument("--factors", default="1", help="iterations as multiples of the defaults, e.g. 0.25,1,4")
     run.add_argument("--size", type=int, default=64)
-    run.add_argument("--axis", default="rows")
-    run.add_argument("--protocol", default="rapid")
     run.add_argument("--seed", type=int, default=0)
     run.add_argument("--device", default=None)
     run.add_argument("--threads", type=int, default=1)

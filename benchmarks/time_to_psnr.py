@@ -6,7 +6,7 @@
 Of every volume and seed r2 is run to its end. Then phyradgs runs with the same number of iterations (or its preset's), its
 volume is measured every ``--every`` iterations, and it ends when it is better than r2. Time spent measuring is taken out.
 Each run is a line of JSON; what is there already is not run again. Scans as in
-benchmarks/quality.py: rapid, rows, TIGRE's noise.
+benchmarks/scans.py: rapid, rows, TIGRE's noise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from measuring import Facts, median, parser_of, where
-from quality import append, file_for, make_scan, read_lines
+from scans import append, file_for, make_scan, read_lines
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
@@ -91,7 +91,7 @@ def run_all(arguments: Namespace) -> None:
             keys = [tuple(facts[k] for k in KEYS) for facts in (first, second)]
             if all(key in done for key in keys):
                 continue
-            scan = make_scan(rt, file_for(folder, name, arguments.size), arguments, seed)
+            scan = make_scan(rt, file_for(folder, name, arguments.size), arguments.size, seed)
             if keys[0] not in done:
                 done[keys[0]] = {**first, **run_r2(rt, scan, arguments.iterations, seed), **where(rt)}
                 append(results, done[keys[0]])
@@ -133,8 +133,6 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--every", type=int, default=50, help="a multiple of 50")
     parser.add_argument("--seeds", default="0")
-    parser.add_argument("--axis", default="rows")
-    parser.add_argument("--protocol", default="rapid")
     arguments = parser.parse_args()
     if arguments.table:
         print(table(read_lines(arguments.table)))

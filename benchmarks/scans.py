@@ -1,0 +1,45 @@
+"""What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of a line of JSON a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import SimulationOptions, simulate, volume_scene
+
+RAPID = make_protocol("rapid")
+
+
+def make_scan(
+    rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0
+) -> Scan:
+    """The scan of a volume file as `phyradgs bench` makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
+
+    ``size`` counts the reference's voxels a side, half the detector's pixels; ``away`` multiplies the distances of source
+    and detector, which leaves the magnification.
+    """
+    detector = 2 * size
+    geometry = ConeGeometry(5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2)
+    scene = volume_scene(rt, str(path), geometry, Grid.cube(size, 2.0), size, "rows")
+    options = SimulationOptions(protocol=protocol, readout_axis="rows", noise="tigre", seed=seed)
+    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference, title=path.stem)
+
+
+def file_for(folder: Path, name: str, size: int) -> Path:
+    """The file with twice ``size`` voxels a side, else the largest that there is."""
+    wanted = folder / f"{name}_{2 * size}.h5"
+    if wanted.exists():
+        return wanted
+    return max(folder.glob(f"{name}_*.h5"), key=lambda p: int(p.stem.rsplit("_", 1)[1]))
+
+
+def read_lines(path: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def append(path: Path, line: dict[str, object]) -> None:
+    with open(path, "a") as file:
+        file.write(json.dumps(line) + "\n")
