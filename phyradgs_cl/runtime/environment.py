@@ -12,6 +12,7 @@ import numpy as np
 
 from phyradgs_cl import __version__
 from phyradgs_cl.runtime.context import Runtime
+from phyradgs_cl.runtime.host_cpu import cpu_name
 
 
 def environment(rt: Runtime) -> dict[str, Any]:
@@ -27,6 +28,7 @@ def environment(rt: Runtime) -> dict[str, Any]:
         "device_version": rt.device.version,
         "compute_units": rt.device.compute_units,
         "host_cores": os.cpu_count(),
+        "processor": cpu_name(),
         "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
 

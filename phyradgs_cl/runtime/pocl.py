@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from phyradgs_cl.parallel import Launch, launched
+from phyradgs_cl.runtime.host_cpu import cpu_facts
 
 log = logging.getLogger(__name__)
 
@@ -174,8 +175,4 @@ def _own_memory() -> Iterator[object]:
 
 
 def _cpu_flags() -> set[str]:
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("flags"):
-                return set(line.split(":", 1)[1].split())
-    return set()
+    return set(cpu_facts().get("flags", "").split())
