@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol
+from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Protocol, Scan
+from phyradgs_cl.bench.case import FLY, SyntheticCase
+from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import SimulationOptions, simulate, volume_scene
+from phyradgs_cl.simulation import volume_scene
 
-RAPID = make_protocol("rapid")
+RAPID = PROTOCOLS["rapid"]
 
 
 def make_scan(
@@ -24,16 +26,12 @@ def make_scan(
     detector = 2 * size
     geometry = ConeGeometry(5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2)
     scene = volume_scene(rt, str(path), geometry, Grid.cube(size, 2.0), size, "rows")
-    options = SimulationOptions(protocol=protocol, readout_axis="rows", noise="tigre", seed=seed)
-    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference, title=path.stem)
+    return SyntheticCase(rt, scene, geometry, protocol, "rows", seed).scan(FLY)
 
 
 def file_for(folder: Path, name: str, size: int) -> Path:
     """The file with twice ``size`` voxels a side, else the largest that there is."""
-    wanted = folder / f"{name}_{2 * size}.h5"
-    if wanted.exists():
-        return wanted
-    return max(folder.glob(f"{name}_*.h5"), key=lambda p: int(p.stem.rsplit("_", 1)[1]))
+    return find_volumes(folder, [name], size)[name]
 
 
 def read_lines(path: Path) -> list[dict[str, object]]:
