@@ -12,6 +12,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.bench.case import FLY, STILL
+from phyradgs_cl.bench.identity import content_hash
 from phyradgs_cl.bench.results import Line
 from phyradgs_cl.bench.rows import Row, candidate_rows, choose_rows, rows_of
 from phyradgs_cl.bench.sizes import BenchSize, bench_size
@@ -173,11 +174,14 @@ def plan_runs(job: BenchJob) -> list[PlannedRun]:
         others = "; ".join(row.label for row in candidate_rows(job.kind) if not row.lacks(voxels))
         raise InputError("--rows", asked, f"one of {others}", INSTALL)
     plan = []
+    sources = job.sources()
+    hashes = {volume: content_hash(source) for volume, source in sources.items()}
     for seed in dict.fromkeys(job.seeds):
-        for volume, source in job.sources().items():
+        for volume, source in sources.items():
             for protocol in dict.fromkeys(job.chosen_protocols):
                 for acquisition, row, options in shared:
                     facts = _facts(job, volume, source, protocol, seed, acquisition, row, options)
+                    facts["source_hash"] = hashes[volume]
                     plan.append(PlannedRun(volume, source, protocol, seed, acquisition, row, options, facts))
     return plan
 

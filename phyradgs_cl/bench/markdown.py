@@ -94,15 +94,21 @@ def _means(job: BenchJob, protocol: str, lines: Sequence[Line]) -> list[str]:
 def _row_cells(
     job: BenchJob, row: Row, protocol: str, lines: Sequence[Line], columns: dict[str, Cell], most: int
 ) -> list[str]:
-    summary = summarise(lines_of_run(lines, protocol, row.run, FLY))
-    still = summarise(lines_of_run(lines, protocol, row.standing().run, STILL))
+    moving = lines_of_run(lines, protocol, row.run, FLY)
+    volumes = {line["volume"] for line in moving}
+    standing = lines_of_run(lines, protocol, row.standing().run, STILL)
+    summary = summarise(moving)
+    still = summarise([line for line in standing if line["volume"] in volumes or not volumes])
     label = row.label
     if summary is None and (lacks := row.lacks(job.bench_size.voxels)):
         label += f" ({lacks})"
     if summary is not None and summary.volumes < most:
         label += f" ({summary.volumes} of {most} volumes)"
     cells = [cell(summary) if summary is not None else "–" for cell in columns.values()]
-    return [label, *cells, _both(still) if still is not None else "–"]
+    bound = _both(still) if still is not None else "–"
+    if still is not None and summary is not None and still.volumes < summary.volumes:
+        bound += f" ({still.volumes} of {most} volumes)"
+    return [label, *cells, bound]
 
 
 def _motion_block(job: BenchJob, protocol: str, lines: Sequence[Line]) -> list[str]:
@@ -162,7 +168,7 @@ def _by_volume(job: BenchJob, lines: Sequence[Line], volumes: Sequence[str]) -> 
 
 
 def _row_text(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:

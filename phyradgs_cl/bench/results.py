@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.io.json_lines import Line, append_line, read_lines, refuse_irregular
+from phyradgs_cl.io import json_lines
+from phyradgs_cl.io.json_lines import Line, append_line, refuse_irregular
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]
 
@@ -24,6 +27,52 @@ KEY = (
     "seed",
     "iterations",
 )
+
+# What tables read of a line with numbers besides.
+_WORDS = (
+    "study",
+    "volume",
+    "run",
+    "acquisition",
+    "protocol",
+    "axis",
+    "device",
+    "platform",
+    "version",
+    "python",
+    "numpy",
+)
+_COUNTS = ("voxels", "pixels", "seed", "views")
+_TIMES = ("seconds", "processor_s")
+
+
+def read_lines(path: Path) -> list[Line]:
+    """All sound lines of a benchmark's results file, with a word about others; none where there is no file.
+
+    Raises:
+        InputError: a file that cannot be read, or that has content but no result.
+    """
+    return json_lines.read_lines(path, _is_sound)
+
+
+def _is_sound(line: Line) -> bool:
+    """Whether what is read of a line is of its kind, as it may not be once a hand has edited it."""
+    if any(isinstance(line.get(name), list | dict) for name in KEY):
+        return False
+    if "metrics" not in line:
+        return True
+    metrics = line["metrics"]
+    return (
+        all(isinstance(line.get(name), str) for name in _WORDS)
+        and all(type(line.get(name)) is int for name in _COUNTS)
+        and isinstance(metrics, dict)
+        and all(value is None or _is_number(value) for value in metrics.values())
+        and all(_is_number(line[name]) for name in _TIMES if name in line)
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
 
 
 def key_of(line: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
 from phyradgs_cl.bench.case import Case, SyntheticCase
 from phyradgs_cl.bench.figures import truth_of, write_figures, write_slices
+from phyradgs_cl.bench.identity import refuse_other_objects
 from phyradgs_cl.bench.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
 from phyradgs_cl.bench.phantom_case import PhantomCase
 from phyradgs_cl.bench.pseudo_truth import PseudoTruth, refuse_interrupted
@@ -23,7 +25,7 @@ from phyradgs_cl.bench.summary import REFERENCE
 from phyradgs_cl.bench.tables import write_tables
 from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import file_kind, load_attenuation
+from phyradgs_cl.io import file_kind, load_attenuation, only_run
 from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, reconstruct
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
@@ -69,18 +71,29 @@ def complete_bench(job: BenchJob, make: Callable[[Work], None]) -> list[Path]:
     plan = plan_runs(job)
     _name_rows_left_out(job)
     results = _results_file(job.output)
-    lines = read_lines(results)
-    present = Present(lines)
-    missing = [run for run in plan if not present.has(run.facts)]
-    _check_volumes(missing)
-    if missing:
-        make(Work(results, lines, missing, len(plan)))
-    return _write_tables_and_figures(job, lines)
+    with only_run(results):
+        lines = read_lines(results)
+        refuse_other_objects(results, [run.facts for run in plan], lines)
+        present = Present(lines)
+        missing = [run for run in plan if not present.has(run.facts)]
+        _check_volumes(missing)
+        if missing:
+            make(Work(results, lines, missing, len(plan)))
+        return _write_tables_and_figures(job, lines)
 
 
-def remake_tables(job: BenchJob) -> list[Path]:
-    """Writes tables and figures from the results file as it is; the files written."""
-    return _write_tables_and_figures(job, read_lines(job.output / RESULTS))
+def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Path]:
+    """Writes tables and figures from the results file as it is; the files written.
+
+    The job's names, where it has any, and ``seeds`` restrict what is read.
+    """
+    lines = read_lines(job.output / RESULTS)
+    if job.names:
+        held = list(dict.fromkeys(str(line.get("volume")) for line in lines))
+        for name in job.names:
+            checks.one_of("--names", name, held)
+    chosen = [line for line in lines if not job.names or line.get("volume") in job.names]
+    return _write_tables_and_figures(job, [x for x in chosen if seeds is None or x.get("seed") in seeds])
 
 
 def _write_tables_and_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:

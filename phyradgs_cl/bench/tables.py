@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from phyradgs_cl.bench.summary import Summary, lines_of, lines_of_run, summarise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import written_beside
 
+log = logging.getLogger(__name__)
 METRICS = (
     "psnr_db", "ssim", "psnr_2d_db", "ssim_2d", "psnr_db_pseudo", "ssim_pseudo", "roundness", "roundness_rms",
     "centre_shift_mm", "edge_rise_mm", "bias_balls", "bias_holder", "seconds", "processor_s",
@@ -34,11 +36,14 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     """
     job = job.with_all(lines)
     chosen = lines_of(job, lines)
-    if not chosen or _misses_splats(job, chosen, lines):
-        size = job.bench_size
+    size = job.bench_size
+    if not chosen:
         remedy = f"choose --size {_size_names(lines)} and --iterations as in the runs, or another benchmark"
         wanted = f"runs for {job.kind} at {size.voxels}³, of splats with {size.iterations} iterations"
         raise InputError(str(job.output), f"only {'; '.join(_held(lines))}", wanted, remedy)
+    if others := _other_iterations(job, chosen, lines):
+        text = "%s: the table is for splats with %s iterations; those with %s have one of their own (--iterations)"
+        log.warning(text, job.output, size.iterations, others)
     written = {
         job.output / f"{job.stem}.md": markdown(job, chosen),
         job.output / f"{job.stem}.csv": comma_separated(job, chosen),
@@ -49,11 +54,14 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     return list(written)
 
 
-def _misses_splats(job: BenchJob, chosen: Sequence[Line], lines: Sequence[Line]) -> bool:
-    """Whether the file has splatting runs, but none with the job's iterations: a table would lose all of them."""
-    iterations = job.bench_size.iterations
-    others = any(x.get("study") == job.study and x.get("iterations") not in (None, iterations) for x in lines)
-    return others and not any(line.get("iterations") == iterations for line in chosen)
+def _other_iterations(job: BenchJob, chosen: Sequence[Line], lines: Sequence[Line]) -> str:
+    """With how many iterations the file has splatting runs of this size, where it has none with the job's."""
+    size = job.bench_size
+    if any(line.get("iterations") == size.iterations for line in chosen):
+        return ""
+    of_table = (job.study, size.voxels, size.pixels, job.axis)
+    same = [x for x in lines if tuple(x.get(n) for n in ("study", "voxels", "pixels", "axis")) == of_table]
+    return ", ".join(sorted({str(x["iterations"]) for x in same if x.get("iterations") is not None}))
 
 
 def _held(lines: Sequence[Line]) -> list[str]:

@@ -93,20 +93,29 @@ def bench_command(
         ),
     ] = None,
     seeds: Annotated[
-        str, typer.Option(help="Seeds of noise, jitter, cloud and frame order, with commas.")
-    ] = "0",
+        str | None,
+        typer.Option(
+            help="Seeds of noise, jitter, cloud and frame order, with commas.",
+            show_default="0; with --table-only all",
+        ),
+    ] = None,
     iterations: Annotated[
         int | None, typer.Option(help="Iterations of the splatting methods.", show_default="the size's")
     ] = None,
     readout: Annotated[Axis, typer.Option(help="What is read out at one time.")] = Axis.rows,
     table_only: Annotated[
-        bool, typer.Option("--table-only", help="Make tables and figures from the results file, run nothing.")
+        bool,
+        typer.Option(
+            "--table-only",
+            help="Make tables and figures from the results file, of --names and --seeds or all; run nothing.",
+        ),
     ] = False,
     scheduler: Scheduler = None,
     workers: WorkerCount = None,
     device: Device = None,
 ) -> None:
     """Compare methods on volumes: a resumable results file, tables in Markdown and CSV, figures of slices."""
+    chosen_seeds = None if seeds is None else listed_seeds("--seeds", seeds)
     job = BenchJob(
         kind.value,  # type: ignore[attr-defined]
         output or Path("bench-results"),
@@ -115,7 +124,7 @@ def bench_command(
         listed("--names", names),
         listed("--protocols", protocols),
         listed("--rows", rows),
-        listed_seeds("--seeds", seeds),
+        (0,) if chosen_seeds is None else chosen_seeds,
         iterations,
         readout.value,
     )
@@ -123,11 +132,14 @@ def bench_command(
     pool = None
     if scheduler is not None or workers is not None:
         pool = Workers(LOCAL if scheduler is None else scheduler, workers, wish)
-    interrupted = f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to go on"
+    interrupted = (
+        f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to go on, "
+        "with --table-only for their tables"
+    )
     signals.say_at_the_end(interrupted)
     try:
         if table_only:
-            written = remake_tables(job)
+            written = remake_tables(job, chosen_seeds)
         elif pool is not None:
             written = run_bench_at_workers(job, pool, BenchTicker(), _tell_dashboard)
         else:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ Line = dict[str, Any]
 log = logging.getLogger(__name__)
 
 
-def read_lines(path: Path) -> list[Line]:
-    """All whole lines of a results file; none where there is no file.
+def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True) -> list[Line]:
+    """All whole and sound lines of a results file, with a word about others; none where there is no file.
 
     Raises:
         InputError: a file that cannot be read, or that has content but no result.
@@ -33,7 +33,7 @@ def read_lines(path: Path) -> list[Line]:
     damaged = []
     for number, row in enumerate(text.split("\n"), 1):
         line = _parsed(row)
-        if line is not None:
+        if line is not None and is_sound(line):
             lines.append(line)
         elif row.strip():
             damaged.append(number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -33,6 +34,8 @@ from phyradgs_cl.bench.raw_counts import Panel, measured_attenuation
 from phyradgs_cl.bench.results import read_lines
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import only_run
+from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import phantom_scene
@@ -145,7 +148,9 @@ def test_figures_without_slices_are_left_out_with_a_word(
     assert "no slices of 1 of 1 pictures" in caplog.text
 
 
-def test_tables_alone_need_no_device_but_results(job: BenchJob, rt: Runtime) -> None:
+def test_tables_alone_need_no_device_but_results(
+    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture
+) -> None:
     with pytest.raises(InputError, match="no results"):
         remake_tables(job)
     run_bench(replace(job, rows=["FDK", "PhyRadGS"]), lambda: rt)
@@ -153,11 +158,89 @@ def test_tables_alone_need_no_device_but_results(job: BenchJob, rt: Runtime) -> 
     with pytest.raises(InputError, match="found only volumes at 12³; volumes at 12³ with 8"):
         remake_tables(replace(job, size="S", rows=["PhyRadGS"]))
     before = remake_tables(job)[0].read_text()
-    with pytest.raises(
-        InputError, match="with 8 iterations"
-    ):  # a table without its splats is not what is meant
-        remake_tables(replace(job, iterations=9))
+    other = remake_tables(replace(job, iterations=9))[0]
+    assert "splats with 9 iterations; those with 8 have one of their own" in caplog.text
+    assert "| PhyRadGS | – |" in other.read_text() and other != remake_tables(job)[0]
     assert remake_tables(job)[0].read_text() == before
+
+
+def test_tables_alone_may_be_of_some_volumes_and_seeds(job: BenchJob, rt: Runtime) -> None:
+    job = replace(job, rows=["FDK"])
+    run_bench(job, lambda: rt)
+    whole = run_bench(replace(job, names=["ball"], seeds=[1]), lambda: rt)[0].read_text()
+    of_ball = remake_tables(replace(job, names=["ball"]), seeds=[0])[0].read_text()
+    assert "Seeds 0, 1:" in whole and "| ball | box |" in whole
+    assert "Seeds 0:" in of_ball and "| box |" not in of_ball
+    with pytest.raises(InputError, match="--names: found 'bull'"):
+        remake_tables(replace(job, names=["bull"]))
+    assert remake_tables(job)[0].read_text() == whole
+
+
+def test_a_name_stands_for_one_object(job: BenchJob, rt: Runtime, folder: Path) -> None:
+    job = replace(job, rows=["FDK"])
+    run_bench(job, lambda: rt)
+    other = folder / "other"
+    other.mkdir()
+    shutil.copy(folder / "box.h5", other / "ball.h5")
+    with pytest.raises(InputError, match="runs of ball_24.h5 under the name 'ball', which is ball.h5 now"):
+        run_bench(replace(job, volumes=other), no_runtime)
+    shutil.copy(folder / "box.h5", folder / "ball_24.h5")
+    with pytest.raises(InputError, match="runs of ball_24.h5 from before its contents changed"):
+        run_bench(job, no_runtime)
+    run_bench(replace(job, names=["box"]), no_runtime)
+
+
+def test_lines_without_a_hash_go_by_the_name_of_their_file(job: BenchJob, rt: Runtime) -> None:
+    job = replace(job, rows=["FDK"], names=["ball"])
+    run_bench(job, lambda: rt)
+    results = job.output / RESULTS
+    lines = read_lines(results)
+    assert all(re.fullmatch("[0-9a-f]{16}", line.pop("source_hash")) for line in lines)
+    results.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    run_bench(job, no_runtime)
+
+
+def test_two_benchmarks_in_one_folder_refuse_each_other(job: BenchJob) -> None:
+    job.output.mkdir()
+    with only_run(job.output / RESULTS), pytest.raises(BusyError, match="another run"):
+        run_bench(job, no_runtime)
+
+
+def test_stop_and_shoot_is_of_the_volumes_of_its_row(job: BenchJob, rt: Runtime) -> None:
+    run_bench(replace(job, rows=["SIRT"]), lambda: rt)
+    table = run_bench(replace(job, rows=["SIRT per-row"], names=["ball"]), lambda: rt)[0].read_text()
+    still = {x["volume"]: x["metrics"] for x in read_lines(job.output / RESULTS) if x["acquisition"] == STILL}
+    assert still["ball"]["psnr_db"] != pytest.approx(still["box"]["psnr_db"], abs=0.01)
+    row = next(line for line in table.splitlines() if line.startswith("| SIRT per-row (1 of 2 volumes)"))
+    assert f"| {still['ball']['psnr_db']:.2f} / {still['ball']['ssim']:.3f} |" in row
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"volume": ["ball"]},
+        {"seed": "a"},
+        {"views": None},
+        {"device": 5},
+        {"seconds": "long"},
+        {"metrics": 5},
+        {"metrics": {"psnr_db": "x"}},
+        {"metrics": {"psnr_db": True}},
+        {"metrics": {"psnr_db": float("nan")}},
+    ],
+)
+def test_lines_that_a_hand_has_damaged_are_left_out(
+    job: BenchJob, rt: Runtime, caplog: pytest.LogCaptureFixture, damage: dict[str, object]
+) -> None:
+    job = replace(job, rows=["FDK"], names=["ball"])
+    table = run_bench(job, lambda: rt)[0].read_text()
+    results = job.output / RESULTS
+    first, second = results.read_text().splitlines()
+    results.write_text(json.dumps({**json.loads(first), **damage}) + f"\n{second}\n")
+    assert remake_tables(job)[0].read_text() != table
+    assert "line 1 is damaged and left out" in caplog.text
+    run_bench(job, lambda: rt)
+    assert len(read_lines(results)) == 2
 
 
 def test_files_that_are_no_volumes_are_named_before_any_work(job: BenchJob) -> None:
@@ -353,7 +436,10 @@ def test_a_partial_run_loses_no_line_of_a_table(job: BenchJob, rt: Runtime) -> N
     tables = run_bench(job, lambda: rt)
     before = {path: path.read_bytes() for path in tables}
     partial = replace(job, rows=["FDK"], names=["ball"], protocols=["rapid"])
-    for again in (lambda: run_bench(partial, no_runtime), lambda: remake_tables(partial)):
+    for again in (
+        lambda: run_bench(partial, no_runtime),
+        lambda: remake_tables(replace(partial, names=None)),
+    ):
         assert again() == tables
         assert {path: path.read_bytes() for path in tables} == before
     run_bench(replace(partial, rows=["SART micro-views"], names=["box"]), lambda: rt)

@@ -250,7 +250,8 @@ def test_a_benchmark_ends_with_its_own_line(tmp_path, name, status, step):
     """
     done = run_process(["bench", "quick", "--size", "XS", "--rows", "FDK", "-o", str(tmp_path)], body)
     expected = (
-        f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to go on\n"
+        f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to go on, with "
+        "--table-only for their tables\n"
     )
     assert (done.returncode, done.stderr) == (status, expected)
 
