@@ -193,7 +193,8 @@ _FAIRNESS = (
     "the other methods run as many as their own defaults say. Rows of R2-Gaussian keep its published learning rates and "
     'weights, made for 30,000 iterations; the row "R2-Gaussian (settings of PhyRadGS)" (--rows) has ours. The column '
     "stop-and-shoot is the same method with a static model on a scan from the mid-window angles of the fly-scan: what "
-    "motion correction could reach at best. Processor seconds are of all threads of a reconstruction, kernel builds of a "
+    "motion correction could reach at best, unless noise stops the method, which blur averages. "
+    "Processor seconds are of all threads of a reconstruction, kernel builds of a "
     "first run included, and can be compared where other work ran beside; lines of early versions have none. 2D numbers "
     "compare projections with noise-free ones half-way between the training angles, at true scale. "
     "The paper's numbers are of other volumes, sizes and hardware."
