@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scans import RAPID, append, file_for, make_scan, read_lines
+from scans import RAPID, append, files_of, make_scan, read_lines
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Protocol, Scan, make_protocol
@@ -99,12 +99,11 @@ FAULTS: dict[str, tuple[Plant, Protocol, float, tuple[str, ...], str]] = {
 
 def run_all(arguments: argparse.Namespace) -> None:
     rt = Runtime(arguments.device)
-    folder, results = Path(arguments.volumes), Path(arguments.results)
-    everything = sorted({p.stem.rsplit("_", 1)[0] for p in folder.glob("*.h5")})
-    names = arguments.names.split(",") if arguments.names else everything
+    results = Path(arguments.results)
+    volumes = files_of(arguments.volumes, arguments.names, arguments.size)
     done = {key_of(line) for line in read_lines(results)}
     for seed in (int(s) for s in arguments.seeds.split(",")):
-        for name in names:
+        for name, path in volumes.items():
             scans: dict[tuple[Protocol, float], Scan] = {}
             for fault in arguments.faults.split(","):
                 facts = {"volume": name, "fault": fault, "size": arguments.size, "seed": seed}
@@ -112,7 +111,6 @@ def run_all(arguments: argparse.Namespace) -> None:
                     continue
                 plant, protocol, away, _, _ = FAULTS[fault]
                 if (protocol, away) not in scans:
-                    path = file_for(folder, name, arguments.size)
                     scans[protocol, away] = make_scan(rt, path, arguments.size, seed, protocol, away=away)
                 scan = plant(
                     scans[protocol, away], np.random.default_rng([seed, *f"{name} {fault}".encode()])

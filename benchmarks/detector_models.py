@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from scans import append, read_lines
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -146,10 +147,6 @@ def table(lines: list[Row]) -> str:
     return "\n".join(text)
 
 
-def read_lines(path: Path) -> list[Row]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("results", type=Path)
@@ -169,8 +166,7 @@ def main() -> None:
         for name in arguments.names.split(","):
             for line in rows(rt, name, seed, wanted, done):
                 print(json.dumps(line), flush=True)
-                with open(arguments.results, "a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
+                append(arguments.results, line)
 
 
 if __name__ == "__main__":

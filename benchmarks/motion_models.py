@@ -21,7 +21,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
-from scans import append, file_for, make_scan, read_lines
+from scans import append, files_of, make_scan, read_lines
 
 from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -54,12 +54,12 @@ def motion_of(name: str) -> dict[str, object]:
 
 def run(arguments: Namespace) -> None:
     rt = Runtime(arguments.device)
-    folder, results = Path(arguments.volumes), Path(arguments.results)
-    names = arguments.names.split(",") if arguments.names else names_in(folder)
+    results = Path(arguments.results)
+    volumes = files_of(arguments.volumes, arguments.names, arguments.size)
     done = {key_of(line) for line in read_lines(results)}
     for motion in arguments.motions.split(","):
         for seed in (int(s) for s in arguments.seeds.split(",")):
-            for name in names:
+            for name, path in volumes.items():
                 facts: Line = {
                     "volume": name,
                     "motion": motion,
@@ -69,14 +69,10 @@ def run(arguments: Namespace) -> None:
                 }
                 if key_of(facts) in done:
                     continue
-                scan = make_scan(rt, file_for(folder, name, arguments.size), arguments.size, seed)
+                scan = make_scan(rt, path, arguments.size, seed)
                 line = {**facts, **run_one(rt, scan, motion, arguments.iterations, seed)}
                 append(results, line)
                 print(json.dumps(line), flush=True)
-
-
-def names_in(folder: Path) -> list[str]:
-    return sorted({p.stem.rsplit("_", 1)[0] for p in folder.glob("*.h5")})
 
 
 def run_one(rt: Runtime, scan: Scan, motion: str, iterations: int, seed: int) -> Line:

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scans import append, file_for, make_scan, read_lines
+from scans import append, files_of, make_scan, read_lines
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
@@ -96,14 +96,13 @@ def run_all(arguments: argparse.Namespace) -> None:
     rt = Runtime(arguments.device)
     results = Path(arguments.results)
     done = {tuple(line[name] for name in KEY) for line in read_lines(results)}
-    for name in arguments.names.split(","):
+    for name, path in files_of(arguments.volumes, arguments.names, arguments.size).items():
         scan: Scan | None = None
         for label in arguments.methods.split(","):
             for factor in (float(text) for text in arguments.factors.split(",")):
                 values = (name, label, arguments.size, arguments.seed, factor)
                 if values in done:
                     continue
-                path = file_for(Path(arguments.volumes), name, arguments.size)
                 scan = scan or make_scan(rt, path, arguments.size, arguments.seed)
                 facts = dict(zip(KEY, values, strict=True))
                 facts["threads"] = arguments.threads

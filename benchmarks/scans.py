@@ -29,9 +29,9 @@ def make_scan(
     return SyntheticCase(rt, scene, geometry, protocol, "rows", seed).scan(FLY)
 
 
-def file_for(folder: Path, name: str, size: int) -> Path:
-    """The file with twice ``size`` voxels a side, else the largest that there is."""
-    return find_volumes(folder, [name], size)[name]
+def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
+    """Volumes as `phyradgs bench` finds them: those of ``names`` (with commas), else all; twice ``size`` voxels a side."""
+    return find_volumes(Path(folder), names.split(",") if names else None, size)
 
 
 def read_lines(path: Path) -> list[dict[str, object]]:

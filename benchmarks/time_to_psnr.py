@@ -17,7 +17,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from measuring import Facts, median, parser_of, where
-from scans import append, file_for, make_scan, read_lines
+from scans import append, files_of, make_scan, read_lines
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
@@ -75,9 +75,9 @@ def run_phyradgs(rt: Runtime, scan: Scan, arguments: Namespace, seed: int, goal_
 
 def run_all(arguments: Namespace) -> None:
     rt = Runtime(arguments.device)
-    results, folder = Path(arguments.results), Path(arguments.volumes)
+    results = Path(arguments.results)
     done = {tuple(line[k] for k in KEYS): line for line in read_lines(results)}
-    for name in arguments.names.split(","):
+    for name, path in files_of(arguments.volumes, arguments.names, arguments.size).items():
         for seed in (int(s) for s in arguments.seeds.split(",")):
             shared = {
                 "volume": name,
@@ -91,7 +91,7 @@ def run_all(arguments: Namespace) -> None:
             keys = [tuple(facts[k] for k in KEYS) for facts in (first, second)]
             if all(key in done for key in keys):
                 continue
-            scan = make_scan(rt, file_for(folder, name, arguments.size), arguments.size, seed)
+            scan = make_scan(rt, path, arguments.size, seed)
             if keys[0] not in done:
                 done[keys[0]] = {**first, **run_r2(rt, scan, arguments.iterations, seed), **where(rt)}
                 append(results, done[keys[0]])
