@@ -73,6 +73,8 @@ class SplatProjector:
         self.cutoff2 = np.float32(cutoff_sigma**2)
         self.path_limits = np.array([*path_limits(time_error), 0], np.float32)
         self.by_pixel = rt.pixel_items
+        self._forward = "splat_forward_pixels" if self.by_pixel else "splat_forward_rows"
+        self._backward = "splat_backward_group" if self.by_pixel else "splat_backward_rows"
         self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
@@ -96,9 +98,7 @@ class SplatProjector:
         self.prepare(gaussians, cells)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         rt = self.rt
-        kernel = rt.kernel(
-            "splat_forward", "splat_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines(cells)
-        )
+        kernel = rt.kernel("splat_forward", self._forward, BLOCK_PIXEL=int(self.by_pixel), **self._defines(cells))
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.pitch, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
@@ -143,7 +143,7 @@ class SplatProjector:
         rt = self.rt
         group = _BACKWARD_GROUP if self.by_pixel else 1
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
-        kernel = rt.kernel("splat_backward", "splat_backward", GROUP=group, **self._defines(cells))
+        kernel = rt.kernel("splat_backward", self._backward, GROUP=group, **self._defines(cells))
         rt.launch(
             kernel,
             gaussians.count * group,
