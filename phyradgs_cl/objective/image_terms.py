@@ -35,6 +35,8 @@ class ImageLoss:
         self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
         self.ssim_weight, self.l1_weight, self.poisson_weight = ssim_weight, l1_weight, poisson_weight
         image = _GUARD + lines * pitch
+        kernels = ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient")
+        self._kernels = {name: rt.kernel("loss", name, IMAGE_GUARD=_GUARD) for name in kernels}
         self._moments = rt.zeros(5 * image + _GUARD)
         self._partials = rt.zeros(3 * image + _GUARD)
         self._spread = rt.zeros(3 * image + _GUARD)
@@ -61,13 +63,10 @@ class ImageLoss:
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
 
-        def kernel(name: str) -> object:
-            return rt.kernel("loss", name, IMAGE_GUARD=_GUARD)
-
         images = (rendered, measured, mask, self._window)
-        rt.launch(kernel("ssim_moments"), (vectors, self.lines), *images, *size, self._moments, group=group)
+        rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
-            kernel("ssim_map"),
+            self._kernels["ssim_map"],
             self.lines,
             self._moments,
             *images,
@@ -81,7 +80,7 @@ class ImageLoss:
             group=group,
         )
         rt.launch(
-            kernel("ssim_spread"),
+            self._kernels["ssim_spread"],
             (vectors, self.lines),
             self._partials,
             self._window,
@@ -90,7 +89,7 @@ class ImageLoss:
             group=group,
         )
         rt.launch(
-            kernel("image_gradient"),
+            self._kernels["image_gradient"],
             self.lines,
             self._spread,
             *images,
