@@ -20,7 +20,8 @@ from phyradgs_cl.cluster.local import RESOURCE, local_cluster
 from phyradgs_cl.cluster.workers import Workers
 from phyradgs_cl.errors import DeviceError, InputError
 
-_LOOK_EVERY_S, _CONNECT_S, _GIVE_UP_S = 0.2, 10.0, 20.0
+_LOOK_EVERY_S, _CONNECT_S = 0.2, 10.0
+_WITHOUT_WORKERS_S, _REVIVALS = 20.0, 3
 # asyncio.TimeoutError is another class up to Python 3.10
 _NO_ANSWER = (TimeoutError, asyncio.TimeoutError, CancelledError, OSError)
 log = logging.getLogger(__name__)
@@ -87,20 +88,27 @@ class Pool:
         second. Raises InputError when the scheduler goes away.
         """
         waiting, running = deque(arguments), dict[Any, str]()
-        seen_s = time.monotonic()
+        seen_s, revivals = time.monotonic(), 0
         try:
             while waiting or running:
                 devices = self._devices()
                 if devices:
                     seen_s = time.monotonic()
-                elif time.monotonic() - seen_s > _GIVE_UP_S:
-                    self._say_no_worker()
+                elif time.monotonic() - seen_s > _WITHOUT_WORKERS_S:
+                    if self.workers.is_local:
+                        revivals += 1
+                        self._revive(revivals)
+                        waiting.extendleft(running.values())
+                        running.clear()
+                    else:
+                        self._say_no_worker()
                     seen_s = time.monotonic()
                 while waiting and len(running) < devices:
                     name = waiting.popleft()
                     running[self._submitted(function, arguments[name], name)] = name
                 look(PoolState(len(waiting), len(running), devices))
                 for future in self._finished(running):
+                    revivals = 0
                     yield running.pop(future), self._outcome(future)
         finally:
             if self._client.status == "running":
@@ -116,7 +124,8 @@ class Pool:
             return set()
         try:
             options = {"timeout": _LOOK_EVERY_S, "return_when": "FIRST_COMPLETED"}
-            return set(distributed().wait(list(running), **options).done)
+            with self._client.as_current():
+                return set(distributed().wait(list(running), **options).done)
         except (TimeoutError, asyncio.TimeoutError):
             return set()
         except CancelledError as error:
@@ -164,9 +173,14 @@ class Pool:
     def _scheduler_gone(self) -> InputError:
         return InputError(self._culprit, "gone", "a scheduler", "start it, and repeat the command to go on")
 
+    def _revive(self, times: int) -> None:
+        """A nanny whose worker was killed as it started does not try again."""
+        if times > _REVIVALS:
+            raise DeviceError(self._culprit, "all gone", "processes that stay", "try fewer --workers")
+        log.warning("no local worker is left: starting them anew")
+        self.__exit__()
+        self.__enter__()
+
     def _say_no_worker(self) -> None:
-        if self.workers.is_local:
-            remedy = "repeat the command to go on, with fewer --workers"
-            raise DeviceError(self._culprit, "all gone", "processes that stay", remedy)
         start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
         log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)
