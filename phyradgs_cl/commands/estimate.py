@@ -45,7 +45,8 @@ def estimate_command(
         if (device := request.given["device"]) is not None:
             remedy = "leave it out: a plan needs no device"
             raise InputError("--device", repr(device), "none with --ranks", remedy)
-        say(plan_ranks(loaded, settings.method, options, ranks).text(memory_limit(settings.memory)))
+        plan = plan_ranks(loaded.with_grid(settings.before), settings.method, options, ranks)
+        say(plan.text(memory_limit(settings.memory)))
         return
     with settings.naming_origins():
         rt = Runtime(settings.device, memory=settings.memory)
