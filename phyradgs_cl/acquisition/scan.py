@@ -99,7 +99,11 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Asks the trajectory for the ends of every frame's window, so that a short table is named early."""
+        """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
+
+        Raises InputError for that, and for an exposure too short for the scan's times.
+        """
+        self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))

@@ -71,6 +71,9 @@ Memory = Annotated[
     ),
 ]
 
+RANKS = "Under mpiexec (docs: cluster.md)"
+"""What the help of a command calls its options for ranks, which stand at its end."""
+
 # where many runs are made
 Scheduler = Annotated[
     str | None,
@@ -167,7 +170,10 @@ GaussianCount = Annotated[
 Batch = Annotated[
     int | None,
     typer.Option(
-        metavar="B", help="Frames a step, for splats (docs: cluster.md).", show_default="as many as ranks"
+        metavar="B",
+        help="Frames a step, for splats.",
+        show_default="as many as ranks",
+        rich_help_panel=RANKS,
     ),
 ]
 Split = Annotated[
@@ -175,6 +181,7 @@ Split = Annotated[
     typer.Option(
         help="What ranks of mpiexec share out, for splats: the frames, or the domain where the Gaussians are too many.",
         show_default="frames",
+        rich_help_panel=RANKS,
     ),
 ]
 Parts = Annotated[
@@ -183,6 +190,7 @@ Parts = Annotated[
         metavar="P",
         help="Parts of a frame's lines, or of the Gaussians, to share out; the same parts give the same bits.",
         show_default="as many as ranks",
+        rich_help_panel=RANKS,
     ),
 ]
 Seed = Annotated[
