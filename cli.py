@@ -25,6 +25,7 @@ from phyradgs_cl.commands import (
     watch,
 )
 from phyradgs_cl.commands.console import complain, give_up_stdout, say, usage_text
+from phyradgs_cl.commands.help_panels import PanelledCommand
 from phyradgs_cl.commands.ranks import takes_part
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io.atomic import NO_SPACE
@@ -54,6 +55,7 @@ app = typer.Typer(
     cls=Commands,
     add_completion=True,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result. "
     "'phyradgs COMMAND --help' explains a command.\n\n"
@@ -69,11 +71,17 @@ app.command(
 app.command("check", short_help="Look for what is wrong or suspicious in a scan.", epilog=check.EXAMPLE)(
     check.check_command
 )
-app.command("reconstruct", short_help="Reconstruct a scan into a volume.", epilog=reconstruct.EXAMPLE)(
-    reconstruct.reconstruct_command
-)
 app.command(
-    "estimate", short_help="Say what time and memory a reconstruction would take.", epilog=estimate.EXAMPLE
+    "reconstruct",
+    cls=PanelledCommand,
+    short_help="Reconstruct a scan into a volume.",
+    epilog=reconstruct.EXAMPLE,
+)(reconstruct.reconstruct_command)
+app.command(
+    "estimate",
+    cls=PanelledCommand,
+    short_help="Say what time and memory a reconstruction would take.",
+    epilog=estimate.EXAMPLE,
 )(estimate.estimate_command)
 app.command("evaluate", short_help="Measure a volume against the truth.", epilog=evaluate.EXAMPLE)(
     evaluate.evaluate_command

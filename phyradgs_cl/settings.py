@@ -14,7 +14,7 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.reconstructors import InputOptions, input_options, method_options
+from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options
 from phyradgs_cl.runtime import bytes_of
 
 if sys.version_info >= (3, 11):
@@ -98,7 +98,7 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
         "phyradgs" if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
     )
     with chosen.naming_origins():
-        return replace(chosen, before=input_options(changes))
+        return replace(chosen, method=method_name(chosen.method), before=input_options(changes))
 
 
 def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
@@ -179,6 +179,15 @@ def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:
     if not all(math.isfinite(x) and abs(x) <= LARGEST_OFFSET_MM for x in (v_mm, u_mm)):
         raise InputError(option, repr(text), f"two lengths of at most {LARGEST_OFFSET_MM:g} mm")
     return v_mm, u_mm
+
+
+def numbers(text: str) -> float | list[float] | str:
+    """A number, or several with commas between; a text that is neither as it is, for the error of whoever wants numbers."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        return text
+    return found if len(found) > 1 else found[0]
 
 
 def pulse_pair(option: str, text: str | None) -> tuple[float, float] | None:

@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Gaussians
+from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.io import (
     Scanner,
     load_scanner,
@@ -133,6 +133,7 @@ def reconstruct(
     method: str = "phyradgs",
     *,
     preset: str | None = None,
+    grid: Grid | None = None,
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     device: Device = None,
@@ -140,12 +141,16 @@ def reconstruct(
 ) -> Reconstruction:
     """The volume of a scan, by any method of docs/methods.md; ``options`` are the method's own, by name.
 
+    ``grid``: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
+    (docs/methods.md#the-grid).
+
     ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model; nested options are dicts
     (``control={"every": 50}``). The result has the volume (nz, ny, nx) in 1/mm and, of splats, the Gaussians in mm.
 
     Raises InputError for options that the method does not have, NumericalError where numbers overflow.
     """
     scan.check_timing()
+    scan = scan if grid is None else scan.on_grid(grid)
     given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)

@@ -9,7 +9,7 @@ import typer
 
 from phyradgs_cl import checks
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument
+from phyradgs_cl.commands.options import RANKS, file_argument
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
@@ -31,7 +31,8 @@ def estimate_command(
         int | None,
         typer.Option(
             metavar="R",
-            help="Without a trial: what lies where on R ranks of mpiexec, bytes a rank, bytes exchanged (docs: cluster.md).",
+            help="Without a trial: what lies where on R ranks of mpiexec, bytes a rank, bytes exchanged.",
+            rich_help_panel=RANKS,
         ),
     ] = None,
 ) -> None:
@@ -45,7 +46,8 @@ def estimate_command(
         if (device := request.given["device"]) is not None:
             remedy = "leave it out: a plan needs no device"
             raise InputError("--device", repr(device), "none with --ranks", remedy)
-        say(plan_ranks(loaded, settings.method, options, ranks).text(memory_limit(settings.memory)))
+        plan = plan_ranks(loaded.with_grid(settings.before), settings.method, options, ranks)
+        say(plan.text(memory_limit(settings.memory)))
         return
     with settings.naming_origins():
         rt = Runtime(settings.device, memory=settings.memory)

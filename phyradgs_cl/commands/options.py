@@ -10,7 +10,7 @@ import typer
 
 from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import file_parser
+from phyradgs_cl.settings import file_parser, numbers
 
 MethodName = Enum("MethodName", {name: name for name in METHODS}, type=str)  # type: ignore[misc]
 
@@ -71,6 +71,9 @@ Memory = Annotated[
     ),
 ]
 
+RANKS = "Under mpiexec (docs: cluster.md)"
+"""What the help of a command calls its options for ranks, which stand at its end."""
+
 # where many runs are made
 Scheduler = Annotated[
     str | None,
@@ -83,10 +86,42 @@ WorkerCount = Annotated[
     int | None, typer.Option(metavar="N", help="Local workers, each a process.", show_default="one a device")
 ]
 
+# which voxels; Any, as the numbers are checked where they are used
+Size = Annotated[
+    Any,
+    typer.Option(
+        parser=numbers,
+        metavar="N|Z,Y,X",
+        help="Voxels of the volume, of a single number along its longest side; the box stays as it is.",
+        show_default="the scan's",
+    ),
+]
+VoxelMm = Annotated[
+    Any,
+    typer.Option(
+        parser=numbers,
+        metavar="D|Z,Y,X",
+        help="Sides of a voxel, mm; the box stays as it is, but for whole voxels.",
+        show_default="the scan's",
+    ),
+]
+RoiMm = Annotated[
+    Any,
+    typer.Option(
+        "--roi-mm",
+        "--roi",
+        parser=numbers,
+        metavar="Z0,Z1,Y0,Y1,X0,X1",
+        help="Box of the volume, mm about the axis; the voxels stay as they are.",
+        show_default="the scan's",
+    ),
+]
+
 # what a reconstruction is asked for; commands that speak of one share these words
 Method = Annotated[
     MethodName | None,  # type: ignore[valid-type]
     typer.Option(
+        case_sensitive=False,
         help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
         "naf, sax-nerf: neural fields; the others are iterative on voxels.",
         show_default="phyradgs",
@@ -135,7 +170,10 @@ GaussianCount = Annotated[
 Batch = Annotated[
     int | None,
     typer.Option(
-        metavar="B", help="Frames a step, for splats (docs: cluster.md).", show_default="as many as ranks"
+        metavar="B",
+        help="Frames a step, for splats.",
+        show_default="as many as ranks",
+        rich_help_panel=RANKS,
     ),
 ]
 Split = Annotated[
@@ -143,6 +181,7 @@ Split = Annotated[
     typer.Option(
         help="What ranks of mpiexec share out, for splats: the frames, or the domain where the Gaussians are too many.",
         show_default="frames",
+        rich_help_panel=RANKS,
     ),
 ]
 Parts = Annotated[
@@ -151,6 +190,7 @@ Parts = Annotated[
         metavar="P",
         help="Parts of a frame's lines, or of the Gaussians, to share out; the same parts give the same bits.",
         show_default="as many as ranks",
+        rich_help_panel=RANKS,
     ),
 ]
 Seed = Annotated[

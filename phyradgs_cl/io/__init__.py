@@ -2,7 +2,7 @@
 
 from phyradgs_cl.io.atomic import check_writable, written_beside
 from phyradgs_cl.io.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
-from phyradgs_cl.io.grid_io import default_grid, with_grid_count
+from phyradgs_cl.io.grid_io import default_grid
 from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.lock import only_run
 from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
@@ -31,7 +31,6 @@ __all__ = [
     "sha256_of",
     "volume_summary",
     "with_detector_count",
-    "with_grid_count",
     "write_checkpoint",
     "write_scan",
     "write_volume",

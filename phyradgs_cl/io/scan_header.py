@@ -76,6 +76,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     shutter = read_shutter(source, entry, used, moving)
     is_fly = moving and shutter.exposure_s > 0
     start_s = read_starts(source, entry, used, shutter, moving)
+    shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
     scan = Scan(

@@ -1,7 +1,14 @@
 """Methods: one file each, one signature for all, ``(scan, options, rt, seed, report) → Reconstruction``."""
 
 from phyradgs_cl.reconstructors.prepared import InputOptions
-from phyradgs_cl.reconstructors.registry import METHODS, Method, input_options, method_options, reconstruct
+from phyradgs_cl.reconstructors.registry import (
+    METHODS,
+    Method,
+    input_options,
+    method_name,
+    method_options,
+    reconstruct,
+)
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress
 
 __all__ = [
@@ -14,6 +21,7 @@ __all__ = [
     "State",
     "ignore_progress",
     "input_options",
+    "method_name",
     "method_options",
     "reconstruct",
 ]

@@ -65,14 +65,21 @@ METHODS = {
 }
 
 
+def method_name(method: object) -> str:
+    """The name of a method in METHODS, however its letters are cased. Raises InputError for what is none."""
+    name = method.lower() if isinstance(method, str) else ""
+    if name not in METHODS:
+        raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
+    return name
+
+
 def method_options(method: str, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together.
     Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
     """
-    if not isinstance(method, str) or method not in METHODS:
-        raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
+    method = method_name(method)
     presets = METHODS[method].presets
     name = next(iter(presets)) if preset is None else preset
     if not isinstance(name, str) or name not in presets:
@@ -98,6 +105,7 @@ def reconstruct(
 
     ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing.
     """
+    method = method_name(method)
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method, rt)
@@ -202,7 +210,9 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
 
 
 def _converted(current: Any, value: Any, culprit: str) -> Any:
-    """``value`` as the type of the present value: numbers, words, tuples, nested tables."""
+    """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
+    if current is None:  # the options check it themselves
+        return value
     if is_dataclass(current):
         if not isinstance(value, Mapping):
             raise InputError(culprit, checks.shown(value), "a table")

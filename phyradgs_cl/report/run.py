@@ -13,7 +13,6 @@ import numpy as np
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, input_options
@@ -25,8 +24,8 @@ log = logging.getLogger(__name__)
 class Run:
     """A reconstruction with what is known about it.
 
-    scan, scan_path, scan_facts: where the scan was found. reference (nz, ny, nx) 1/mm: the truth on the volume's grid.
-    metrics: numbers by name. notes: what a reader should know about the page itself, a sentence each.
+    scan, scan_path, scan_facts: where the scan was found; it has the volume's grid. reference (nz, ny, nx) 1/mm: the truth
+    on that. metrics: numbers by name. notes: what a reader should know about the page itself, a sentence each.
     """
 
     path: Path
@@ -102,8 +101,11 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
         notes.append(
             "The scan shown here is not the file that this volume was reconstructed from: its hash differs."
         )
-    scan = read_scan(found, counts_to_attenuation)
-    reference = _reference_of(scan, stored, notes)
+    whole = read_scan(found, counts_to_attenuation)
+    scan = whole.on_grid(stored.grid)
+    if whole.reference is not None and scan.reference is None:
+        notes.append("The scan's reference is on another grid than the volume and is not shown.")
+    reference = scan.reference if scan.reference is not None and float(scan.reference.max()) > 0 else None
     metrics = dict(stored.metrics or (compare(stored.volume, reference) if reference is not None else {}))
     return Run(path, stored, scan, found, facts, reference, metrics, tuple(notes))
 
@@ -120,21 +122,6 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
             return place
     notes.append(f"The scan {named} was not found, or has changed since; --scan names it.")
     return None
-
-
-def _reference_of(scan: Scan, stored: StoredVolume, notes: list[str]) -> np.ndarray | None:
-    if scan.reference is None or not float(scan.reference.max()) > 0:
-        return None
-    if not _same_grid(scan.grid, stored.grid):
-        notes.append("The scan's reference is on another grid than the volume and is not shown.")
-        return None
-    return scan.reference
-
-
-def _same_grid(a: Grid, b: Grid) -> bool:
-    near_mm = 1e-5 * max(a.size_mm)
-    close = np.allclose(a.voxel_size_mm, b.voxel_size_mm, rtol=1e-5)
-    return a.shape == b.shape and close and np.allclose(a.offset_mm, b.offset_mm, atol=near_mm)
 
 
 def _is_number(value: Any) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
     check_writable,
@@ -53,7 +54,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ReconstructionJob:
-    """Which scan to reconstruct by which method into which file."""
+    """Which scan to reconstruct by which method, a name of METHODS, into which file."""
 
     scan: Path
     output: Path
@@ -159,14 +160,21 @@ def _reconstructed(
             if not leads:
                 return result, metrics
             with finish_despite_interrupt():
-                if scan.reference is not None:
-                    metrics = compare(result.volume, scan.reference)
+                metrics = _metrics(scan, result)
                 _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
                 _keep_checkpoint(job, result, fingerprint)
     except InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
     return result, metrics  # type: ignore[return-value]
+
+
+def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
+    """Against the scan's reference, where the volume is on its grid or a part of that."""
+    reference = scan.on_grid(result.grid).reference
+    if scan.reference is not None and reference is None:
+        log.warning("no PSNR: the scan's reference is on another grid")
+    return {} if reference is None else compare(result.volume, reference)
 
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
@@ -182,6 +190,10 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     if scan.is_fly and motion.name == "micro-views" and motion.strips > scan.lines:
         found = "%d strips are more than the %d lines of %s: a strip a line is the most there is"
         log.warning(found, motion.strips, scan.lines, job.scan)
+    grid = scan.with_grid(job.before).grid
+    if grid != scan.grid and hasattr(options, "iterations") and cuts(grid, scan.grid, scan.geometry):
+        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; fdk does not"
+        log.warning(found, job.scan, job.method)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:
         found = (
@@ -228,7 +240,7 @@ def _provenance(
         "device": rt.device.name,
         "device_version": rt.device.version,
         "seed": job.seed,
-        "input": asdict(job.before),
+        "input": job.before.facts(),
         "scan": str(job.scan),
         "scan_sha256": scan_hash,
         "record": result.record,
@@ -237,7 +249,7 @@ def _provenance(
 
 def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
     """What a run that goes on must have in common with the one that it continues, as JSON."""
-    run = {"method": job.method, "seed": job.seed, "input": asdict(job.before), **asdict(options)}
+    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **asdict(options)}
     return json.dumps({"scan": scan_hash[:16], **run}, sort_keys=True, default=repr)
 
 

@@ -45,6 +45,16 @@ def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
     assert nested.facts["options"]["control"]["every"] == 7
 
 
+def test_a_grid_is_given_or_described(rt, scan) -> None:
+    grid = api.Grid((4, 6, 8), (0.1, 0.1, 0.1), (0.0, 0.1, 0.2))
+    given = api.reconstruct(scan, "FDK", grid=grid, device=rt)
+    assert given.grid == grid and given.volume.shape == grid.shape
+    described = api.reconstruct(scan, "fdk", size=[4, 6, 8], voxel_mm=0.1, device=rt)
+    assert described.grid == api.Grid(grid.shape, grid.voxel_size_mm)
+    with pytest.raises(InputError, match="--roi-mm"):
+        api.reconstruct(scan, "fdk", roi_mm=(0, 1), device=rt)
+
+
 def test_a_simulation_takes_the_options_of_the_command(rt, scan) -> None:
     assert scan.projections.shape == (6, 20, 20) and scan.grid.shape == (12, 12, 12)
     noisy = api.simulate("jaw", size=12, detector=20, noise="beer", dose=100.0, seed=3, views=2, device=rt)

@@ -40,6 +40,26 @@ def test_a_folder_becomes_a_scan(run, tmp_path, make_truth) -> None:
     assert scan.provenance["imported_from"] == str(path)
 
 
+@pytest.mark.parametrize(
+    ("write", "options", "shape", "has_reference"),
+    [
+        (w.write_rtk, ["--size", "6,7,8"], (6, 7, 8), False),
+        (w.write_r2, ["--size", "9", "--voxel-mm", "0.5"], None, False),
+        (w.write_r2, [], None, True),
+    ],
+)
+def test_the_grid_by_options(run, tmp_path, make_truth, write, options, shape, has_reference) -> None:
+    """A truth that does not fit the grid is left out, and that is said."""
+    path, out = write(tmp_path / "source", make_truth()), tmp_path / "scan.h5"
+    done = run(path, "-o", out, *options)
+    assert done.exit_code == 0, done.exception
+    assert ("is on another grid and is left out" in done.output) == (write is w.write_r2 and bool(options))
+    scan = read_scan(out, counts_to_attenuation)
+    assert (scan.reference is not None) == has_reference
+    assert shape is None or scan.grid.shape == shape
+    assert not options or shape or scan.grid.voxel_size_mm == (0.5, 0.5, 0.5)
+
+
 def test_timing_by_options(run, tmp_path, make_truth) -> None:
     path, out = w.write_rtk(tmp_path / "rtk", make_truth()), tmp_path / "scan.h5"
     timing = ["--exposure-s", "0.4", "--readout-s", "0.3", "--frame-time-s", "1.25"]

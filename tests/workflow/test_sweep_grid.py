@@ -28,6 +28,13 @@ def read(tmp_path: Path, tiny_scan: Path):
     return reading
 
 
+def test_grids_are_tried_like_other_options_and_methods_in_any_case(read) -> None:
+    grid = read(GRID + '[[grid]]\nmethod = ["FDK", "fdk"]\nsize = [8, [4, 5, 6]]\n')
+    assert [setting.label for setting in grid.settings] == ["fdk size=8", "fdk size=4,5,6"]
+    run = plan_sweep(grid, Path("results"))[-1]
+    assert run.job.before.size == (4, 5, 6) and run.facts["input"] == {"size": [4, 5, 6]}
+
+
 def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
     grid = read(
         GRID

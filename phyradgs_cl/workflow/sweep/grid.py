@@ -16,7 +16,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.scan_header import read_header
-from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_options
+from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_name, method_options
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.workflow.files import expecting
 
@@ -205,7 +205,7 @@ def _setting(values: dict[str, Any], where: str) -> Setting:
 
 def _checked(values: dict[str, Any]) -> Setting:
     changes = dict(values)
-    method, preset = changes.pop("method", _DEFAULT_METHOD), changes.pop("preset", None)
+    method, preset = method_name(changes.pop("method", _DEFAULT_METHOD)), changes.pop("preset", None)
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
