@@ -13,7 +13,6 @@ import numpy as np
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, input_options
@@ -125,16 +124,10 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
 def _reference_of(scan: Scan, stored: StoredVolume, notes: list[str]) -> np.ndarray | None:
     if scan.reference is None or not float(scan.reference.max()) > 0:
         return None
-    if not _same_grid(scan.grid, stored.grid):
+    if not scan.grid.is_close(stored.grid):
         notes.append("The scan's reference is on another grid than the volume and is not shown.")
         return None
     return scan.reference
-
-
-def _same_grid(a: Grid, b: Grid) -> bool:
-    near_mm = 1e-5 * max(a.size_mm)
-    close = np.allclose(a.voxel_size_mm, b.voxel_size_mm, rtol=1e-5)
-    return a.shape == b.shape and close and np.allclose(a.offset_mm, b.offset_mm, atol=near_mm)
 
 
 def _is_number(value: Any) -> bool:
