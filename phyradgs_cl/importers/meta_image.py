@@ -1,4 +1,4 @@
-"""MetaImage (.mha, .mhd), volumes and stacks of projections: text, then voxels, raw or deflated, here or in one file beside."""
+"""MetaImage (.mha, .mhd), volumes and stacks of projections: a text, then voxels, raw or deflated, here or beside."""
 
 from __future__ import annotations
 

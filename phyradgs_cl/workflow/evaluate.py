@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +38,9 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
         if share == 0:
             found = f"{_place(grid)}, which has no voxel of the reference, {_place(wanted)}"
             raise InputError(str(volume_path), found, "volumes in one place")
-        where = f"from {_place(grid)} to {_place(wanted)}"
-        log.warning(
-            "%s: resampled (linear) %s, the reference's; %.3g %% of that lies in the volume, 0 is taken for the rest",
-            volume_path,
-            where,
-            100 * share,
-        )
+        where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
+        rest = "" if share == 1 else f"; {100 * share:.3g} % of those lie in the volume, the rest counts as 0"
+        log.warning("%s: resampled (linear) %s%s", volume_path, where, rest)
         told = {"resampled": where, "share_of_reference_covered": share}
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
@@ -59,8 +56,9 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
 def _place(grid: Grid) -> str:
     """A grid in a few words, x y z as everywhere where people read."""
     counts, sizes, offsets = (v[::-1] for v in (grid.shape, grid.voxel_size_mm, grid.offset_mm))
+    digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
     words = f"{'×'.join(map(str, counts))} voxels of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
-    return f"{words} about ({', '.join(f'{o:.4g}' for o in offsets)}) mm"
+    return f"{words} about ({', '.join(f'{round(o, digits) + 0.0:g}' for o in offsets)}) mm"
 
 
 def _write_picture(picture: Path, volume: np.ndarray, reference: np.ndarray, title: str) -> None:

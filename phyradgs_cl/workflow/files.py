@@ -38,7 +38,7 @@ def load_scan(path: str | Path) -> Scan:
 
 @contextmanager
 def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
-    """An InputError of the body about a file of another kind than ``kinds`` says that; about a foreign scan, what reads it."""
+    """An InputError of the body about a file of another kind than ``kinds`` says so; about a foreign scan, what reads it."""
     try:
         yield
     except InputError as error:
