@@ -43,6 +43,7 @@
       slider.setAttribute("aria-valuetext", plane.places[k]);
       if (part.source === source) continue;
       part.source = image.src = source;
+      part.steps = null;
       image.decode().then(
         () => part.source === source && (take(part), paint(part), read()),
         () => {}, // another slice came in between
@@ -97,7 +98,8 @@
 
   function magnify() {
     const times = Number(zoom.value);
-    document.getElementById("zoom-told").textContent = zoom.ariaValueText = times + "×";
+    document.getElementById("zoom-told").textContent = times + "×";
+    zoom.setAttribute("aria-valuetext", times + "×");
     for (const axis of Object.keys(parts)) {
       const at = origin[axis], here = share(axis); // out of sight: it becomes the middle of what is seen
       if (times === 1 || here < at - at / times || here > at + (1 - at) / times) origin[axis] = here;
