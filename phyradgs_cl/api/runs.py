@@ -9,21 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__, checks
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol
+from phyradgs_cl import __version__
+from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.detector import counts_to_attenuation
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
-from phyradgs_cl.io import (
-    Scanner,
-    load_scanner,
-    read_scan,
-    read_volume,
-    with_detector_count,
-    write_scan,
-    write_volume,
-)
+from phyradgs_cl.importers import load_attenuation
+from phyradgs_cl.io import read_scan, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.reconstructors import (
     InputOptions,
@@ -34,11 +26,7 @@ from phyradgs_cl.reconstructors import (
     method_options,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.resources import resource
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, volume_scene
-from phyradgs_cl.simulation import simulate as run_simulation
-
-_PROTOCOL_KEYS = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
+from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 
 def load_scan(path: str | Path) -> Scan:
@@ -84,48 +72,18 @@ def simulate(
 ) -> Scan:
     """A fly-scan (or, with ``protocol="static"``, a stop-and-shoot scan) of a phantom, with its truth as reference.
 
-    phantom: a name, or the path of a volume file. size: voxels along the longest side of grid and reference.
+    phantom: a name, or the path of a volume file (docs/formats.md). size: voxels along the longest side of grid and
+    reference.
     detector: columns, rows in proportion. options: those of ``phyradgs simulate`` with underscores (views,
     exposure_deg, readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
     Raises InputError for what there is not, or what is out of range.
     """
-    checks.within("size", size, 1, 4096)
-    described = load_scanner(scanner, resource("data"))
-    geometry = _with_detector(described.geometry, detector)
-    timing = {key: options.pop(key) for key in _PROTOCOL_KEYS if key in options}
-    chosen = _simulation_options(described, _protocol(protocol, described, timing), options)
-    rt, axis = runtime_of(device), chosen.readout_axis
-    if phantom in PHANTOMS:
-        scene = phantom_scene(rt, str(phantom), geometry, described.grid, size, axis, chosen.seed)
-    else:
-        scene = volume_scene(rt, str(phantom), geometry, described.grid, size, axis)
-    scene.warn_of_inverse_crime()
-    title = f"simulated scan of {scene.title}"
-    return run_simulation(scene.source, geometry, scene.grid, chosen, reference=scene.reference, title=title)
-
-
-def _with_detector(geometry: ConeGeometry, columns: int | None) -> ConeGeometry:
-    if columns is None:
-        return geometry
-    checks.within("detector", columns, 1, 32_000)
-    rows, present = geometry.detector_shape
-    return with_detector_count(geometry, max(1, round(columns * rows / present)), columns)
-
-
-def _protocol(name: str, scanner: Scanner, timing: Mapping[str, Any]) -> Protocol:
-    """A named protocol; readout and pulse are the scanner's where nothing else is said."""
-    own = {"readout_ratio": scanner.readout_ratio, "pulse": scanner.pulse}
-    return make_protocol(name, **{**own, **timing})
-
-
-def _simulation_options(scanner: Scanner, protocol: Protocol, given: Mapping[str, Any]) -> SimulationOptions:
-    own = {name: getattr(scanner, name) for name in ("readout_axis", "readout_direction", "lag")}
-    known = {f.name for f in fields(SimulationOptions)} - {"protocol"}
-    if unknown := sorted(set(given) - known):
-        names = ", ".join(sorted({*known, *_PROTOCOL_KEYS}))
-        raise InputError(f"simulate: option {unknown[0]}", "no such option", f"one of {names}")
-    return SimulationOptions(protocol=protocol, **{**own, **given})
+    described = scanner_for(scanner, detector)
+    chosen = scanner_options(described, protocol, **options)
+    of = str(phantom) if phantom in PHANTOMS else load_attenuation(phantom)
+    name = f"volume {phantom}"
+    return simulated_scan(runtime_of(device), of, described, chosen, size=size, name=name)
 
 
 def reconstruct(

@@ -13,7 +13,7 @@ EXAMPLE = "Example: phyradgs info scan.h5"
 
 
 def info_command(
-    file: Annotated[Path, file_argument("FILE", "Scan or volume file.")],
+    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff.")],
 ) -> None:
     """Say what a file holds."""
     for key, value in summary(file).items():

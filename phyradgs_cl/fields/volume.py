@@ -76,6 +76,12 @@ class Grid:
         )
         return z, y, x
 
+    def is_close(self, other: Grid) -> bool:
+        """Whether two grids are one but for what files round off."""
+        near_mm = 1e-5 * max(self.size_mm)
+        same_voxels = np.allclose(self.voxel_size_mm, other.voxel_size_mm, rtol=1e-5)
+        return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
+
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
         """The voxels [start, start + shape) (z, y, x) as a grid of their own."""
         z, y, x = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.folder import regular_file
 
 MOST_TEXT_BYTES = 64 << 20
+MOST_INFLATION = 1040  # deflate cannot do more than 1032
 
 
 def read_bytes(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
@@ -55,6 +57,30 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
         raise InputError(culprit, f"a damaged .npy file ({error})", "a NumPy array") from error
     values = values.reshape(shape, order="F" if fortran else "C")
     return np.ascontiguousarray(values)
+
+
+def read_raw(path: Path, start: int, shape: tuple[int, ...], dtype: np.dtype, packed: bool) -> np.ndarray:
+    """The array (C order) at byte ``start`` to the end of a file, ``packed`` by zlib or gzip or not at all."""
+    available = path.stat().st_size - start
+    check_array(str(path), shape, dtype, available * (MOST_INFLATION if packed else 1), len(shape))
+    count = math.prod(shape)
+    with open(path, "rb") as file:
+        file.seek(start)
+        if not packed:
+            return np.fromfile(file, dtype, count).reshape(shape)
+        return np.frombuffer(_inflated(path, file.read(), count * dtype.itemsize), dtype).reshape(shape)
+
+
+def _inflated(path: Path, packed: bytes, size: int) -> bytes:
+    """Exactly ``size`` bytes; not one more is unpacked."""
+    machine = zlib.decompressobj(wbits=47)  # zlib or gzip
+    try:
+        data = machine.decompress(packed, size)
+    except zlib.error as error:
+        raise InputError(str(path), f"compressed data that are damaged ({error})", "zlib data") from error
+    if len(data) != size:
+        raise InputError(str(path), f"{len(data)} bytes after unpacking", f"{size} bytes")
+    return data
 
 
 def check_array(

@@ -66,6 +66,25 @@ def read_pages(path: Path) -> list[np.ndarray]:
     return pages
 
 
+def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
+    """Voxel sizes (x, y, z) mm and the origin's place (x, y, z) in voxels, where a stack states them; and its "Info".
+
+    Of ImageJ's own stacks, and of BigTIFF in which tifffile keeps the same words as JSON. Call ``read_pages`` first.
+    """
+    tifffile = _library()
+    try:
+        with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
+            facts = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
+            per_mm = [np.divide(*tiff.pages[0].tags[f"{axis}Resolution"].value) for axis in "XY"]
+        sizes = np.array([1 / per_mm[0], 1 / per_mm[1], float(facts["spacing"])])
+        if facts.get("unit") != "mm" or not np.all(np.isfinite(sizes) & (sizes > 0)):
+            return None, None, ""
+        origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])
+        return sizes, origin if np.isfinite(origin).all() else None, str(facts.get("Info", ""))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, tifffile.TiffFileError):
+        return None, None, ""
+
+
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
     """Keeps a library from logging a line for every damaged tag: one error says it all."""

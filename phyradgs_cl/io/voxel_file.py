@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,15 +47,17 @@ def load_volume(path: str | Path) -> LoadedVolume:
     return LoadedVolume(volume, grid)
 
 
-def load_attenuation(path: str | Path, *, warn: bool = True) -> LoadedVolume:
-    """``load_volume``, for a volume that rays are to be sent through.
+def load_attenuation(
+    path: str | Path, *, warn: bool = True, load: Callable[[str | Path], LoadedVolume] = load_volume
+) -> LoadedVolume:
+    """What ``load`` reads, for a volume that rays are to be sent through.
 
     Where a tenth as much lies below 0 as above, that is worth a warning: noise about 0 in air has less.
 
     Raises:
         InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units.
     """
-    loaded = load_volume(path)
+    loaded = load(path)
     volume = loaded.volume
     positive = float(np.sum(volume, where=volume > 0, dtype=np.float64))
     negative = float(-np.sum(volume, where=volume < 0, dtype=np.float64))

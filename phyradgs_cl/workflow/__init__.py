@@ -5,8 +5,6 @@ from phyradgs_cl.workflow.files import load_reference, load_scan, summary
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob, profile_report, run_reconstruction
 from phyradgs_cl.workflow.simulate import (
     SimulationJob,
-    load_scanner_for,
-    make_scan_protocol,
     refuse_jitter,
     refuse_noise_options,
     run_simulation,
@@ -17,8 +15,6 @@ __all__ = [
     "SimulationJob",
     "load_reference",
     "load_scan",
-    "load_scanner_for",
-    "make_scan_protocol",
     "profile_report",
     "refuse_jitter",
     "refuse_noise_options",

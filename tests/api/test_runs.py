@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl import api
+from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.errors import InputError
 
 
@@ -60,6 +61,15 @@ def test_a_simulation_takes_the_options_of_the_command(rt, scan) -> None:
     noisy = api.simulate("jaw", size=12, detector=20, noise="beer", dose=100.0, seed=3, views=2, device=rt)
     still = api.simulate("jaw", size=12, detector=20, protocol="static", views=3, device=rt)
     assert len(noisy.projections) == 2 and noisy.is_fly and not still.is_fly
+
+
+def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:
+    options = ["--phantom", "jaw", "--size", "8", "--detector", "10", "--views", "2", "--noise", "beer", "--seed", "4"]
+    assert load_cli().run(["simulate", *options, "--readout", "columns", "-o", str(tmp_path / "scan.h5")]) == 0
+    ours = api.simulate("jaw", size=8, detector=10, views=2, noise="beer", seed=4, readout_axis="columns", device=rt)
+    theirs = api.load_scan(tmp_path / "scan.h5")
+    assert np.array_equal(ours.projections, theirs.projections) and ours.shutter == theirs.shutter
+    assert ours.provenance == theirs.provenance and ours.provenance["simulated"] == "phantom jaw"
 
 
 def test_a_volume_file_can_be_scanned(rt, scan, tmp_path) -> None:

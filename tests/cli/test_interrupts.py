@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl import signals
+from phyradgs_cl import signals, simulation
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.reconstructors import interrupt
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_on_interrupt
@@ -49,9 +49,9 @@ COMMANDS = {
     "fdk": ["reconstruct", "{scan}", "--method", "fdk"],
 }
 STAGES = [
-    ("simulate", simulate, "load_scanner"),
+    ("simulate", simulation, "load_scanner"),
     ("simulate", simulate, "check_writable"),
-    ("simulate", simulate, "simulate"),
+    ("simulate", simulate, "simulated_scan"),
     ("simulate", Runtime, "kernel"),
     ("reconstruct", reconstruct, "load_scan"),
     ("reconstruct", reconstruct, "sha256_of"),
