@@ -7,6 +7,7 @@ the nxtomo package has written them, are undone, and the rotation axis's column 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,7 +15,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.frames import line_integrals, upright
+from phyradgs_cl.importers.frames import line_integrals, united, upright
 from phyradgs_cl.importers.hdf5_frames import gantry_sign, opened, optional_length, read_frames
 from phyradgs_cl.importers.moving_poses import Turned
 from phyradgs_cl.importers.options import ImportOptions, option_name
@@ -60,7 +61,7 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         _refuse_moves(source, entry, used)
         title = _title(source, entry, path)
     frames = upright(turn.frames(frames), options, "bottom")
-    projections, bad = line_integrals(
+    integrals = line_integrals(
         f"{path}:{detector}/data",
         frames[used],
         options,
@@ -70,10 +71,8 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     )
     if mask is not None:
         mask = upright(turn.frames(mask), options, "bottom")
-        bad = mask if bad is None else mask | bad
-    return put_together(
-        projections, bad, trajectory, geometry, timing, options, title=title, source=str(path)
-    )
+        integrals = replace(integrals, mask=united(mask, integrals.mask))
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _refuse_ours(source: Hdf5Source, entry: str) -> None:
