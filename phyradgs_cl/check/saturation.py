@@ -45,7 +45,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
         return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
     if scan.saturation is not None and scan.saturation.share > _SHARE:
-        return _clipped(scan.saturation, "lower the exposure; the import has masked these pixels")
+        return _clipped(scan.saturation, "lower the exposure; the import has masked these pixels, or taken them as air")
     p = np.asarray(scan.projections)
     masked = (
         np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)

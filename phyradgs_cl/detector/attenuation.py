@@ -15,7 +15,8 @@ QUANTITIES = ("attenuation", "transmission", "counts")
 # Transmission is kept at or above this before the logarithm (a line integral of 13.8): beyond what
 # 16-bit detectors resolve, and finite.
 TRANSMISSION_FLOOR = 1e-6
-_BLOCK = 1 << 20  # pixels that are converted at a time
+_LARGEST = float(np.finfo(np.float32).max)
+_BLOCK = 1 << 18  # pixels that are converted at a time
 
 
 def counts_to_attenuation(
@@ -53,9 +54,13 @@ def frames_to_attenuation(
     quantity: str,
     flats: NDArray[np.generic] | None = None,
     darks: NDArray[np.generic] | None = None,
+    largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own."""
-    return _converted(frames, range(len(frames)), quantity, flats, darks)
+    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own.
+
+    Attenuation above ``largest`` must not be used either.
+    """
+    return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
 
 
 def _converted(
@@ -64,19 +69,21 @@ def _converted(
     quantity: str,
     flats: NDArray[np.generic] | None,
     darks: NDArray[np.generic] | None,
+    largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     panel = frames.shape[1:]
     result = np.empty((len(chosen), *panel), dtype=np.float32)
     unusable = np.empty(result.shape, dtype=bool)
     rows = max(1, _BLOCK // max(1, panel[1]))
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is marked as unusable
-        dark, gain = _calibration(flats, darks) if quantity == "counts" else (np.zeros(panel), np.ones(panel))
+        plain = np.broadcast_to(0.0, panel), np.broadcast_to(1.0, panel)
+        dark, gain = _calibration(flats, darks) if quantity == "counts" else plain
         for i, frame in enumerate(chosen):
             for start in range(0, panel[0], rows):  # float64 copies of a scan, or of one huge frame, are large
                 part = slice(start, start + rows)
                 values = frames[frame, part].astype(np.float64)
                 if quantity == "attenuation":
-                    bad = ~(np.abs(values) <= np.finfo(np.float32).max)  # NaN compares false
+                    bad = ~(np.abs(values) <= largest)  # NaN compares false
                     result[i, part], unusable[i, part] = np.where(bad, 0.0, values), bad
                 else:
                     result[i, part], unusable[i, part] = _minus_log(values - dark[part], gain[part])

@@ -96,8 +96,9 @@ def check_numbering(paths: Sequence[Path], remedy: str) -> None:
         return
     numbers = [number for _, number, _ in places[0]] if places else [0] * len(names)
     steps = [after - before for before, after in pairwise(numbers)]
+    usual = min((step for step in steps if step > 0), default=1)
     for (before, after), step in zip(pairwise(paths), steps, strict=True):
-        if step == 0 or step != min(steps):
+        if step != usual:
             found = f"{after.name} after {before.name}: {'one number' if step == 0 else 'a hole'} in the numbering"
             raise InputError(str(after.parent), found, "every number once", remedy)
 

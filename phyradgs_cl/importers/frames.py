@@ -15,6 +15,7 @@ from phyradgs_cl.io.scan_file import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
 Mask = np.ndarray | None
+_SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ def line_integrals(
     if quantity is None:
         remedy = f"say {option_name('quantity')} attenuation, transmission or counts"
         raise InputError(f"{culprit} quantity", "nothing that says it", "what the pixels hold", remedy)
-    saturation = None
+    saturation = flat = None
     if quantity == "counts":
         if options.flat_value is not None or flats is None or len(flats) == 0:
             flats = _constant_flat(culprit, frames, options)
@@ -57,34 +58,31 @@ def line_integrals(
             if stack is not None and len(stack):
                 _check_panel(culprit, stack, frames)
         with np.errstate(over="ignore", invalid="ignore"):
-            saturation = find_saturation(frames, flats.mean(axis=0, dtype=np.float64))
-    integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks)
+            flat = flats.mean(axis=0, dtype=np.float64)
+            saturation = find_saturation(frames, flat)
+    integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
+    if quantity == "attenuation" and unusable.any():
+        text = "%s: %d line integrals are not finite or beyond %g: masked"
+        _log.warning(text, culprit, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if saturation is not None and saturation.share > 0:
-        _mask_clipped(culprit, frames, saturation, unusable)
-    _mask_beyond(culprit, integrals, unusable, quantity)
+        _mask_clipped(culprit, frames, flat, saturation, unusable)
     return LineIntegrals(integrals, compact(unusable), saturation)
 
 
-def _mask_clipped(culprit: str, frames: np.ndarray, saturation: Saturation, unusable: np.ndarray) -> None:
-    """Each frame's clipped pixels are masked in that frame alone: elsewhere the same pixels see something."""
+def _mask_clipped(
+    culprit: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
+) -> None:
+    """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object.
+
+    Where the flat is clipped too the integral is 0: right for air, which is most of it, and without air in the frames a
+    reconstruction is further off (2 to 3 times) than with thin parts that are lost.
+    """
+    brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
-        bad |= frame == saturation.level
-    text = "%s: %.3g %% of the projections' pixels are clipped at %g counts: masked, each in its own frame"
-    _log.warning(text, culprit, 100 * saturation.share, saturation.level)
-
-
-def _mask_beyond(culprit: str, integrals: np.ndarray, unusable: np.ndarray, quantity: str) -> None:
-    """Attenuation that is not finite, or beyond all sense, would end the reading of the scan that is written."""
-    if quantity != "attenuation":
-        return
-    count = 0
-    for values, bad in zip(integrals, unusable, strict=True):
-        bad |= np.abs(values) > LARGEST_LINE_INTEGRAL
-        values[bad] = 0
-        count += int(np.count_nonzero(bad))
-    if count:
-        text = "%s: %d line integrals are not finite or beyond %g: masked"
-        _log.warning(text, culprit, count, LARGEST_LINE_INTEGRAL)
+        bad |= (frame == saturation.level) & brighter
+    fate = "masked, each in its own frame" if brighter.any() else "taken as air, for the flats are clipped too"
+    text = "%s: %.3g %% of the projections' pixels are clipped at %g counts: %s"
+    _log.warning(text, culprit, 100 * saturation.share, saturation.level, fate)
 
 
 def has_flats(flats: np.ndarray | None, options: ImportOptions) -> bool:

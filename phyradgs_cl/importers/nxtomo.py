@@ -1,7 +1,8 @@
 """NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from options.
 
-Row 0 is taken as the lowest, as that reader takes it; flips that the file declares, in either of the ways in which
-the nxtomo package has written them, are undone, and the rotation axis's column becomes a detector offset.
+The format does not say which row is on top. Row 0 is taken as the lowest, as that reader takes it, and this is said;
+flips that the file declares, in either of the ways in which the nxtomo package has written them, are undone first. The
+rotation axis's column becomes a detector offset.
 """
 
 from __future__ import annotations
@@ -60,6 +61,9 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         quantity = read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, used)
         title = _title(source, entry, path)
+    if options.row_0 is None:
+        text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
+        _log.warning(text, path, option_name("row_0"))
     frames = upright(turn.frames(frames), options, "bottom")
     integrals = line_integrals(
         f"{path}:{detector}/data",

@@ -21,7 +21,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.bounded import check_room
 from phyradgs_cl.importers.folder import regular_file
 
-_MOST_OPCODES = 3_000_000  # some seconds
+_MOST_OPCODES = 1_000_000  # two seconds
 _MOST_COPIES, _FREE_BYTES = 4, 1 << 20  # of the file's size: one text may be made an array again and again
 _BESIDE = 3  # arrays and line integrals, for every byte of the file
 _LARGEST_KEY = 1 << 60  # smaller integers are their own hashes

@@ -103,9 +103,9 @@ def _first(*values: float | None) -> float | None:
 def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses what a user says of a turn without the time from frame to frame; warns where a file has an exposure."""
     asked = [option_name(name) for name in _OF_A_TURN if getattr(options, name) is not None]
-    remedy = f"say {option_name('frame_time_s')} too, or leave it out for frames taken at rest"
+    remedy = f"say {option_name('frame_time_s')}"
     for name in (*asked, *stored.written):
-        raise InputError(name, "no time from frame to frame beside it", "the gantry's turn in between", remedy)
+        raise InputError(name, "no time from frame to frame beside it", "both, or neither for frames taken at rest", remedy)
     if shutter.exposure_s > 0:
         text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; %s if the gantry did not stop"
         _log.warning(text, culprit, shutter.exposure_s, option_name("frame_time_s"))
