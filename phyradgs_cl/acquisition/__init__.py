@@ -4,7 +4,7 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import ConeGeometry, pixel_centres, transpose_pose
 from phyradgs_cl.acquisition.motion import MOTIONS, Motion
 from phyradgs_cl.acquisition.protocol import PROTOCOLS, Protocol, make_protocol
-from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.scan import Saturation, Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import (
     CircularOrbit,
@@ -26,6 +26,7 @@ __all__ = [
     "Motion",
     "PoseTable",
     "Protocol",
+    "Saturation",
     "Scan",
     "Shutter",
     "SpeedRamp",

@@ -17,6 +17,14 @@ DETECTOR_MODELS = ("log", "intensity")
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
 
 
+@dataclass(frozen=True)
+class Saturation:
+    """What raw counts said before they became line integrals: the largest of them, and the share of pixels clipped there."""
+
+    level: float
+    share: float
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """One cone-beam scan in line integrals.
@@ -25,6 +33,7 @@ class Scan:
     line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
     lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
     projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
+    ``saturation`` is None where nobody looked at raw counts.
     ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
     """
 
@@ -41,6 +50,7 @@ class Scan:
     title: str = "cone-beam scan"
     provenance: dict[str, object] = field(default_factory=dict)
     lag: float = 0.0
+    saturation: Saturation | None = None
 
     def __post_init__(self) -> None:
         frames = len(self.projections)

@@ -1,4 +1,4 @@
-"""Reading small texts and NumPy arrays whose size is bounded by the file's own."""
+"""Reading small texts and NumPy arrays whose size is bounded by the file's own, and by this machine's memory."""
 
 from __future__ import annotations
 
@@ -10,10 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.fields import LARGEST
 from phyradgs_cl.importers.folder import regular_file
+from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
 
 MOST_TEXT_BYTES = 64 << 20
 MOST_INFLATION = 1040  # deflate cannot do more than 1032
+
+
+def check_room(culprit: str, needed_bytes: int) -> None:
+    """InputError for what would take more than its share of this machine's memory."""
+    most = HOST_SHARE * host_bytes()
+    if needed_bytes > most:
+        found, expected = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, most))
+        remedy = "import fewer frames at a time, or bin them"
+        raise InputError(culprit, f"{found} to unpack", f"at most {expected} on this machine", remedy)
 
 
 def read_bytes(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
@@ -36,6 +47,25 @@ def read_json(path: Path) -> dict[str, object]:
     if not isinstance(content, dict):
         raise InputError(str(path), f"JSON {type(content).__name__}", "a JSON object")
     return content
+
+
+def read_numbers(path: Path, count: int, what: str) -> np.ndarray:
+    """(count,) finite numbers of a text file, one a line; empty lines and what follows a # are passed over."""
+    values = []
+    for number, line in enumerate(read_bytes(path).decode("utf-8-sig", "replace").splitlines(), start=1):
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not abs(value) <= LARGEST:
+            raise InputError(f"{path} line {number}", repr(text[:40]), "a finite number")
+        values.append(value)
+    if len(values) != count:
+        raise InputError(str(path), f"{len(values)} {what}", f"{count}, one for each frame")
+    return np.array(values)
 
 
 def read_npy(path: Path, ndim: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
-_LARGEST = 1e12  # of any length, angle or time that makes sense; keeps sums finite
+LARGEST = 1e12  # of any length, angle or time that makes sense; keeps sums finite
 
 
 class Fields:
@@ -101,7 +101,7 @@ class Fields:
         if isinstance(value, np.generic):
             value = value.item()
         good = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not good or not abs(value) <= _LARGEST or not math.isfinite(value):  # type: ignore[arg-type]
+        if not good or not abs(value) <= LARGEST or not math.isfinite(value):  # type: ignore[arg-type]
             raise InputError(self.name(key), described(value), "a finite number")
         return float(value)  # type: ignore[arg-type]
 

@@ -10,6 +10,7 @@ import re
 import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from phyradgs_cl.errors import InputError
@@ -82,6 +83,24 @@ def regular_file(path: Path, culprit: str) -> Path:
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Sorted by name with numbers by value: 2.tif before 10.tif."""
     return sorted(paths, key=lambda path: _natural(path.name))
+
+
+def check_numbering(paths: Sequence[Path], remedy: str) -> None:
+    """InputError for frames, in natural order, that share a number or leave one out: all later angles would be wrong.
+
+    Numbers are those in the one place where the names differ; names that differ elsewhere too are no numbering.
+    """
+    names = [_natural(path.stem) for path in paths]
+    places = [place for place in zip(*names, strict=False) if len(set(place)) > 1]
+    if len({len(name) for name in names}) > 1 or len(places) > 1 or any(word for _, _, word in sum(places, ())):
+        return
+    numbers = [number for _, number, _ in places[0]] if places else [0] * len(names)
+    steps = [after - before for before, after in pairwise(numbers)]
+    usual = min((step for step in steps if step > 0), default=1)
+    for (before, after), step in zip(pairwise(paths), steps, strict=True):
+        if step != usual:
+            found = f"{after.name} after {before.name}: {'one number' if step == 0 else 'a hole'} in the numbering"
+            raise InputError(str(after.parent), found, "every number once", remedy)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

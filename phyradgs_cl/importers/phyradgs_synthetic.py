@@ -33,10 +33,9 @@ def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
     timing = timing_of_marks(opened.meta, marks, options)
     sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
     grid, reference = opened.reference()
-    projections, mask = opened.projections(entries, options)
+    integrals = opened.projections(entries, options)
     return put_together(
-        projections,
-        mask,
+        integrals,
         CircularOrbit(opened.geometry, sweeps),
         opened.geometry,
         timing,

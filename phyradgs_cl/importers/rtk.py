@@ -36,11 +36,9 @@ def import_rtk(path: Path, options: ImportOptions) -> Scan:
     timing = make_timing(str(description), rtk.frames, options)
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
     custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
-    projections, mask = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
+    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
     title = description.stem
-    return put_together(
-        projections, mask, trajectory, geometry, timing, options, title=title, source=str(path)
-    )
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _trajectory(

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -91,6 +91,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         title=_optional_word(source, f"{entry}/title", "cone-beam scan"),
         provenance=_read_provenance(source, entry),
         lag=_read_lag(source, entry),
+        saturation=_read_saturation(source, entry),
     )
     scan.check_timing()
     mask_shape = check_mask(source, entry, data.shape)
@@ -147,6 +148,15 @@ def _read_lag(source: Hdf5Source, entry: str) -> float:
     lag = read_number(source, address, known=KNOWN)
     checks.within(source.name(address), lag, 0, LARGEST_LAG)
     return lag
+
+
+def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
+    level, share = (f"{entry}/{schema.EXTRA}/saturation_{name}" for name in ("level", "share"))
+    if source.optional(level, KNOWN) is None and source.optional(share, KNOWN) is None:
+        return None
+    found = Saturation(read_number(source, level, known=KNOWN), read_number(source, share, known=KNOWN))
+    checks.within(source.name(share), found.share, 0, 1)
+    return found
 
 
 def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:

@@ -129,6 +129,9 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
     extra["detector_model"] = scan.detector_model
     if scan.lag > 0:
         write_number(extra, "lag", scan.lag)
+    if scan.saturation is not None:
+        write_number(extra, "saturation_level", scan.saturation.level)
+        write_number(extra, "saturation_share", scan.saturation.share)
     if scan.shutter.pulse_s is not None and _stored_durations(scan)[0] > 0:
         start_s, length_s = scan.shutter.pulse_s
         write_number(extra, "pulse_start", start_s, "s")
