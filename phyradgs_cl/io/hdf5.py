@@ -7,6 +7,7 @@ whose declared size the file cannot hold. Every defect is an InputError about "F
 from __future__ import annotations
 
 import difflib
+import math
 import posixpath
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -190,6 +191,7 @@ class Hdf5Source:
         try:
             elsewhere = dataset.is_virtual or bool(dataset.external)
             shape, chunks, declared_bytes = dataset.shape, dataset.chunks, dataset.nbytes
+            chunk_bytes = math.prod(chunks or ()) * dataset.dtype.itemsize
         except (OSError, RuntimeError, TypeError, ValueError) as error:
             raise InputError(self.name(address), f"a damaged dataset ({error})", "numbers or text") from error
         if elsewhere:
@@ -199,8 +201,10 @@ class Hdf5Source:
             raise InputError(self.name(address), "an empty dataset", "a value")
         file_bytes = self.path.stat().st_size
         most = file_bytes if chunks is None else _MOST_EXPANSION * file_bytes + _FREE_BYTES
-        if declared_bytes > most:
-            found = f"shape {shape}, {declared_bytes / 2**30:.3g} GiB in a file of {file_bytes} bytes"
+        if max(declared_bytes, chunk_bytes) > most:
+            what, size = ("shape", shape) if declared_bytes > most else ("chunks of", chunks)
+            declared = f"{max(declared_bytes, chunk_bytes) / 2**30:.3g} GiB"
+            found = f"{what} {size}, {declared} in a file of {file_bytes} bytes"
             raise InputError(
                 self.name(address), found, "a size that the file can hold", "write the file again"
             )
