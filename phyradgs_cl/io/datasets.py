@@ -46,8 +46,8 @@ def _unfolded(dataset: h5py.Dataset) -> object:
 
 
 def _damage(error: Exception) -> str:
-    what = "unfold, or that unfold to more than their header promises" if "filter" in str(error) else "read"
-    return f"data that HDF5 cannot {what} ({error})"
+    bomb = ", or that unfold to more than their header promises" if "filter" in str(error) else ""
+    return f"data that HDF5 cannot read{bomb} ({error})"
 
 
 def read_array(

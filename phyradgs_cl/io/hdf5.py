@@ -18,6 +18,7 @@ import h5py
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5_trial import survive
+from phyradgs_cl.io.regular import regular_file
 
 _MOST_SOFT_LINKS = 16
 # Masks of zeros shrink a thousandfold, frames hardly at all: a file of some size may unfold to so many times that.
@@ -32,11 +33,8 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
     Errors of HDF5 in the body come out as InputError too, so the body should do nothing but read.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(str(path), "no such file", "an HDF5 file", "check the path")
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "something that is not a regular file"
-        raise InputError(str(path), what, "an HDF5 file", "name an HDF5 file")
+    if regular_file(path, str(path), "an HDF5 file").st_size == 0:  # of /proc, or cut off
+        raise InputError(str(path), "an empty file", "an HDF5 file", "copy or write it again")
     survive(path)
     try:
         file = h5py.File(path, "r")
