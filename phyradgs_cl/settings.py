@@ -14,6 +14,7 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
+from phyradgs_cl.io.tables import read_toml
 from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options
 from phyradgs_cl.runtime import bytes_of
 
@@ -116,15 +117,7 @@ def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
     if path is None:
         return {}
-    if path.exists() and not path.is_file():  # a device or a pipe may never end
-        raise InputError(f"{option} {path}", "not a regular file", "a TOML file")
-    try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{option} {path}", error.strerror or str(error), "a TOML file") from error
-    except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
-        raise InputError(f"{option} {path}", f"not TOML ({error})", "a TOML file") from error
+    return read_toml(path, f"{option} {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:

@@ -7,13 +7,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.detector import counts_to_attenuation
-from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import read_scan, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
@@ -44,8 +42,7 @@ def load_volume(path: str | Path) -> Reconstruction:
     stored = read_volume(path)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    cloud = None if stored.gaussians is None else Gaussians(**stored.gaussians)
-    return Reconstruction(stored.volume, stored.grid, cloud, record, facts)
+    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts)
 
 
 def save_volume(
@@ -53,11 +50,7 @@ def save_volume(
 ) -> None:
     """Writes a volume file, whole or not at all; ``metrics`` as from ``compare`` are kept with it."""
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    cloud = None
-    if result.gaussians is not None:
-        names = ("mean", "scale", "quaternion", "density")
-        cloud = {name: np.asarray(getattr(result.gaussians, name), np.float32) for name in names}
-    write_volume(path, result.volume, result.grid, facts, cloud, metrics)
+    write_volume(path, result.volume, result.grid, facts, result.gaussians, metrics)
 
 
 def simulate(

@@ -50,7 +50,6 @@ def check_command(
     counts = CountReader()
     with expecting(scan, "scan"):
         loaded = read_scan(scan, counts)
-    loaded.check_timing()
     with Ticker("question") as ticker:
         found = check(loaded, Runtime(wish), counts, ticker.show)
     say(_as_json(found, scan) if as_json else _as_text(found))

@@ -40,7 +40,6 @@ def estimate_command(
     settings = request.settings()
     options = method_options(settings.method, settings.preset, settings.changes)
     loaded = load_scan(scan)
-    loaded.check_timing()
     if ranks is not None:
         checks.within("--ranks", ranks, 1, MOST_RANKS)
         if (device := request.given["device"]) is not None:

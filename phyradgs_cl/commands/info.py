@@ -10,6 +10,7 @@ from phyradgs_cl.commands.options import file_argument
 from phyradgs_cl.workflow import summary
 
 EXAMPLE = "Example: phyradgs info scan.h5"
+_LONGEST = 2000
 
 
 def info_command(
@@ -17,4 +18,5 @@ def info_command(
 ) -> None:
     """Say what a file holds."""
     for key, value in summary(file).items():
-        say(f"{key.replace('_', ' '):24s} {value}")
+        text = str(value)
+        say(f"{key.replace('_', ' '):24s} {text[:_LONGEST]}{'…' if len(text) > _LONGEST else ''}")

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.fields import LARGEST
 from phyradgs_cl.importers.folder import regular_file
 from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
+from phyradgs_cl.io.tables import LARGEST
 
 MOST_TEXT_BYTES = 64 << 20
 MOST_INFLATION = 1040  # deflate cannot do more than 1032

@@ -7,13 +7,13 @@ but regular files.
 from __future__ import annotations
 
 import re
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import regular
 
 _MOST_FILES = 200_000
 _LONGEST_NAME = 4096
@@ -70,13 +70,7 @@ def checked_name(name: object, culprit: str) -> str:
 
 def regular_file(path: Path, culprit: str) -> Path:
     """The path of a file that exists and is neither a folder nor a device."""
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):
-        raise InputError(culprit, f"no file {path}", "a file that exists", "check the path") from None
-    if not stat.S_ISREG(mode):  # a pipe would never end
-        what = "a folder" if stat.S_ISDIR(mode) else "something that is not a regular file"
-        raise InputError(culprit, f"{what} at {path}", "a regular file", "check the path")
+    regular.regular_file(path, culprit)
     return path
 
 

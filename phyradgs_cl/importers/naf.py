@@ -13,12 +13,12 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tigre_frame
-from phyradgs_cl.importers.fields import Fields, described
 from phyradgs_cl.importers.frames import line_integrals, upright
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.pickle_reader import read_pickle
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
+from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),

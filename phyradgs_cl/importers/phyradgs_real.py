@@ -16,7 +16,6 @@ from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tiff
 from phyradgs_cl.importers.bounded import read_json
-from phyradgs_cl.importers.fields import Fields
 from phyradgs_cl.importers.folder import SafeFolder, check_numbering
 from phyradgs_cl.importers.frames import line_integrals
 from phyradgs_cl.importers.moving_poses import plain_geometry, turn_of
@@ -24,6 +23,7 @@ from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.phyradgs_synthetic import readout_ratio, start_times_s
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing
+from phyradgs_cl.io.tables import Fields
 
 OPTIONS = (
     "exposure_s",

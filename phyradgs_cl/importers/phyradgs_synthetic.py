@@ -12,11 +12,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.fields import Fields
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.r2_gaussian import R2Folder, entries_of
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing
+from phyradgs_cl.io.tables import Fields
 
 META = "meta_data_motion_blur_rolling_shutter_fps18.json"
 OPTIONS = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")

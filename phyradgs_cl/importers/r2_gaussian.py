@@ -14,12 +14,12 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import tigre_frame
 from phyradgs_cl.importers.bounded import read_json, read_npy
-from phyradgs_cl.importers.fields import Fields
 from phyradgs_cl.importers.folder import SafeFolder
 from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, upright
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
+from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
 OPTIONS = (

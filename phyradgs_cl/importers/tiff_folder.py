@@ -6,8 +6,6 @@ The tables [source], [detector], [volume], [readout] and [beam] are those of a s
 
 from __future__ import annotations
 
-import difflib
-import sys
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -16,8 +14,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tiff
-from phyradgs_cl.importers.bounded import read_bytes, read_numbers
-from phyradgs_cl.importers.fields import Fields
+from phyradgs_cl.importers.bounded import read_numbers
 from phyradgs_cl.importers.folder import SafeFolder, check_numbering, checked_name, in_natural_order
 from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, united, upright
 from phyradgs_cl.importers.hdf5_frames import gantry_sign
@@ -25,11 +22,7 @@ from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, QUANTITIES, ROTATE
 from phyradgs_cl.importers.scan_parts import put_together, with_options
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.scanner_file import Scanner, scanner_from
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
 OPTIONS = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
@@ -85,23 +78,10 @@ def description_of(folder: SafeFolder) -> Path:
 
 def _tables(path: Path) -> dict[str, Fields]:
     """The file's own tables by name, and under "" what a scanner file has; unknown names are refused."""
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(str(path), f"text that is not TOML ({error})", "a TOML file") from error
-    _refuse_unknown(str(path), content, (*_SCANNER, *_OWN))
-    tables = {name: Fields(f"{path} [{name}]", content.get(name, {})) for name in _OWN}
-    for name, table in tables.items():
-        _refuse_unknown(table.culprit, table.values, _OWN[name])
+    content = read_toml(path)
+    refuse_unknown(str(path), content, (*_SCANNER, *_OWN), "a name")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), _OWN[name]) for name in _OWN}
     return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in _OWN}), **tables}
-
-
-def _refuse_unknown(culprit: str, found: object, allowed: tuple[str, ...]) -> None:
-    for key in found:  # type: ignore[attr-defined]
-        if key not in allowed:
-            close = difflib.get_close_matches(str(key), allowed, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else "remove it"
-            raise InputError(f"{culprit} {key}", "a name that is not known", ", ".join(allowed), remedy)
 
 
 def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:

@@ -11,7 +11,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.fields import Fields
+from phyradgs_cl.io.tables import Fields
 
 ROW_0 = "top"
 

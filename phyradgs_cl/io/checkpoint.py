@@ -11,6 +11,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.atomic import written_beside
+from phyradgs_cl.io.names import beside
 from phyradgs_cl.io.npz import read_npz
 
 _FORMAT = 1
@@ -20,7 +21,12 @@ _RESTART = "start without --resume"
 
 def checkpoint_path(output: str | Path) -> Path:
     """Where the checkpoint of a run that writes ``output`` lies."""
-    return Path(f"{output}.checkpoint.npz")
+    return beside(output, ".checkpoint.npz")
+
+
+def former_checkpoint_path(output: str | Path) -> Path:
+    """Where the checkpoint of an earlier run is kept that another run of the same output has found."""
+    return beside(output, ".checkpoint.npz.bak")
 
 
 def write_checkpoint(path: str | Path, arrays: dict[str, np.ndarray], fingerprint: str) -> None:

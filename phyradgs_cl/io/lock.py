@@ -10,6 +10,7 @@ from pathlib import Path
 
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
+from phyradgs_cl.io.names import beside
 
 try:
     import fcntl
@@ -27,7 +28,7 @@ class BusyError(OutputError):
 def lock_path(output: str | Path) -> Path:
     """The lock file of ``output``; it is there while a run is, and means nothing once that has ended."""
     target = Path(os.path.realpath(output))
-    return target.with_name(f".{target.name}.lock")
+    return beside(target, ".lock", ".")
 
 
 @contextmanager

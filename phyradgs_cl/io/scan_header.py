@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import scan_schema as schema
 from phyradgs_cl.io.datasets import read_attribute, read_number, read_word
+from phyradgs_cl.io.facts import read_facts
 from phyradgs_cl.io.grid_io import default_grid, read_grid
 from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.scan_detector import (
@@ -163,13 +163,7 @@ def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
     address = f"{entry}/{schema.EXTRA}/provenance"
     if source.optional(address, KNOWN) is None:
         return {}
-    try:
-        facts = json.loads(read_word(source, address))
-    except ValueError as error:
-        raise InputError(source.name(address), f"text that is not JSON ({error})", "a JSON object") from error
-    if not isinstance(facts, dict):
-        raise InputError(source.name(address), f"JSON {type(facts).__name__}", "a JSON object")
-    return facts
+    return read_facts(source.name(address), read_word(source, address), {})
 
 
 def _optional_word(source: Hdf5Source, address: str, default: str) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from difflib import get_close_matches
 from typing import Any
 
 from phyradgs_cl import checks
@@ -25,6 +24,7 @@ from phyradgs_cl.reconstructors.sax_nerf import SAX_PRESETS, sax_nerf
 from phyradgs_cl.reconstructors.sirt import SirtOptions, sirt
 from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import near_miss
 
 _MOTION_KEYS = ("motion", "strips", "sub_intervals", "segments", "time_error")
 _MODELS_WITH = {
@@ -202,8 +202,7 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
     for key, value in changes.items():
         if key not in known:
             names = [*known, *_motion_keys(options)]
-            close = get_close_matches(key, names, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else "leave it out"
+            remedy = near_miss(key, names, "leave it out")
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
         values[key] = _converted(known[key], value, f"{culprit}: option {key}")
     return replace(options, **values)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,13 +64,8 @@ class Run:
     @property
     def record(self) -> list[dict[str, float]]:
         """The convergence record: finite numbers only."""
-        lines = self.stored.provenance.get("record")
-        lines = lines if isinstance(lines, list) else []
-        return [
-            {k: float(v) for k, v in line.items() if _is_number(v)}
-            for line in lines
-            if isinstance(line, dict)
-        ]
+        lines: Any = self.stored.provenance.get("record") or []
+        return [{k: float(v) for k, v in line.items() if _is_number(v)} for line in lines]
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
@@ -95,8 +91,8 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
         return Run(path, stored, metrics=stored.metrics or {}, notes=tuple(notes))
     if scan_path is not None and (kind := file_kind(scan_path)) != "scan":
         raise InputError(f"--scan {scan_path}", f"a {kind}", "a scan")
-    facts = scan_summary(found)
     known = stored.provenance.get("scan_sha256")
+    facts = scan_summary(found, str(known) if scan_path is None else None)
     if known is not None and facts["sha256"] != known:
         notes.append(
             "The scan shown here is not the file that this volume was reconstructed from: its hash differs."
@@ -113,13 +109,14 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
     """The file that the provenance names, from here or from beside the volume, if it has the hash that is kept."""
     named = provenance.get("scan")
-    if not isinstance(named, str) or not named or "\0" in named:
+    if not isinstance(named, str) or not named:
         notes.append("The volume file names no scan.")
         return None
     known = provenance.get("scan_sha256")
     for place in (Path(named), path.parent / named, path.parent / Path(named).name):
-        if place.is_file() and sha256_of(place) == known:
-            return place
+        with suppress(InputError):  # whatever else there is: it may be any file of this machine
+            if file_kind(place) == "scan" and sha256_of(place) == known:
+                return place
     notes.append(f"The scan {named} was not found, or has changed since; --scan names it.")
     return None
 

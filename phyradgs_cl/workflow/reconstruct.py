@@ -22,9 +22,10 @@ from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_ho
 from phyradgs_cl.io import (
     check_writable,
     checkpoint_path,
+    former_checkpoint_path,
+    hashing,
     only_run,
     read_checkpoint,
-    sha256_of,
     write_checkpoint,
     write_volume,
 )
@@ -139,18 +140,18 @@ def run_reconstruction(
 def _reconstructed(
     job: ReconstructionJob, options: Any, make_runtime: Callable[[], Runtime], report: ProgressReport
 ) -> tuple[Reconstruction, dict[str, float]]:
-    scan = load_scan(job.scan)
-    scan.check_timing()
+    with hashing(job.scan) as scan_hash_of:
+        scan = load_scan(job.scan)
+        scan_hash = scan_hash_of()
     _warn_of_doubts(job, scan, options)
     rt = make_runtime()
-    scan_hash = sha256_of(job.scan)
     fingerprint = _fingerprint(scan_hash, job, options)
     extra: dict[str, Any] = {"before": job.before}
     leads = rt.ranks.rank == 0
     if job.resume:
         extra["resume"] = rt.ranks.tell(_resumed(job, fingerprint) if leads else None)
     elif leads:
-        _set_aside(checkpoint_path(job.output))
+        _set_aside(job.output)
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
     result: Reconstruction | None = None
     metrics: dict[str, float] = {}
@@ -222,12 +223,7 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
 def _write_result(
     job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
 ) -> None:
-    cloud = result.gaussians
-    arrays = None
-    if cloud is not None:
-        names = ("mean", "scale", "quaternion", "density")
-        arrays = {name: np.asarray(getattr(cloud, name), np.float32) for name in names}
-    write_volume(job.output, result.volume, result.grid, provenance, arrays, metrics or None)
+    write_volume(job.output, result.volume, result.grid, provenance, result.gaussians, metrics or None)
 
 
 def _provenance(
@@ -262,10 +258,11 @@ def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
     return read_checkpoint(checkpoint_path(job.output), fingerprint)
 
 
-def _set_aside(checkpoint: Path) -> None:
+def _set_aside(output: Path) -> None:
     """Whoever repeats a command without --resume may have meant it: the hours in a checkpoint are not thrown away."""
+    checkpoint = checkpoint_path(output)
     if checkpoint.is_file():
-        kept = checkpoint.with_name(f"{checkpoint.name}.bak")
+        kept = former_checkpoint_path(output)
         os.replace(checkpoint, kept)
         remedy = "to go on from it, stop, rename it back and add --resume"
         log.warning("%s is of an earlier run and is kept as %s: %s", checkpoint, kept.name, remedy)
