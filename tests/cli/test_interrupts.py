@@ -11,7 +11,6 @@ import pytest
 
 from phyradgs_cl import signals
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.reconstructors import interrupt
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import evaluate, reconstruct, simulate
@@ -212,7 +211,7 @@ def test_a_loop_is_saved_and_goes_on(cli, scan, tmp_path, name, status, method):
 
 def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(interrupt.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(signals.time, "monotonic", lambda: now[0])
     with pytest.raises(KeyboardInterrupt), stop_on_interrupt() as request:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
@@ -223,6 +222,7 @@ def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
 
 
 def test_a_signal_that_is_ignored_stays_ignored():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with stop_on_interrupt() as request, finish_despite_interrupt():
         signal.raise_signal(signal.SIGINT)
@@ -230,6 +230,8 @@ def test_a_signal_that_is_ignored_stays_ignored():
     signals.take_over()
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     signals.let_go()
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("method", ["sart", "phyradgs"])
