@@ -1,9 +1,9 @@
 """Ctrl-C and SIGTERM in a process of the command line: one line on stderr and an end, whatever is running.
 
 An exception raised by a signal's handler may surface in any library, which may swallow it or complain about it. So
-nothing is raised here: the process removes its half-written files and ends. Work that is worth keeping makes the signals
-wait until it is saved (reconstructors/interrupt.py); in somebody else's process they are KeyboardInterrupt then. Nothing is
-imported that takes time, not even ``signal``, which builds enums round ``_signal``: this is to be in force as early as can be.
+nothing is raised here: the process removes its half-written files and ends. Work that is worth keeping makes signals wait
+(reconstructors/interrupt.py). Nothing is imported that takes time, nor ``signal``, which builds enums round ``_signal``:
+this is to be in force as early as can be.
 """
 
 from __future__ import annotations
@@ -31,6 +31,10 @@ patience_s: list[float] = []
 asked_s: float | None = None
 """When the first of the signals that wait came."""
 _taken: set[int] = set()
+
+
+class InterruptedAfterwards(KeyboardInterrupt):
+    """Ctrl-C that came during work which was finished all the same."""
 
 
 def answer(caught: int, frame: FrameType | None) -> None:
@@ -67,7 +71,10 @@ def _remove(path: str) -> None:
 
 
 def handle(caught: int) -> None:
-    """Sets the handler. System calls go on after it: a compiler in an OpenCL driver would take a short reading for an error."""
+    """Sets the handler.
+
+    System calls go on after it: a compiler inside an OpenCL driver would take a reading that is cut short for an error.
+    """
     signal.signal(caught, answer)
     if hasattr(signal, "siginterrupt"):
         signal.siginterrupt(caught, False)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Protocol as Interface
 
 import numpy as np
-from skimage.transform import resize_local_mean
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, pixel_centres
@@ -291,6 +290,8 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Means of a volume (z, y, x) over the voxels of a coarser (or equal) grid of the same box, float32."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
+    from skimage.transform import resize_local_mean  # slow to import
+
     return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(
         np.float32
     )

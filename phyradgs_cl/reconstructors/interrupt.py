@@ -19,10 +19,6 @@ from phyradgs_cl.errors import DeviceError
 _SAME_PRESS_S = 1.0  # wrappers (timeout, uv) pass on what the terminal has sent already
 
 
-class InterruptedAfterwards(KeyboardInterrupt):
-    """Ctrl-C that came during work which was finished all the same."""
-
-
 @dataclass(frozen=True)
 class StopRequest:
     """Whether somebody has asked the run to stop."""
@@ -92,4 +88,4 @@ def _waiting(patience_s: float, says_so: bool = False) -> Iterator[bool]:
         if not signals.patience_s:
             asked, signals.asked_s = signals.asked_s is not None, None
     if asked and says_so:
-        raise InterruptedAfterwards
+        raise signals.InterruptedAfterwards

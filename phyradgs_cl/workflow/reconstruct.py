@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__, checks
+from phyradgs_cl import __version__, checks, signals
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
@@ -40,7 +40,6 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.interrupt import (
-    InterruptedAfterwards,
     finish_despite_interrupt,
     keep_finished_work,
 )
@@ -163,7 +162,7 @@ def _reconstructed(
                     metrics = compare(result.volume, scan.reference)
                 _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
                 _keep_checkpoint(job, result, fingerprint)
-    except InterruptedAfterwards:
+    except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
     return result, metrics  # type: ignore[return-value]
