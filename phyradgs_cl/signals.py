@@ -52,7 +52,7 @@ def answer(caught: int, frame: FrameType | None) -> None:
 def _end(caught: int) -> None:
     """Says ``farewell`` and ends with 128 + the signal's number."""
     for path in tuple(unfinished):
-        _remove(path)
+        remove(path)
     try:
         if sys.stderr is not None:
             start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over a counter that is open
@@ -61,7 +61,8 @@ def _end(caught: int) -> None:
         os._exit(128 + caught)
 
 
-def _remove(path: str) -> None:
+def remove(path: str) -> None:
+    """Removes a temporary file or folder, if there is one."""
     try:
         os.unlink(path)
     except OSError:  # a folder, or there is none yet, or it has become the output

@@ -1,7 +1,7 @@
 """Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
 
 from phyradgs_cl.io.atomic import check_writable, written_beside
-from phyradgs_cl.io.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
+from phyradgs_cl.io.checkpoint import checkpoint_path, partial_path, read_checkpoint, write_checkpoint
 from phyradgs_cl.io.grid_io import default_grid, with_grid_count
 from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.lock import only_run
@@ -24,6 +24,7 @@ __all__ = [
     "load_attenuation",
     "load_volume",
     "only_run",
+    "partial_path",
     "read_checkpoint",
     "read_scan",
     "read_volume",
