@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
+
+import typer
 
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import file_argument
@@ -14,7 +17,12 @@ EXAMPLE = "Example: phyradgs info scan.h5"
 
 def info_command(
     file: Annotated[Path, file_argument("FILE", "Scan or volume file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Say what a file holds."""
-    for key, value in summary(file).items():
+    facts = summary(file)
+    if as_json:
+        say(json.dumps(facts, default=str))
+        return
+    for key, value in facts.items():
         say(f"{key.replace('_', ' '):24s} {value}")

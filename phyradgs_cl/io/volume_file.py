@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import h5py
@@ -26,6 +28,7 @@ _VOLUME = f"{_DATA}/volume"
 _AXES = ("z", "y", "x")
 _MOST_ARRAYS = 16
 _AXIS_TOLERANCE = 1e-3  # of a voxel: what axes stored in float32 need
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +80,13 @@ def write_volume(
 
 
 def read_volume(path: str | Path) -> StoredVolume:
-    """Read a volume file; InputError names what is wrong by its HDF5 path."""
+    """Read a volume file; InputError names what is wrong by its HDF5 path. A run that was interrupted is a warning."""
     with open_hdf5(path) as source:
         dataset, grid = _checked(source)
         values = read_values(source, _VOLUME, dataset)
         checks.finite(source.name(_VOLUME), values)
         volume = in_unit(source, _VOLUME, values, ATTENUATION).astype(np.float32)
-        provenance = _read_facts(source, "provenance") or {}
+        provenance = read_provenance(source)
         return StoredVolume(volume, grid, provenance, _read_gaussians(source), _read_facts(source, "metrics"))
 
 
@@ -97,7 +100,7 @@ def volume_summary(path: str | Path) -> dict[str, object]:
             "shape": grid.shape,
             "voxel_size_mm": grid.voxel_size_mm,
             "offset_mm": grid.offset_mm,
-            "provenance": _read_facts(source, "provenance") or {},
+            "provenance": read_provenance(source),
             "metrics": _read_facts(source, "metrics"),
             "gaussians": max(counts, default=0),
             "sha256": sha256_of(path),
@@ -120,6 +123,29 @@ def file_kind(path: str | Path) -> str:
         members = ", ".join(sorted(source.file)) or "nothing"
     expected = "a scan (/entry/instrument), a volume (/entry/reconstruction) or a dataset /volume"
     raise InputError(f"{path}:/", f"members: {members}", expected, "check the path")
+
+
+def read_provenance(source: Hdf5Source) -> dict[str, object]:
+    """How a volume came about; says once if its run was interrupted."""
+    provenance = _read_facts(source, "provenance") or {}
+    if where := interruption(provenance):
+        of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"
+        _say_once(source.path, f"interrupted at iteration {where['interrupted_at']}{of}")
+    return provenance
+
+
+def interruption(provenance: Mapping[str, object]) -> dict[str, int | None]:
+    """``interrupted_at`` and ``iterations_asked`` of a run that was interrupted; nothing of one that was not."""
+    at, options = provenance.get("interrupted_at"), provenance.get("options")
+    if type(at) is not int:  # a truth is an int too
+        return {}
+    asked = options.get("iterations") if isinstance(options, Mapping) else None
+    return {"interrupted_at": at, "iterations_asked": asked if type(asked) is int else None}
+
+
+@cache
+def _say_once(path: Path, text: str) -> None:
+    log.warning("%s: %s", path, text)
 
 
 def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:

@@ -14,6 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io.datasets import read_attribute, read_values
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
+from phyradgs_cl.io.volume_file import read_provenance
 
 _BARE = "/volume"
 _ENTRY = "/entry/reconstruction"
@@ -42,7 +43,10 @@ def load_volume(path: str | Path) -> LoadedVolume:
     with open_hdf5(path) as source:
         name = _dataset_name(source)
         volume = _read(source, name)
-        grid = _read_grid(source, volume.shape) if name != _BARE else None
+        grid = None
+        if name != _BARE:
+            grid = _read_grid(source, volume.shape)
+            read_provenance(source)
     return LoadedVolume(volume, grid)
 
 

@@ -13,6 +13,7 @@ from phyradgs_cl.io import (
     read_volume,
     written_beside,
 )
+from phyradgs_cl.io.volume_file import interruption
 from phyradgs_cl.metrics import compare, slices_png
 from phyradgs_cl.reconstructors.interrupt import (
     finish_despite_interrupt,
@@ -46,6 +47,7 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
     return {
         **metrics,
         **known,
+        **interruption(stored.provenance),
         "volume": str(volume_path),
         "reference": str(reference_path),
         "picture": str(picture),

@@ -22,6 +22,7 @@ from phyradgs_cl.io import (
     check_writable,
     checkpoint_path,
     only_run,
+    partial_path,
     read_checkpoint,
     sha256_of,
     write_checkpoint,
@@ -121,15 +122,17 @@ def run_reconstruction(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
 
-    An interrupted run writes the volume as far as it got, and a checkpoint beside it that ``resume`` continues; a run
-    that is killed leaves its last checkpoint. Raises OutputError while another run is at work on the same output.
+    An interrupted run leaves what is at ``output`` alone: it writes the volume as far as it got to ``io.partial_path``, and
+    a checkpoint that ``resume`` continues; both go when a run has come to its end. A run that is killed leaves its last
+    checkpoint. Raises OutputError while another run is at work on the same output.
     Of ``ranks``, which the runtime must have too, rank 0 alone writes; the others have no metrics.
     """
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)
     if leads:
         check_writable(job.output)
-    refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
+    for path in (job.output, partial_path(job.output)):
+        refuse_overwriting("-o", path, job.scan, *([job.config] if job.config else []))
     with only_run(job.output) if leads else nullcontext():
         return _reconstructed(job, options, make_runtime, report)
 
@@ -214,7 +217,8 @@ def _write_result(
     if cloud is not None:
         names = ("mean", "scale", "quaternion", "density")
         arrays = {name: np.asarray(getattr(cloud, name), np.float32) for name in names}
-    write_volume(job.output, result.volume, result.grid, provenance, arrays, metrics or None)
+    path = job.output if result.state is None else partial_path(job.output)
+    write_volume(path, result.volume, result.grid, provenance, arrays, metrics or None)
 
 
 def _provenance(
@@ -261,7 +265,8 @@ def _set_aside(checkpoint: Path) -> None:
 def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
     path = checkpoint_path(job.output)
     if result.state is None:
-        with suppress(OSError):  # the volume is there, whatever lies in the checkpoint's place
-            path.unlink()
+        for outdated in (path, partial_path(job.output)):
+            with suppress(OSError):  # the volume is there, whatever lies in their place
+                outdated.unlink()
     else:
         write_checkpoint(path, dict(result.state), fingerprint)
