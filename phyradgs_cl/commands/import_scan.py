@@ -11,7 +11,8 @@ import numpy as np
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Axis, DetectorModel, file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Axis, DetectorModel
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument
+from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.workflow import summary
 
 EXAMPLE = "Example: phyradgs info scan.h5"

@@ -10,7 +10,8 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say
-from phyradgs_cl.commands.options import Output, file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Output
 from phyradgs_cl.commands.ranks import last_words
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.io import partial_path
