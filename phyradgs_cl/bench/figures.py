@@ -35,7 +35,8 @@ def read_slices(folder: Path, facts: Mapping[str, Any]) -> Images | None:
     """The slices of a run; None where there are none, or they are damaged."""
     try:
         with np.load(slices_path(folder, facts), allow_pickle=False) as stored:
-            return [stored[f"arr_{number}"] for number in range(len(stored))]
+            images = [stored[f"arr_{number}"] for number in range(len(stored))]
+            return images if all(isinstance(image, np.ndarray) for image in images) else None
     except Exception:  # zipfile, zlib and NumPy's parser hand on whatever they stumble over
         return None
 
