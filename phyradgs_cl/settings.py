@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -148,17 +148,6 @@ def device_wish(value: object, culprit: str = "--device") -> str | None:
         remedy = "see 'phyradgs devices', or leave it out for the best device"
         raise InputError(culprit, checks.shown(value), "an index, cpu, gpu or part of a name", remedy)
     return value
-
-
-def file_parser(culprit: str) -> Callable[[str], Path]:
-    """Reads the file name given for ``culprit``; an empty one would pass for the current folder."""
-
-    def file(text: str) -> Path:
-        if not text.strip():
-            raise InputError(culprit, repr(text), "a file name", "name a file")
-        return Path(text)
-
-    return file
 
 
 def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:

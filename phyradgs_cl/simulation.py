@@ -9,7 +9,6 @@ from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
-from skimage.transform import resize_local_mean
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, make_protocol, pixel_centres
@@ -363,6 +362,8 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Means of a volume (z, y, x) over the voxels of a coarser (or equal) grid of the same box, float32."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
+    from skimage.transform import resize_local_mean  # slow to import
+
     return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(
         np.float32
     )

@@ -10,7 +10,6 @@ from typing import Any
 
 import typer
 
-from phyradgs_cl.checks import shown
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.text import plain_text
 
@@ -37,6 +36,8 @@ def complain(text: str, status: int = 2) -> int:
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
     """What Typer found wrong with the words of a command, with the value that it could not read."""
     text = str(error.format_message()).replace("Value error, ", "")
+    from phyradgs_cl.checks import shown
+
     value = _value_of(getattr(error, "param", None), arguments)
     return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {shown(value)}"
 

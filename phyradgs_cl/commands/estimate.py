@@ -9,7 +9,8 @@ import typer
 
 from phyradgs_cl import checks
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import RANKS, file_argument
+from phyradgs_cl.commands.files import file_argument
+from phyradgs_cl.commands.options import RANKS
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.exporters import CLOUDS, EXPORTS, export_volume, format_of
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting

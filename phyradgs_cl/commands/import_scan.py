@@ -11,15 +11,8 @@ import numpy as np
 import typer
 
 from phyradgs_cl.commands.console import remark, say
-from phyradgs_cl.commands.options import (
-    Axis,
-    DetectorModel,
-    RoiMm,
-    Size,
-    VoxelMm,
-    file_argument,
-    file_option,
-)
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, VoxelMm
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise

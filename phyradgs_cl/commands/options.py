@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
+from phyradgs_cl.commands.files import file_option
 from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import file_parser, numbers
+from phyradgs_cl.settings import numbers
 
 MethodName = Enum("MethodName", {name: name for name in METHODS}, type=str)  # type: ignore[misc]
 
@@ -36,17 +37,6 @@ class SplitName(str, Enum):
 class DetectorModel(str, Enum):
     log = "log"
     intensity = "intensity"
-
-
-def file_option(*names: str, help: str, show_default: bool | str = True) -> Any:
-    """An option that takes a file name."""
-    parser = file_parser(names[-1])
-    return typer.Option(*names, parser=parser, metavar="FILE", help=help, show_default=show_default)
-
-
-def file_argument(name: str, help: str) -> Any:
-    """An argument that is a file name."""
-    return typer.Argument(parser=file_parser(name), metavar=name, help=help)
 
 
 Device = Annotated[

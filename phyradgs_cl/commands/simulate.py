@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output, file_option
+from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, offset_pair, pulse_pair

@@ -4,6 +4,7 @@ from phyradgs_cl.io.atomic import check_writable, written_beside
 from phyradgs_cl.io.checkpoint import (
     checkpoint_path,
     former_checkpoint_path,
+    partial_path,
     read_checkpoint,
     write_checkpoint,
 )
@@ -39,6 +40,7 @@ __all__ = [
     "load_attenuation",
     "load_volume",
     "only_run",
+    "partial_path",
     "read_checkpoint",
     "read_scan",
     "read_volume",

@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ _AXES = ("z", "y", "x")
 _GAUSSIANS = "/entry/gaussians"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
 _AXIS_TOLERANCE = 1e-3  # of a voxel: what axes stored in float32 need
-_log = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +92,13 @@ def write_volume(
 
 
 def read_volume(path: str | Path) -> StoredVolume:
-    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning."""
+    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning.
+
+    A run that was interrupted is a warning too.
+    """
     with open_hdf5(path) as source:
         volume, grid = _read_voxels(source)
-        provenance = _read_facts(source, "provenance", PROVENANCE) or {}
-        return StoredVolume(volume, grid, provenance, _read_gaussians(source), _read_metrics(source))
+        return StoredVolume(volume, grid, read_provenance(source), _read_gaussians(source), _read_metrics(source))
 
 
 def load_volume(path: str | Path) -> LoadedVolume:
@@ -115,6 +118,7 @@ def load_volume(path: str | Path) -> LoadedVolume:
         if not isinstance(source.find(_VOLUME), h5py.Dataset):
             found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
             raise InputError(str(path), found, f"a 3D dataset {_BARE} or {_VOLUME}")
+        read_provenance(source)
         return LoadedVolume(*_read_voxels(source))
 
 
@@ -139,7 +143,7 @@ def load_attenuation(
         raise InputError(f"volume of {path}", found, expected, remedy)
     if warn and negative > 0.1 * positive:
         share = f"{100 * negative / positive:.0f} % as much below 0 as above"
-        _log.warning("volume of %s: %s, %s; expected %s; %s", path, found, share, expected, remedy)
+        log.warning("volume of %s: %s, %s; expected %s; %s", path, found, share, expected, remedy)
     return loaded
 
 
@@ -152,7 +156,7 @@ def volume_summary(path: str | Path) -> dict[str, object]:
             "shape": grid.shape,
             "voxel_size_mm": grid.voxel_size_mm,
             "offset_mm": grid.offset_mm,
-            "provenance": _read_facts(source, "provenance", PROVENANCE) or {},
+            "provenance": read_provenance(source),
             "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
             "sha256": sha256_of(path),
@@ -175,6 +179,29 @@ def file_kind(path: str | Path) -> str:
         members = ", ".join(sorted(source.file)) or "nothing"
     expected = "a scan (/entry/instrument), a volume (/entry/reconstruction) or a dataset /volume"
     raise InputError(f"{path}:/", f"members: {members}", expected, "check the path")
+
+
+def read_provenance(source: Hdf5Source) -> dict[str, object]:
+    """How a volume came about; says once if its run was interrupted."""
+    provenance = _read_facts(source, "provenance", PROVENANCE) or {}
+    if where := interruption(provenance):
+        of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"
+        _say_once(source.path, f"interrupted at iteration {where['interrupted_at']}{of}")
+    return provenance
+
+
+def interruption(provenance: Mapping[str, object]) -> dict[str, int | None]:
+    """``interrupted_at`` and ``iterations_asked`` of a run that was interrupted; nothing of one that was not."""
+    at, options = provenance.get("interrupted_at"), provenance.get("options")
+    if type(at) is not int:  # a truth is an int too
+        return {}
+    asked = options.get("iterations") if isinstance(options, Mapping) else None
+    return {"interrupted_at": at, "iterations_asked": asked if type(asked) is int else None}
+
+
+@cache
+def _say_once(path: Path, text: str) -> None:
+    log.warning("%s: %s", path, text)
 
 
 def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:
@@ -267,7 +294,7 @@ def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:
         return None
     wrong = [name for name, value in metrics.items() if isinstance(value, str | bool | dict | list)]
     if wrong:
-        _log.warning("%s: %s: no numbers, left out", source.name("/entry/metrics"), checks.shown(wrong))
+        log.warning("%s: %s: no numbers, left out", source.name("/entry/metrics"), checks.shown(wrong))
     return {name: value for name, value in metrics.items() if name not in wrong}
 
 

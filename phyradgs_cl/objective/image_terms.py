@@ -9,7 +9,7 @@ Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import correlate1d
+import scipy
 
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
@@ -137,5 +137,5 @@ def image_loss(
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
-    rows = correlate1d(image, WINDOW, axis=1, mode="constant")
-    return correlate1d(rows, WINDOW, axis=0, mode="constant")
+    rows = scipy.ndimage.correlate1d(image, WINDOW, axis=1, mode="constant")
+    return scipy.ndimage.correlate1d(rows, WINDOW, axis=0, mode="constant")

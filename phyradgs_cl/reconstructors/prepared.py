@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
@@ -50,4 +50,5 @@ def median_frames(scan: Scan, edge: int) -> np.ndarray:
     Masked pixels are filled in from their row first, so that what they hold does not reach their neighbours.
     """
     frames = unmasked_frames(scan)
-    return np.stack([median_filter(frame, size=edge, mode="nearest") for frame in frames]).astype(np.float32)
+    smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]
+    return np.stack(smooth).astype(np.float32)

@@ -9,7 +9,6 @@ import weakref
 from collections.abc import Sequence
 
 import numpy as np
-import pyopencl as cl
 
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
@@ -17,6 +16,7 @@ from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
 from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, memory_limit
+from phyradgs_cl.runtime.opencl import cl
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 from phyradgs_cl.runtime.source import kernel_source
 

@@ -11,6 +11,7 @@ import numpy as np
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.io.volume_file import interruption
 from phyradgs_cl.metrics import compare, resampled, slices_png
 from phyradgs_cl.reconstructors.interrupt import (
     finish_despite_interrupt,
@@ -50,7 +51,7 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
         _write_picture(picture, volume, reference, title)
     known = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
-    return {**metrics, **known, **told, **files}
+    return {**metrics, **known, **interruption(provenance), **told, **files}
 
 
 def _place(grid: Grid) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__, checks
+from phyradgs_cl import __version__, checks, signals
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
@@ -25,6 +25,7 @@ from phyradgs_cl.io import (
     former_checkpoint_path,
     hashing,
     only_run,
+    partial_path,
     read_checkpoint,
     write_checkpoint,
     write_volume,
@@ -42,7 +43,6 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.interrupt import (
-    InterruptedAfterwards,
     finish_despite_interrupt,
     keep_finished_work,
 )
@@ -124,15 +124,17 @@ def run_reconstruction(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
 
-    An interrupted run writes the volume as far as it got, and a checkpoint beside it that ``resume`` continues; a run
-    that is killed leaves its last checkpoint. Raises OutputError while another run is at work on the same output.
+    An interrupted run leaves what is at ``output`` alone: it writes the volume as far as it got to ``io.partial_path``, and
+    a checkpoint that ``resume`` continues; both go when a run has come to its end. A run that is killed leaves its last
+    checkpoint. Raises OutputError while another run is at work on the same output.
     Of ``ranks``, which the runtime must have too, rank 0 alone writes; the others have no metrics.
     """
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)
     if leads:
         check_writable(job.output)
-    refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
+    for path in (job.output, partial_path(job.output)):
+        refuse_overwriting("-o", path, job.scan, *([job.config] if job.config else []))
     with only_run(job.output) if leads else nullcontext():
         return _reconstructed(job, options, make_runtime, report)
 
@@ -164,7 +166,7 @@ def _reconstructed(
                 metrics = _metrics(scan, result)
                 _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
                 _keep_checkpoint(job, result, fingerprint)
-    except InterruptedAfterwards:
+    except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
     return result, metrics  # type: ignore[return-value]
@@ -223,7 +225,8 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
 def _write_result(
     job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
 ) -> None:
-    write_volume(job.output, result.volume, result.grid, provenance, result.gaussians, metrics or None)
+    path = job.output if result.state is None else partial_path(job.output)
+    write_volume(path, result.volume, result.grid, provenance, result.gaussians, metrics or None)
 
 
 def _provenance(
@@ -271,7 +274,8 @@ def _set_aside(output: Path) -> None:
 def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
     path = checkpoint_path(job.output)
     if result.state is None:
-        with suppress(OSError):  # the volume is there, whatever lies in the checkpoint's place
-            path.unlink()
+        for outdated in (path, partial_path(job.output)):
+            with suppress(OSError):  # the volume is there, whatever lies in their place
+                outdated.unlink()
     else:
         write_checkpoint(path, dict(result.state), fingerprint)

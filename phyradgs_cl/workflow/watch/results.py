@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phyradgs_cl.errors import OutputError
-from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, written_beside
+from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, partial_path, written_beside
 from phyradgs_cl.io.names import beside
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.watch.arrivals import Arrival
@@ -68,7 +68,7 @@ class Results:
 
     def discard(self, scan: Path) -> None:
         """Nothing is left of a run."""
-        for path in (self.work(scan), *self._checkpoints(scan)):
+        for path in (self.work(scan), partial_path(self.work(scan)), *self._checkpoints(scan)):
             path.unlink(missing_ok=True)
 
     def set_aside(self, arrival: Arrival, message: str) -> None:
