@@ -24,6 +24,7 @@ def write_nxtomo(
     recorded: Recorded | np.ndarray,
     angle_unit: str = "deg",
     angle_factor: float = 1.0,
+    with_grid: bool = True,
 ) -> None:
     """A scan file (docs/formats.md) that states ``setup``.
 
@@ -77,6 +78,8 @@ def write_nxtomo(
             times = np.arange(0.0, starts[is_projection][-1] + setup.span_s + 0.1, 0.1)
             poses = setup.pose(setup.angle_deg(times))
             _group(own, "poses", "NXcollection", time_s=(times, "s"), pose=(poses, "mm"))
+        if not with_grid:
+            return
         grid = {"shape": (SIZE,) * 3, "voxel_size": ((VOXEL_MM,) * 3, "mm"), "offset": ((0.0,) * 3, "mm")}
         _group(own, "grid", "NXcollection", **grid)
 

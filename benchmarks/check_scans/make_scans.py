@@ -1,7 +1,7 @@
 """Good scans and planted faults for `phyradgs check`, by a projector that is not this project's: RTK's.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy h5py tifffile
-    PEER/bin/python benchmarks/check_scans/make_scans.py OUT --volumes DIR [--only NAME] [--phyradgs .venv/bin/phyradgs]
+    PEER/bin/python benchmarks/check_scans/make_scans.py OUT --volumes DIR [--only NAME] [--phyradgs CMD]
 
 Nothing here imports phyradgs_cl: line integrals come from RTK (Joseph's method in a voxel volume of 64^3, closed form for
 Shepp-Logan), rendered at moments 0.6 degrees apart; every line averages intensities over its own exposure; NumPy counts
