@@ -15,6 +15,7 @@ CONSISTENCY, EXPOSURE, TIMING, ANGLES = "consistency", "exposure", "timing", "an
 SATURATION, DEAD, COVERAGE, DRIFT = "saturation", "dead pixels", "coverage", "gain drift"
 MIRROR = "the mirror image fits exactly"
 SCALE = "an object of another size fits exactly"
+BLURRED = "an object smeared by the rest of the arc fits exactly"
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ FAULTS = (
     Kind("exposure-too-long", "jaw", "exposure stated twice as long, beyond the frame time",
          {"exposure_s": 0.7, "readout_s": 0.2}, {"exposure_s": 1.4}, right=(TIMING, EXPOSURE)),
     Kind("exposure-halved", "tooth", "exposure stated half as long", {"exposure_s": 0.9, "readout_s": 0.1},
-         {"exposure_s": 0.45}, right=(EXPOSURE,)),
+         {"exposure_s": 0.45}, right=(EXPOSURE,), undecidable=BLURRED),
     Kind("half-beam", "engine", "beam on for half the exposure", {"exposure_s": 0.45, "readout_s": 0.0},
          {"exposure_s": 0.9}, right=(EXPOSURE,)),
     Kind("at-rest-as-moving", "walnut", "stop-and-shoot stated as fly-scan",
