@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import affine_transform
 
 from phyradgs_cl.fields import Grid
 
@@ -18,7 +18,7 @@ def resampled(
     """
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
     first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
-    values = affine_transform(
+    values = scipy.ndimage.affine_transform(
         volume.astype(np.float32, copy=False), step, first, output_shape=onto.shape, order=1, mode="nearest"
     )
     share = 1.0

@@ -54,7 +54,7 @@ STAGES = [
     ("simulate", simulate, "simulated_scan"),
     ("simulate", Runtime, "kernel"),
     ("reconstruct", reconstruct, "load_scan"),
-    ("reconstruct", reconstruct, "sha256_of"),
+    ("reconstruct", reconstruct, "hashing"),
     ("fdk", Runtime, "launch"),
 ]
 
