@@ -107,14 +107,14 @@ def root(
         say(ctx.get_help())
 
 
-def run(arguments: list[str]) -> int:
-    """Runs one command; the exit status."""
+def run(arguments: list[str], program: typer.Typer = app) -> int:
+    """Runs one command of ``program``; the exit status."""
     signals.start_afresh()
     if not takes_part(arguments):
         return 0
     try:
         with naming_host_memory():
-            status = app(arguments, standalone_mode=False)
+            status = program(arguments, standalone_mode=False)
         return status if isinstance(status, int) else 0
     except PhyradgsError as error:
         return complain(str(error), error.exit_code)

@@ -14,11 +14,11 @@ from functools import lru_cache
 from pathlib import Path
 
 from scans import RAPID, append, read_lines
+from tables.case import FLY, STILL
+from tables.phantom_case import PhantomCase
+from tables.sizes import bench_size
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.phantom_case import PhantomCase
-from phyradgs_cl.bench.sizes import bench_size
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.runtime import Runtime

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from tables.case import FLY, SyntheticCase
+from tables.volumes import find_volumes
+
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Protocol, Scan
-from phyradgs_cl.bench.case import FLY, SyntheticCase
-from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.runtime import Runtime

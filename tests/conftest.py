@@ -1,4 +1,4 @@
-"""Runtimes and random clouds for all rooms; makes ``tolerances`` importable wherever pytest starts."""
+"""Runtimes and random clouds for all rooms; ``tolerances`` and the benchmarks' ``tables`` can be imported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent / "benchmarks")]
 
 from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
 from phyradgs_cl.acquisition.cells import TimeCells  # noqa: E402

@@ -1,61 +1,37 @@
-"""bench: methods compared on volumes."""
+"""bench: a quick comparison of methods."""
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from phyradgs_cl import signals
-from phyradgs_cl.bench import (
-    KINDS,
-    RESULTS,
-    SIZES,
-    BenchJob,
-    BenchProgress,
-    listed,
-    listed_seeds,
-    remake_tables,
-    result_text,
-    run_bench,
-    run_bench_at_workers,
-)
-from phyradgs_cl.cluster import LOCAL, Workers
-from phyradgs_cl.commands.console import complain, remark, say
 from phyradgs_cl.commands.files import file_parser
-from phyradgs_cl.commands.options import Axis, Device, Scheduler, WorkerCount
-from phyradgs_cl.progress import Ticker
+from phyradgs_cl.commands.options import Device, Scheduler, WorkerCount
+from phyradgs_cl.commands.sweep import chosen_workers, make_sweep
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
+from phyradgs_cl.workflow.quick import ITERATIONS, PIXELS, VOXELS, quick_grid
+from phyradgs_cl.workflow.sweep import RESULTS, SweepJob
 
 EXAMPLE = (
-    "Example: phyradgs bench table1 --volumes VOLUMES -o results --size S --seeds 0,1,2\n\n"
-    "Runs that the results file in the folder has already are not made again: interrupt and repeat at will."
+    "Example: phyradgs bench quick\n\n"
+    "Runs that the results file in the folder has already are not made again. The paper's tables, on volumes of your own: "
+    "python benchmarks/tables --help, in a checkout."
 )
-BenchKind = Enum("BenchKind", {name: name for name in KINDS}, type=str)  # type: ignore[misc]
-SizeName = Enum("SizeName", {name: name for name in SIZES}, type=str)  # type: ignore[misc]
+_TABLES = ("table1", "table2", "phantom")
 
 
 def bench_command(
     kind: Annotated[
-        BenchKind,  # type: ignore[valid-type]
+        str,
         typer.Argument(
-            help="table1: all methods, 25 and 50 views; table2: PhyRadGS over M and N; phantom: the paper's sphere "
-            "phantom against a pseudo-truth; quick: few methods on two small volumes, some minutes.",
+            metavar="quick",
+            help=f"quick: methods with and without motion on two phantoms of {VOXELS}³ from {PIXELS}², a minute or two.",
         ),
     ],
-    volumes: Annotated[
-        Path | None,
-        typer.Option(
-            parser=file_parser("--volumes"),
-            metavar="DIR",
-            help="Folder of HDF5 files NAME_COUNT.h5 or NAME.h5 with a dataset /volume; each is projected at its own "
-            "resolution.",
-            show_default="the built-in foot and jaw",
-        ),
-    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -63,113 +39,22 @@ def bench_command(
             "-o",
             parser=file_parser("-o"),
             metavar="DIR",
-            help=f"Folder for {RESULTS} (a line a run), tables, figures and slices.",
+            help=f"Folder for scans, {RESULTS} (a line a run), volumes and tables.",
             show_default="bench-results",
         ),
     ] = None,
-    size: Annotated[
-        SizeName | None,  # type: ignore[valid-type]
-        typer.Option(
-            help="; ".join(
-                f"{s.name}: {s.voxels}³ from {s.pixels}², {s.iterations:,} iterations" for s in SIZES.values()
-            ),
-            show_default="S; M for phantom, XS for quick",
-        ),
-    ] = None,
-    names: Annotated[
-        str | None,
-        typer.Option(help="Volumes, with commas.", show_default="all; the first two for quick"),
-    ] = None,
-    rows: Annotated[
-        str | None,
-        typer.Option(
-            help="Rows by their label in the table, with commas; a wrong one lists all.", show_default="all"
-        ),
-    ] = None,
-    protocols: Annotated[
-        str | None,
-        typer.Option(
-            help="rapid (25 views) and standard (50), with commas.",
-            show_default="both for table1, else rapid",
-        ),
-    ] = None,
-    seeds: Annotated[
-        str | None,
-        typer.Option(
-            help="Seeds of noise, jitter, cloud and frame order, with commas.",
-            show_default="0; with --table-only all",
-        ),
-    ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(help="Iterations of the splatting methods.", show_default="the size's")
-    ] = None,
-    readout: Annotated[Axis, typer.Option(help="What is read out at one time.")] = Axis.rows,
-    table_only: Annotated[
-        bool,
-        typer.Option(
-            "--table-only",
-            help="Make tables and figures from the results file, of --names and --seeds or all; run nothing.",
-        ),
-    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise, cloud and frame order.")] = 0,
+    iterations: Annotated[int, typer.Option(help="Iterations of the splatting methods.")] = ITERATIONS,
     scheduler: Scheduler = None,
     workers: WorkerCount = None,
     device: Device = None,
 ) -> None:
-    """Compare methods on volumes: a resumable results file, tables in Markdown and CSV, figures of slices."""
-    chosen_seeds = None if seeds is None else listed_seeds("--seeds", seeds)
-    job = BenchJob(
-        kind.value,  # type: ignore[attr-defined]
-        output or Path("bench-results"),
-        volumes,
-        size.value if size else None,  # type: ignore[attr-defined]
-        listed("--names", names),
-        listed("--protocols", protocols),
-        listed("--rows", rows),
-        (0,) if chosen_seeds is None else chosen_seeds,
-        iterations,
-        readout.value,
-    )
-    wish = device_wish(device)
-    pool = None
-    if scheduler is not None or workers is not None:
-        pool = Workers(LOCAL if scheduler is None else scheduler, workers, wish)
-    interrupted = (
-        f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to go on, "
-        "with --table-only for their tables"
-    )
-    signals.say_at_the_end(interrupted)
-    try:
-        if table_only:
-            written = remake_tables(job, chosen_seeds)
-        elif pool is not None:
-            written = run_bench_at_workers(job, pool, BenchTicker(), _tell_dashboard)
-        else:
-            written = run_bench(job, lambda: Runtime(wish), BenchTicker())
-    except KeyboardInterrupt:
-        complain(interrupted)
-        raise typer.Exit(signals.status()) from None
-    for path in written:
-        say(str(path))
-
-
-def _tell_dashboard(address: str) -> None:
-    remark(f"Dask's dashboard: {address}")
-
-
-class BenchTicker:
-    """Progress of a benchmark: a counter for each run, and its result once it is done."""
-
-    def __init__(self) -> None:
-        self.title = ""
-        self.ticker = Ticker("")
-
-    def __call__(self, p: BenchProgress) -> None:
-        if p.title != self.title:
-            self.title = p.title
-            self.ticker = Ticker(f"{p.number}/{p.runs} {p.title}: iteration")
-        if p.line is not None:
-            with self.ticker:  # ends the line that it rewrites
-                pass
-            say(result_text(p))
-        elif p.iterations:
-            self.ticker.show(p.iteration, p.iterations)
+    """Compare methods on two built-in phantoms: a resumable results file, volumes, a table."""
+    if kind != "quick":
+        remedy = f"'python benchmarks/tables {kind} …' in a checkout" if kind in _TABLES else ""
+        raise InputError("bench", repr(kind), "quick", remedy)
+    wish, folder = device_wish(device), output or Path("bench-results")
+    asked = scheduler is not None or workers is not None
+    pool = chosen_workers(scheduler, workers, device) if asked else None
+    grid = quick_grid(folder, lambda: Runtime(wish), seed=seed, iterations=iterations)
+    make_sweep(SweepJob(grid, folder, pool, wish if pool is None else None))

@@ -52,8 +52,12 @@ def sweep_command(
     """Reconstruct many scans with many settings: a resumable results file, volumes, and tables."""
     read = read_grid(read_config(grid, "GRID"), grid)
     where = chosen_workers(scheduler, workers, device)  # may say something, and an error has one line
-    job = SweepJob(read, output, where, device if where is None else None, checkpoint_every)
-    interrupted = f"interrupted: finished runs are in {output / RESULTS}; repeat the command to go on"
+    make_sweep(SweepJob(read, output, where, device if where is None else None, checkpoint_every))
+
+
+def make_sweep(job: SweepJob) -> None:
+    """Runs a sweep with progress, and says what was written."""
+    interrupted = f"interrupted: finished runs are in {job.folder / RESULTS}; repeat the command to go on"
     signals.say_at_the_end(interrupted)
     try:
         with SweepTicker() as ticker:
@@ -64,7 +68,7 @@ def sweep_command(
     for path in written:
         say(str(path))
     if failed:
-        complain(f"{failed} runs failed: {output / 'results.md'} says why; repeat the command to try again")
+        complain(f"{failed} runs failed: {job.folder / 'results.md'} says why; repeat the command to try again")
         raise typer.Exit(2)
 
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from phyradgs_cl.bench import (
+from tables import (
     KINDS,
     RESULTS,
     BenchJob,
@@ -23,12 +22,13 @@ from phyradgs_cl.bench import (
     rows_of,
     run_bench,
 )
-from phyradgs_cl.bench import rows as bench_rows
-from phyradgs_cl.bench.figures import read_slices, slices_path, write_slices
-from phyradgs_cl.bench.published import TABLE1, TABLE2
-from phyradgs_cl.bench.results import _MEASURED, KEY, Present, append_line, read_lines
-from phyradgs_cl.bench.summary import summarise
-from phyradgs_cl.bench.volumes import find_volumes
+from tables import rows as bench_rows
+from tables.figures import read_slices, slices_path, write_slices
+from tables.published import TABLE1, TABLE2
+from tables.results import _MEASURED, KEY, Present, append_line, read_lines
+from tables.summary import summarise
+from tables.volumes import find_volumes
+
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.reconstructors import METHODS
 
@@ -74,7 +74,7 @@ def test_devices_and_pipes_are_no_results_files(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / RESULTS).symlink_to(pipe)
     with pytest.raises(InputError, match="not a regular file"):
-        run_bench(BenchJob("quick", folder, rows=["FDK"]), pytest.fail)  # type: ignore[arg-type]
+        run_bench(BenchJob("table1", folder, rows=["FDK"]), pytest.fail)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("damage", ["cut off", "a bomb", "objects", "other names", "not there"])

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-
-from phyradgs_cl.bench import Row, rows_of
-from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.gains import gain_over_static
+from tables import Row, rows_of
+from tables.case import FLY, STILL
+from tables.gains import gain_over_static
 
 ROWS = {row.label: row for row in rows_of("table1")}
 MOVING, STATIC = ROWS["SART per-row"], ROWS["SART"]

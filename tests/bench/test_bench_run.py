@@ -7,17 +7,13 @@ import json
 import re
 import shutil
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-
-from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Motion
-from phyradgs_cl.bench import (
+from tables import (
     RESULTS,
     BenchJob,
     BenchProgress,
@@ -26,12 +22,15 @@ from phyradgs_cl.bench import (
     result_text,
     run_bench,
 )
-from phyradgs_cl.bench import rows as bench_rows
-from phyradgs_cl.bench import run as bench_run
-from phyradgs_cl.bench.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, standing
-from phyradgs_cl.bench.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
-from phyradgs_cl.bench.raw_counts import Panel, measured_attenuation
-from phyradgs_cl.bench.results import read_lines
+from tables import rows as bench_rows
+from tables import run as bench_run
+from tables.__main__ import run
+from tables.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, standing
+from tables.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
+from tables.raw_counts import Panel, measured_attenuation
+from tables.results import read_lines
+
+from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Motion
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import only_run
@@ -399,22 +398,13 @@ def test_every_ball_of_the_phantom_has_surroundings_of_its_own() -> None:
 def test_the_command_runs_resumes_and_makes_tables(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from phyradgs_cl.bench import sizes
+    from tables import sizes
 
     monkeypatch.setitem(sizes.SIZES, "XS", replace(TINY, name="XS"))
-    run: Callable[[list[str]], int] = load_cli().run
-    command = [
-        "bench",
-        "quick",
-        "--volumes",
-        str(folder),
-        "-o",
-        str(folder / "out"),
-        "--rows",
-        "FDK,PhyRadGS",
-    ]
-    assert run(["bench", "--help"]) == 0
-    assert "Example: phyradgs bench table1" in capsys.readouterr().out
+    out = ["--volumes", str(folder), "-o", str(folder / "out"), "--size", "XS", "--protocols", "rapid"]
+    command = ["table1", *out, "--rows", "FDK,PhyRadGS"]
+    assert run(["--help"]) == 0
+    assert "Example: python benchmarks/tables table1" in capsys.readouterr().out
     assert run(command) == 0
     first = capsys.readouterr().out
     assert "PhyRadGS (fly-scan): PSNR" in first
@@ -426,7 +416,7 @@ def test_the_command_runs_resumes_and_makes_tables(
     error = capsys.readouterr().err
     assert error.startswith("phyradgs: --rows: found 'PhyRadSG'")
     assert error.count("\n") == 1
-    assert run(["bench", "table1", "--volumes", str(folder / "out"), "-o", str(folder / "none")]) == 2
+    assert run(["table1", "--volumes", str(folder / "out"), "-o", str(folder / "none")]) == 2
     assert not (folder / "none").exists()
     assert json.loads((folder / "out" / RESULTS).read_text().splitlines()[0])["size"] == "XS"
 

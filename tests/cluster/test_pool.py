@@ -10,11 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tables.__main__ as tables_command
 from cluster.processes import free_port, wait_until
+from tables import RESULTS, BenchJob, BenchSize, run_bench, run_bench_at_workers
+from tables.results import read_lines
 
-from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.bench import RESULTS, BenchJob, BenchSize, run_bench, run_bench_at_workers
-from phyradgs_cl.bench.results import read_lines
 from phyradgs_cl.cluster import Lost, Pool, Workers
 from phyradgs_cl.cluster import pool as pool_module
 from phyradgs_cl.errors import InputError
@@ -61,9 +61,9 @@ def test_an_error_of_a_run_is_raised_as_it_is() -> None:
 
 
 def test_no_scheduler_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out")]
+    options = ["table1", "--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out")]
     for where in (f"tcp://127.0.0.1:{free_port()}", str(tmp_path / "none.json"), "nonsense://x"):
-        assert load_cli().run(["bench", "quick", *options, "--scheduler", where]) == 2
+        assert tables_command.run([*options, "--scheduler", where]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and f"--scheduler {where}: found no answer" in error
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import faults_kit as kit
 import numpy as np
 import pytest
+from tables.results import append_line, read_lines
 
-from phyradgs_cl.bench.results import append_line, read_lines
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import checkpoint_path, new_hdf5, read_checkpoint, write_checkpoint, write_volume

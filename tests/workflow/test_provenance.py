@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from tables import results as bench_results
 
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.bench import results as bench_results
 from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.io.facts import PROVENANCE, read_facts
 from phyradgs_cl.io.json_lines import read_lines

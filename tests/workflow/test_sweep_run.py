@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import tables.__main__ as tables_command
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.cluster import Workers
@@ -202,8 +203,8 @@ def test_what_is_wrong_with_a_grid_is_one_line_without_dask_too(job, no_dask, ca
 
 
 def test_bench_says_what_to_install(tmp_path, no_dask, capsys) -> None:
-    options = ["--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out"), "--scheduler", "local"]
-    assert load_cli().run(["bench", "quick", *options]) == 2
+    options = ["table1", "--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out"), "--scheduler", "local"]
+    assert tables_command.run(options) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "pip install 'phyradgs-cl[cluster]'" in error
 

@@ -6,8 +6,8 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from phyradgs_cl.bench.results import Line
 from phyradgs_cl.errors import InputError
+from tables.results import Line
 
 _CHUNK_BYTES = 1 << 20
 

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.bench.case import Case
-from phyradgs_cl.bench.figures import truth_of, write_slices
-from phyradgs_cl.bench.job import PHANTOM, BenchJob, PlannedRun, Report
-from phyradgs_cl.bench.pseudo_truth import PseudoTruth
-from phyradgs_cl.bench.results import Line, Present
-from phyradgs_cl.bench.run import Batch, Work, complete_bench, make_case, one_run, reference_lines
 from phyradgs_cl.cluster import Lost, Pool, PoolState, Workers, runtime_of_process
 from phyradgs_cl.io import only_run
 from phyradgs_cl.reconstructors import ignore_progress
 from phyradgs_cl.runtime import Runtime
+from tables.case import Case
+from tables.figures import truth_of, write_slices
+from tables.job import PHANTOM, BenchJob, PlannedRun, Report
+from tables.pseudo_truth import PseudoTruth
+from tables.results import Line, Present
+from tables.run import Batch, Work, complete_bench, make_case, one_run, reference_lines
 
 _LONGEST_WAIT_S = 86_400.0
 

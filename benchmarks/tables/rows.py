@@ -13,7 +13,7 @@ from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 
 _MOST_NEURAL_VOXELS = 128  # a side, on a CPU: beyond it a run takes hours
-KINDS = ("table1", "table2", "phantom", "quick")
+KINDS = ("table1", "table2", "phantom")
 
 
 @dataclass(frozen=True)
@@ -156,16 +156,12 @@ def rows_of(kind: str) -> tuple[Row, ...]:
     """The rows of a table, in order."""
     if kind not in KINDS:
         raise InputError("benchmark", repr(kind), f"one of {', '.join(KINDS)}")
-    if kind == "quick":
-        wanted = ("FDK", "ASD-POCS", "ASD-POCS per-row", "R2-Gaussian", "PhyRadGS w/o ST", "PhyRadGS")
-        return tuple(row for row in _table1() if row.label in wanted)
     return _table2() if kind == "table2" else _table1()
 
 
 def candidate_rows(kind: str) -> tuple[Row, ...]:
-    """Every row that a kind may have: a quick run may take any of table 1; extras stand at the end."""
-    rows = _table1() if kind == "quick" else rows_of(kind)
-    return (*rows, *(() if kind == "table2" else _extras()))
+    """Every row that a kind may have; extras stand at the end."""
+    return (*rows_of(kind), *(() if kind == "table2" else _extras()))
 
 
 def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:

@@ -11,21 +11,21 @@ from typing import Any
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.acquisition.shutter import AXES
-from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.identity import content_hash
-from phyradgs_cl.bench.results import Line
-from phyradgs_cl.bench.rows import Row, candidate_rows, choose_rows, rows_of
-from phyradgs_cl.bench.sizes import BenchSize, bench_size
-from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from tables.case import FLY, STILL
+from tables.identity import content_hash
+from tables.results import Line
+from tables.rows import Row, candidate_rows, choose_rows, rows_of
+from tables.sizes import BenchSize, bench_size
+from tables.volumes import find_volumes
 
 SYNTHETIC, PHANTOM = "synthetic", "phantom"
 BUILT_IN = ("foot", "jaw")
 SPHERES = "spheres"
-_DEFAULT_SIZES = {"table1": "S", "table2": "S", "phantom": "M", "quick": "XS"}
+_DEFAULT_SIZES = {"table1": "S", "table2": "S", "phantom": "M"}
 _FLY_PROTOCOLS = tuple(name for name, protocol in PROTOCOLS.items() if protocol.is_fly)
 
 
@@ -34,11 +34,11 @@ class BenchJob:
     """Which table, of which volumes, at which size.
 
     Args:
-        kind: table1, table2, phantom or quick.
+        kind: table1, table2 or phantom.
         output: folder of the results file, tables, figures and slices; made where it is missing.
         volumes: folder of HDF5 volumes; the built-in phantoms foot and jaw without it. Not for phantom.
         size: XS, S, M, L, XL or a size of one's own; by default the kind's.
-        names: volumes by name; all by default, the first two for quick.
+        names: volumes by name; all by default.
         protocols: rapid (25 views), standard (50); by default both for table1, rapid for the others.
         rows: labels of rows; all of the table by default.
         seeds: of noise, jitter, cloud and frame order.
@@ -130,9 +130,7 @@ class BenchJob:
         if self.kind == "phantom":
             return {SPHERES: None}
         if self.volumes is not None:
-            found = find_volumes(self.volumes, self.names, self.bench_size.voxels)
-            short = self.kind == "quick" and not self.names
-            return dict(list(found.items())[:2]) if short else dict(found)
+            return dict(find_volumes(self.volumes, self.names, self.bench_size.voxels))
         for name in self.names or ():
             checks.one_of("--names (without --volumes)", name, BUILT_IN)
         return dict.fromkeys(self.names or BUILT_IN)

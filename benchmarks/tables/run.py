@@ -14,15 +14,6 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
-from phyradgs_cl.bench.case import Case, SyntheticCase
-from phyradgs_cl.bench.figures import truth_of, write_figures, write_slices
-from phyradgs_cl.bench.identity import refuse_other_objects
-from phyradgs_cl.bench.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
-from phyradgs_cl.bench.phantom_case import PhantomCase
-from phyradgs_cl.bench.pseudo_truth import PseudoTruth, refuse_interrupted
-from phyradgs_cl.bench.results import Line, Present, append_line, read_lines, refuse_irregular
-from phyradgs_cl.bench.summary import REFERENCE
-from phyradgs_cl.bench.tables import write_tables
 from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind, load_attenuation, only_run
@@ -32,6 +23,15 @@ from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.environment import environment
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
+from tables.case import Case, SyntheticCase
+from tables.figures import truth_of, write_figures, write_slices
+from tables.identity import refuse_other_objects
+from tables.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
+from tables.phantom_case import PhantomCase
+from tables.pseudo_truth import PseudoTruth, refuse_interrupted
+from tables.results import Line, Present, append_line, read_lines, refuse_irregular
+from tables.summary import REFERENCE
+from tables.tables import write_tables
 
 RESULTS = "results.jsonl"
 # R2-Gaussian's scanner: distances and sides in scene units

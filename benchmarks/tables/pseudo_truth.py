@@ -8,15 +8,15 @@ from dataclasses import asdict
 import numpy as np
 
 from phyradgs_cl.acquisition import PROTOCOLS
-from phyradgs_cl.bench.job import BenchJob, plain
-from phyradgs_cl.bench.phantom_case import PSEUDO, PSEUDO_VIEWS, PhantomCase
-from phyradgs_cl.bench.rows import Row
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, reconstruct
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.runtime import Runtime
+from tables.job import BenchJob, plain
+from tables.phantom_case import PSEUDO, PSEUDO_VIEWS, PhantomCase
+from tables.rows import Row
 
 
 class PseudoTruth:

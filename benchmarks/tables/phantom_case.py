@@ -12,9 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
-from phyradgs_cl.bench.case import FLY, HeldOutViews, Images, Measure, standing
-from phyradgs_cl.bench.raw_counts import Panel, measured_attenuation
-from phyradgs_cl.bench.sizes import BenchSize
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_scanner, with_detector_count
 from phyradgs_cl.metrics import Ball, compare, edge_sharpness, regional_bias, roundness
@@ -22,6 +19,9 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, sphere_phantom
 from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+from tables.case import FLY, HeldOutViews, Images, Measure, standing
+from tables.raw_counts import Panel, measured_attenuation
+from tables.sizes import BenchSize
 
 PSEUDO = "pseudo-truth"
 PSEUDO_VIEWS = 64

@@ -8,15 +8,15 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.job import PHANTOM, SYNTHETIC, BenchJob
-from phyradgs_cl.bench.markdown import markdown
-from phyradgs_cl.bench.published import published
-from phyradgs_cl.bench.results import Line
-from phyradgs_cl.bench.rows import Row
-from phyradgs_cl.bench.summary import Summary, lines_of, lines_of_run, summarise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import written_beside
+from tables.case import FLY, STILL
+from tables.job import PHANTOM, SYNTHETIC, BenchJob
+from tables.markdown import markdown
+from tables.published import published
+from tables.results import Line
+from tables.rows import Row
+from tables.summary import Summary, lines_of, lines_of_run, summarise
 
 log = logging.getLogger(__name__)
 METRICS = (

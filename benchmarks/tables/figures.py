@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl.bench.case import FLY, Images
-from phyradgs_cl.bench.job import BenchJob
-from phyradgs_cl.bench.results import Line, key_of
-from phyradgs_cl.bench.summary import lines_of
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import written_beside
 from phyradgs_cl.metrics import panels_png
+from tables.case import FLY, Images
+from tables.job import BenchJob
+from tables.results import Line, key_of
+from tables.summary import lines_of
 
 log = logging.getLogger(__name__)
 _TRUTH = {"run": "truth", "acquisition": None, "protocol": None, "seed": None, "iterations": None}

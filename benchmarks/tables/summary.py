@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.bench.job import BenchJob
-from phyradgs_cl.bench.results import Line
+from tables.job import BenchJob
+from tables.results import Line
 
 REFERENCE = "reference"  # the acquisition of lines about the truth and the pseudo-truth
 

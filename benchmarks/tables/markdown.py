@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.gains import Gain, gain_over_static
-from phyradgs_cl.bench.job import PHANTOM, BenchJob
-from phyradgs_cl.bench.published import published
-from phyradgs_cl.bench.results import Line
-from phyradgs_cl.bench.rows import Row
-from phyradgs_cl.bench.summary import REFERENCE, Summary, lines_of_run, summarise
+from tables.case import FLY, STILL
+from tables.gains import Gain, gain_over_static
+from tables.job import PHANTOM, BenchJob
+from tables.published import published
+from tables.results import Line
+from tables.rows import Row
+from tables.summary import REFERENCE, Summary, lines_of_run, summarise
 
 Cell = Callable[[Summary], str]
 
@@ -39,7 +39,6 @@ _TITLES = {
     "table1": "Table 1, methods",
     "table2": "Table 2, strips M and sub-intervals N",
     "phantom": "Sphere phantom",
-    "quick": "Quick comparison",
 }
 
 

@@ -1,11 +1,11 @@
 """Benchmarks: volumes × methods × protocols to a results file, tables and figures; resumable at any run."""
 
-from phyradgs_cl.bench.at_workers import run_bench_at_workers
-from phyradgs_cl.bench.job import BenchJob, BenchProgress, plan_runs
-from phyradgs_cl.bench.rows import KINDS, Row, choose_rows, rows_of
-from phyradgs_cl.bench.run import RESULTS, remake_tables, run_bench
-from phyradgs_cl.bench.sizes import SIZES, BenchSize
-from phyradgs_cl.bench.words import listed, listed_seeds, result_text
+from tables.job import BenchJob, BenchProgress, plan_runs
+from tables.rows import KINDS, Row, choose_rows, rows_of
+from tables.run import RESULTS, remake_tables, run_bench
+from tables.sizes import SIZES, BenchSize
+from tables.words import listed, listed_seeds, result_text
+from tables.workers import run_bench_at_workers
 
 __all__ = [
     "KINDS",

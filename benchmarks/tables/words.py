@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from phyradgs_cl.bench.job import BenchProgress
 from phyradgs_cl.errors import InputError
+from tables.job import BenchProgress
 
 
 def listed(option: str, text: str | None) -> list[str] | None:

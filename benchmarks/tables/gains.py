@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.bench.case import FLY, STILL
-from phyradgs_cl.bench.results import Line
-from phyradgs_cl.bench.rows import Row
-from phyradgs_cl.bench.summary import Summary, lines_of_run, summarise
+from tables.case import FLY, STILL
+from tables.results import Line
+from tables.rows import Row
+from tables.summary import Summary, lines_of_run, summarise
 
 
 @dataclass(frozen=True)
