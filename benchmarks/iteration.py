@@ -63,7 +63,7 @@ def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
 def control_ms(run: SplatRun) -> float:
     """One round of density control, which leaves the run with another cloud."""
     started = time.perf_counter()
-    run._control_density()
+    run.control_density()
     run.rt.finish()
     return 1e3 * (time.perf_counter() - started)
 

@@ -31,27 +31,18 @@ class Scale:
 
 
 class DeviceFrames:
-    """The scan on the device: time cells, measurement in internal units and mask of every frame.
+    """The scan on the device: time cells, measurement in internal units and mask of every frame."""
 
-    With ``keeps_frames`` false the measurements stay on the host, and ``get`` copies one at a time.
-    """
-
-    def __init__(
-        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, keeps_frames: bool = True
-    ) -> None:
-        self.rt, self.count = rt, scan.frames
+    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
+        self.count = scan.frames
         by_column = scan.shutter.axis == "columns"
         rows, columns = scan.geometry.detector_shape
         self.lines, self.width = (columns, rows) if by_column else (rows, columns)
         tables, merges = cells_of_scan(scan, options)
-        tables = [scaled_cells(table, 1 / scale.length_mm) for table in tables]
-        self._tables = tables
-        self._cells = [DeviceCells.upload(rt, table) for table in tables]
-        self._parts: dict[tuple[int, int, int], DeviceCells] = {}
+        self._cells = [DeviceCells.upload(rt, scaled_cells(table, 1 / scale.length_mm)) for table in tables]
         self.intensity_unit = scale.line_integral if merges else None
-        self._line_integral, self._by_column = np.float32(scale.line_integral), by_column
-        self._frames = scan.projections
-        self._measured = [rt.upload(self._internal(f)) for f in range(scan.frames)] if keeps_frames else []
+        measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
+        self._measured = [rt.upload(pad_rows(m.T if by_column else m)) for m in measured]
         self._mask, self._pixels = _upload_masks(rt, scan, by_column)
         self._transmission: list[DeviceArray] = []
         if options.poisson_weight > 0:
@@ -59,21 +50,9 @@ class DeviceFrames:
             trust = transmission_weights(scan.projections, valid)
             self._transmission = [rt.upload(pad_rows(t.T if by_column else t)) for t in trust]
 
-    def _internal(self, frame: int) -> np.ndarray:
-        """A frame in internal units, lines first, padded."""
-        image = self._frames[frame] / self._line_integral
-        return pad_rows(image.T if self._by_column else image)
-
     def cells(self, frame: int) -> DeviceCells:
         """The time cells of a frame."""
         return self._cells[frame]
-
-    def part(self, frame: int, lines: range) -> DeviceCells:
-        """The cells of a frame as far as they serve ``lines``."""
-        key = frame, lines.start, lines.stop
-        if key not in self._parts:
-            self._parts[key] = DeviceCells.upload(self.rt, cells_within(self._tables[frame], lines))
-        return self._parts[key]
 
     def transmission(self, frame: int) -> DeviceArray | None:
         """Weights of the Poisson term, where it counts."""
@@ -86,8 +65,7 @@ class DeviceFrames:
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
         shared = frame if len(self._mask) > 1 else 0
-        measured = self._measured[frame] if self._measured else self.rt.upload(self._internal(frame))
-        return self._cells[frame], measured, self._mask[shared], self._pixels[shared]
+        return self._cells[frame], self._measured[frame], self._mask[shared], self._pixels[shared]
 
 
 def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], bool]:
@@ -114,15 +92,3 @@ def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
     """The same cells with all lengths multiplied by ``factor``."""
     ends = None if table.end_poses is None else table.end_poses * factor
     return replace(table, pose=table.pose * factor, end_poses=ends)
-
-
-def cells_within(table: TimeCells, lines: range) -> TimeCells:
-    """The cells that serve any of ``lines``, and only those lines; at least one cell, which may serve none."""
-    start = np.clip(table.line_start, lines.start, lines.stop)
-    stop = np.clip(table.line_stop, lines.start, lines.stop)
-    kept = np.flatnonzero(stop > start)
-    kept = kept if kept.size else np.zeros(1, np.int64)
-    names = ("pose", "time_s", "weight", "end_poses", "line_times")
-    arrays = {name: getattr(table, name) for name in names}
-    some = {name: None if values is None else values[kept] for name, values in arrays.items()}
-    return replace(table, line_start=start[kept], line_stop=np.maximum(stop, start)[kept], **some)

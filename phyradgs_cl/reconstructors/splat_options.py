@@ -12,7 +12,6 @@ from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 
-SPLITS = ("frames", "domain")
 _WEIGHT = (0, 1e6)
 _RANGES = {
     "ssim_weight": _WEIGHT,
@@ -45,9 +44,7 @@ class SplatOptions:
     what the scan says. ``pixel_footprint`` lets pixels average over their area.
 
     ``iterations`` counts frames: a step of Adam is taken every ``batch`` of them (0: as many as there are ranks), with
-    rates × √batch. ``split`` says what ranks share out: ``frames``, every rank with all Gaussians, or the ``domain``, every
-    rank with its own. ``parts``: into how many parts a frame's lines, or the Gaussians, are cut for that (0: as many as
-    there are ranks for them); the same batch and parts give the same bits on any number of ranks (docs/cluster.md).
+    rates × √batch. The same batch gives the same bits on any number of ranks (docs/cluster.md).
     """
 
     motion: Motion = Motion("exact")
@@ -74,8 +71,6 @@ class SplatOptions:
     scale_min_voxels: float = 0.0
     scale_max: float = 1.0
     batch: int = 0
-    split: str = "frames"
-    parts: int = 0
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
 
@@ -83,8 +78,6 @@ class SplatOptions:
         checks.within("--iterations", self.iterations, 0, 1_000_000_000)
         checks.within("--gaussians (0 chooses from the grid)", self.gaussians, 0, 100_000_000)
         checks.within("--batch (0: as many as ranks)", self.batch, 0, 1_000_000)
-        checks.one_of("--split", self.split, SPLITS)
-        checks.within("--parts (0: as many as ranks)", self.parts, 0, 1_000_000)
         checks.fields_within("", self, _RANGES)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         if self.scale_max <= self.scale_min:
@@ -105,10 +98,10 @@ class SplatOptions:
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Frames a step: as asked, else one for every rank that has work of its own, none twice."""
+        """Frames per step: as asked, else one for every rank, none twice."""
         if self.batch > frames:
             raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
-        return self.batch or (min(ranks, frames) if self.split == "frames" else 1)
+        return self.batch or min(ranks, frames)
 
     @property
     def asks_for_gaussians(self) -> bool:

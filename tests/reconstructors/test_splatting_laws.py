@@ -17,7 +17,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import splat_run
+from phyradgs_cl.reconstructors import splatting
 from phyradgs_cl.reconstructors.phyradgs import phyradgs
 from phyradgs_cl.reconstructors.r2 import r2
 from phyradgs_cl.reconstructors.result import Progress
@@ -119,7 +119,7 @@ def test_the_cloud_is_the_volume(rt, scan) -> None:
 @pytest.mark.parametrize("how", ["a report that raises", "a signal"])
 def test_ctrl_c_keeps_what_there_is_and_can_go_on(rt, scan, monkeypatch, how) -> None:
     """Stopped after 8 of 30 iterations; resumed from there, the volume is that of an undisturbed run, bit for bit."""
-    monkeypatch.setattr(splat_run, "REPORT_EVERY", 4)
+    monkeypatch.setattr(splatting, "REPORT_EVERY", 4)
     seen: list[int] = []
 
     def stop_at_8(progress: Progress) -> None:

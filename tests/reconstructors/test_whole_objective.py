@@ -97,11 +97,11 @@ def test_gradient_of_everything(rt, make_cloud, finite_differences, axis) -> Non
     population = Population(raw, np.zeros((2, *raw.shape)))
     run = SplatRun(rt, scan, OPTIONS, UNIT, population, np.random.default_rng(SEED))
     run.step()
-    assert run.objective.loss.value() == pytest.approx(image_term(raw), rel=WHOLE_VALUE)
-    found = rt.download(run.clouds[0].gradients)[:11, :COUNT]
+    assert run.measures()["loss"] == pytest.approx(image_term(raw), rel=WHOLE_VALUE)
+    found = rt.download(run.cloud.gradients)[:11, :COUNT]
     expected = finite_differences(objective, raw, FINITE_DIFFERENCE_STEP)
     for name, part in {"mean": MEAN, "scale": SCALE, "quaternion": QUATERNION, "density": DENSITY}.items():
         error = np.linalg.norm(found[part] - expected[part]) / np.linalg.norm(expected[part])
         assert error <= WHOLE_GRADIENT, name
-    moved = rt.download(run.clouds[0].raw)[:, :COUNT] - raw
+    moved = rt.download(run.cloud.raw)[:, :COUNT] - raw
     np.testing.assert_array_equal(np.sign(moved[MEAN]), -np.sign(expected[MEAN]))  # and it goes downhill
