@@ -12,7 +12,7 @@ from skimage.transform import resize_local_mean
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, pixel_centres
-from phyradgs_cl.acquisition.cells import TimeCells, finer_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
@@ -182,7 +182,7 @@ class PixelAreaSource:
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
         n = self._samples
-        fine = self._finer.frame(finer_cells(cells, n), model, factor)
+        fine = self._finer.frame(cells.finer(n), model, factor)
         rows, columns = fine.shape[0] // n, fine.shape[1] // n
         rays = fine.reshape(rows, n, columns, n).transpose(1, 3, 0, 2).reshape(n * n, rows, columns)
         return average(rays, np.full(n * n, 1 / n**2), model).astype(np.float32)

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
+from phyradgs_cl.acquisition.cells import TimeCells
 
 
 def layers(table: TimeCells) -> list[TimeCells]:
     """The cells of a frame in tables in which no line has more than one; cells sorted by line stay so."""
-    numbers = layer_numbers(table)
+    numbers = table.layer_numbers
     return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers, layer_weights
+from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
@@ -115,10 +115,9 @@ class DeviceCells:
             times = np.zeros((table.count, 3, pitch_of(table.lines)), np.float32)
             times[:, :, : table.lines] = table.line_times
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
-        numbers = layer_numbers(table)
-        weights = layer_weights(table, numbers)
+        weights = table.layer_weights
         return cls(
-            cells=rt.upload(cell_constants(pose, table.weight, numbers)),
+            cells=rt.upload(cell_constants(pose, table.weight, table.layer_numbers)),
             matrices=split_coefficients(rt, projection_matrices(poses)),
             cell_lines=rt.upload(ranges),
             line_cells=rt.upload(cells_of_lines(ranges, table.lines)),
@@ -127,7 +126,7 @@ class DeviceCells:
             count=table.count,
             lines=table.lines,
             layers=len(weights),
-            moving=table.end_poses is not None,
+            moving=table.is_moving,
         )
 
 

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import ClassVar
 from typing import Protocol as Interface
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition.motion import STILL, check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.checked_state import check_like, count_of
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
 from phyradgs_cl.reconstructors.system import System, norm
 from phyradgs_cl.runtime import Runtime
 
@@ -40,7 +40,9 @@ class IterativeOptions:
     transmission_weights: ClassVar[bool] = False
     """Weigh pixels by their transmission; methods that can have an option of this name."""
 
-    motion: Motion = Motion("static")
+    MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
+
+    motion: Motion = Static()
     iterations: int = 20
     nonnegative: bool = True
     tolerance: float = 0.0
@@ -50,9 +52,7 @@ class IterativeOptions:
         checks.within("iterations", self.iterations, 0, MOST_ITERATIONS)
         checks.within("tolerance", self.tolerance, 0, 1)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
-        if self.motion.name == "exact":
-            expected = "static, static-start, micro-views or per-row: exact moves splats, and rays have none"
-            raise InputError("--motion", "'exact'", expected, "take --motion per-row")
+        check_motion(self.motion, self.MOTIONS)
 
 
 class Algorithm(Interface):
@@ -96,7 +96,7 @@ def run_iterations(
     loop.run(resume)
     facts: dict[str, object] = {
         "method": method,
-        "options": asdict(options),
+        "options": option_facts(options),
         "detector_model": "log" if system.intensity is None else "intensity",
         "iterations": run.iteration,
         "stopped_by": loop.stopped_by,

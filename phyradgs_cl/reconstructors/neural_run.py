@@ -6,7 +6,6 @@ The one place where the scan, the field and its training meet; PyTorch is import
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,13 @@ from phyradgs_cl.neural import NeuralOptions, require_torch
 from phyradgs_cl.reconstructors.checked_state import check_array, count_of, restore_generator
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, state_arrays
+from phyradgs_cl.reconstructors.result import (
+    ProgressReport,
+    Reconstruction,
+    State,
+    option_facts,
+    state_arrays,
+)
 from phyradgs_cl.reconstructors.splat_start import internal_scale
 from phyradgs_cl.runtime import Runtime
 
@@ -54,7 +59,7 @@ def reconstruct_neural(
     loop.run(resume)
     facts: dict[str, object] = {
         "method": method,
-        "options": asdict(options),
+        "options": option_facts(options),
         "seed": seed,
         "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition import Exact, Scan, TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators import DeviceCells
 from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
-from phyradgs_cl.reconstructors.system import averages
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _PEAK_PERCENTILE = 99.9  # noise has peaks of its own
@@ -39,7 +38,7 @@ class DeviceFrames:
         rows, columns = scan.geometry.detector_shape
         self.lines, self.width = (columns, rows) if by_column else (rows, columns)
         tables, merges = cells_of_scan(scan, options)
-        self._cells = [DeviceCells.upload(rt, scaled_cells(table, 1 / scale.length_mm)) for table in tables]
+        self._cells = [DeviceCells.upload(rt, table.scaled(1 / scale.length_mm)) for table in tables]
         self.intensity_unit = scale.line_integral if merges else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
         self._measured = [rt.upload(pad_rows(m.T if by_column else m)) for m in measured]
@@ -72,9 +71,12 @@ def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], b
     """The time cells of every frame, in mm, and whether the detector merges intensities of several."""
     model = scan.detector_model if options.detector_model == "scan" else options.detector_model
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
-    tables = [options.motion.cells(scan, frame, peak) for frame in range(scan.frames)]
+    cells, motion = options.motion.cells, options.motion
+    if isinstance(motion, Exact):
+        cells = partial(motion.cells, intensity_peak=peak)
+    tables = [cells(scan, frame) for frame in range(scan.frames)]
     # of one value both models are the mean
-    return tables, model == "intensity" and any(averages(table) for table in tables)
+    return tables, model == "intensity" and any(table.averages for table in tables)
 
 
 def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:
@@ -86,9 +88,3 @@ def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[Device
         masks = [(m == 0).astype(np.float32) for m in stack]
     arrays = [rt.upload(pad_rows(m.T if by_column else m)) for m in masks]
     return arrays, [float(m.sum()) for m in masks]
-
-
-def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
-    """The same cells with all lengths multiplied by ``factor``."""
-    ends = None if table.end_poses is None else table.end_poses * factor
-    return replace(table, pose=table.pose * factor, end_poses=ends)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Static, StaticStart
+from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
@@ -47,7 +49,9 @@ class SplatOptions:
     rates × √batch. The same batch gives the same bits on any number of ranks (docs/cluster.md).
     """
 
-    motion: Motion = Motion("exact")
+    MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), StaticStart(), MicroViews(), Exact())
+
+    motion: Motion = Exact()
     affine: bool = False
     detector_model: str = "scan"
     pixel_footprint: bool = False
@@ -82,8 +86,7 @@ class SplatOptions:
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         if self.scale_max <= self.scale_min:
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
-        if self.motion.name == "per-row":
-            raise InputError("--motion", "'per-row'", "static, static-start, micro-views or exact")
+        check_motion(self.motion, self.MOTIONS)
 
     def activation(self, grid: Grid) -> Activation:
         """Bounds of the scales on ``grid`` (in internal units)."""
@@ -108,13 +111,10 @@ class SplatOptions:
         """Whether the size of the first cloud is somebody's own wish and not a preset's."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
-    def as_dict(self) -> dict[str, object]:
-        return asdict(self)
-
 
 PUBLISHED_CONTROL = DensityControl(threshold=5e-5, prune_aspect=0.0)
 _PAPER = SplatOptions(
-    motion=Motion("micro-views", 8, 5),
+    motion=MicroViews(8, 5),
     gaussians=50_000,
     iterations=20_000,
     rates=PUBLISHED_RATES,
@@ -123,7 +123,7 @@ _PAPER = SplatOptions(
 _RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 # a sixth of the iterations with everything at the same share of them, and two or three segments a frame
 _QUICK = SplatOptions(
-    motion=Motion("exact", time_error=0.02),
+    motion=Exact(time_error=0.02),
     iterations=500,
     parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
@@ -132,7 +132,7 @@ _QUICK = SplatOptions(
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER, "released": _RELEASED}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
-    motion=Motion("static"),
+    motion=Static(),
     affine=True,
     gaussians=50_000,
     ssim_weight=0.25,

@@ -10,6 +10,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import SplatProjector, Voxeliser
+from phyradgs_cl.operators.splat import DEFAULT_TIME_ERROR
 from phyradgs_cl.optim import DeviceAdam
 from phyradgs_cl.reconstructors.splat_cloud import DeviceCloud
 from phyradgs_cl.reconstructors.splat_frames import DeviceFrames, Scale
@@ -44,7 +45,7 @@ class FrameStep:
             width,
             affine=options.affine,
             cutoff_sigma=options.cutoff_sigma,
-            time_error=options.motion.time_error,
+            time_error=getattr(options.motion, "time_error", DEFAULT_TIME_ERROR),
             pixel_footprint=options.pixel_footprint,
             intensity_unit=self.frames.intensity_unit,
         )

@@ -11,12 +11,12 @@ import time
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Exact, Scan
 from phyradgs_cl.operators.splat_count import Work
 from phyradgs_cl.optim import Population
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
 from phyradgs_cl.reconstructors.splat_frames import Scale
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splat_run import SplatRun
@@ -55,7 +55,7 @@ def reconstruct_splats(
     volume = run.present_volume()[0]
     facts = {
         "method": method,
-        "options": options.as_dict(),
+        "options": option_facts(options),
         "seed": seed,
         "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm,
@@ -70,7 +70,7 @@ def reconstruct_splats(
         "batch": run.batch,
         "ranks": rt.ranks.size,
     }
-    if options.motion.name == "exact":
+    if isinstance(options.motion, Exact):
         facts |= time_facts(run)
     if rt.profile:
         facts["evaluated_pairs"] = evaluated_pairs(run)

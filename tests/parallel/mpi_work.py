@@ -10,7 +10,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from phyradgs_cl.acquisition import Motion, Scan  # noqa: E402
+from phyradgs_cl.acquisition import Exact, MicroViews, Scan  # noqa: E402
 from phyradgs_cl.api import load_scan, reconstruct  # noqa: E402
 from phyradgs_cl.optim import DensityControl  # noqa: E402
 from phyradgs_cl.parallel import launched_ranks  # noqa: E402
@@ -23,11 +23,11 @@ from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 CONTROL = DensityControl(every=6, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(
-    motion=Motion("micro-views", 4, 2), iterations=21, gaussians=300, tv_edge=8, control=CONTROL
+    motion=MicroViews(4, 2), iterations=21, gaussians=300, tv_edge=8, control=CONTROL
 )
 SPLATS = {
     "micro-views": replace(OPTIONS, batch=4),
-    "exact": replace(OPTIONS, batch=4, motion=Motion("exact")),
+    "exact": replace(OPTIONS, batch=4, motion=Exact()),
 }
 VOXELS = {
     "sirt": {"iterations": 5, "motion": "per-row"},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tolerances import RANK_GRADIENT, RANK_VOLUME
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, Protocol, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.optim import DensityControl
@@ -23,11 +23,11 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 CONTROL = DensityControl(every=6, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(
-    motion=Motion("micro-views", 4, 2), iterations=21, gaussians=300, tv_edge=8, batch=4, control=CONTROL
+    motion=MicroViews(4, 2), iterations=21, gaussians=300, tv_edge=8, batch=4, control=CONTROL
 )
 DIVIDED = {
     "four frames per step": OPTIONS,
-    "exact in time": replace(OPTIONS, motion=Motion("exact")),
+    "exact in time": replace(OPTIONS, motion=Exact()),
     "intensities": replace(OPTIONS, detector_model="intensity"),
 }
 

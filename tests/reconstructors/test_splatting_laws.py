@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tolerances import CLOUD_VOLUME, FLOAT64, GAIN_LAW, SCALE_LAW
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, PerRow, Protocol, Scan, Static
 from phyradgs_cl.detector import attenuation_to_counts, counts_to_attenuation
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
@@ -26,7 +26,7 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(
-    motion=Motion("micro-views", 4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
+    motion=MicroViews(4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
 )
 STEADY = replace(OPTIONS, control=DensityControl(every=0))
 
@@ -90,7 +90,7 @@ def test_more_counts_make_the_same_volume(rt, scan, gain) -> None:
 
 def test_exact_motion_says_how_it_averaged(rt, scan) -> None:
     """Which rules served how many pairs, and K; with the same bits every time and a loss like that of micro-views."""
-    options = replace(OPTIONS, motion=Motion("exact", segments=3))
+    options = replace(OPTIONS, motion=Exact(segments=3))
     result = phyradgs(scan, options, rt)
     assert result.facts["segments"] == 3
     assert sum(result.facts["time_rules"].values()) == pytest.approx(1.0)
@@ -182,7 +182,7 @@ def test_r2_is_affine_and_static_unless_told(rt, scan) -> None:
 
 def test_motion_matters(rt, scan) -> None:
     static, moving = (
-        phyradgs(scan, replace(STEADY, motion=motion), rt, seed=1) for motion in (Motion("static"), Motion())
+        phyradgs(scan, replace(STEADY, motion=motion), rt, seed=1) for motion in (Static(), MicroViews())
     )
     assert difference(static.volume, moving.volume) > 0.01
 
@@ -192,7 +192,7 @@ def test_motion_matters(rt, scan) -> None:
     [
         ({"iterations": -1}, "--iterations"),
         ({"gaussians": -1}, "--gaussians"),
-        ({"motion": Motion("per-row")}, "--motion"),
+        ({"motion": PerRow()}, "--motion"),
     ],
 )
 def test_impossible_options_are_named(change, option) -> None:
