@@ -110,6 +110,13 @@ class TimeCells:
             raise InputError("--motion", "a line without a time cell", "weights of every line that sum to 1")
         return self.pose[cell[nearest[first]]]
 
+    def line_cells(self) -> np.ndarray:
+        """Per line the range (lines, 2) [first, stop) of cells outside of which none serves it; inside some may not."""
+        line = np.arange(self.lines)
+        first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
+        stop = np.searchsorted(self.line_start, line, side="right")
+        return np.stack([first, stop], -1)
+
     @cached_property
     def layer_numbers(self) -> np.ndarray:
         """A number (C,) for every cell, so that no line has two of one number; as few as its busiest line has cells."""

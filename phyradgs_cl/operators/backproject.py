@@ -13,9 +13,9 @@ import numpy as np
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
-from phyradgs_cl.operators.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 from phyradgs_cl.operators.rays import voxel_matrices
 from phyradgs_cl.runtime import DeviceArray, Room, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 
 _VIEWS_A_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28

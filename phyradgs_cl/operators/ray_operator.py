@@ -12,11 +12,11 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.cell_layers import averaged, layered
-from phyradgs_cl.operators.layout import pad_rows, unpad_rows
 from phyradgs_cl.operators.ray_memory import RayMemory
 from phyradgs_cl.operators.rays import RayCells, RayLayout, launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays_upright import launch_upright, upright_block
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 
 class LinearOperator(Interface):

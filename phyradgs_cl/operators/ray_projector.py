@@ -9,11 +9,11 @@ import numpy as np
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.layout import pad_rows, unpad_rows
 from phyradgs_cl.operators.ray_memory import RayMemory
 from phyradgs_cl.operators.ray_operator import RayOperator
 from phyradgs_cl.operators.rays import RayCells, RayLayout, launch_adjoint, launch_forward
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
+from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,9 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, whole
-from phyradgs_cl.operators.layout import GUARD, pitch_of, projection_matrices
+from phyradgs_cl.operators.layout import projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _RAY_CELL_FLOATS = 16
 BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
@@ -111,7 +112,7 @@ class RayCells:
         pose = np.concatenate([lines_first(table) for table in tables])
         weight = np.concatenate([table.weight for table in tables])
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
-        served = [serving(r, t.lines) + s for r, t, s in zip(ranges, tables, starts[:-1], strict=True)]
+        served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
         stride = int(starts[-1]) + _WIDEST
         matrices = np.zeros((12, stride))
         matrices[:, : starts[-1]] = voxel_matrices(pose, grid).T
@@ -219,17 +220,6 @@ def _defines(rt: Runtime, layout: RayLayout) -> dict[str, int]:
 def lines_first(table: TimeCells) -> np.ndarray:
     """Poses (C, 12) with the readout's lines as the slow axis of the image."""
     return transpose_pose(table.pose) if table.axis == "columns" else table.pose
-
-
-def serving(ranges: np.ndarray, lines: int) -> np.ndarray:
-    """For every line the range (lines, 2) [first, stop) of cells outside of which none serves it.
-
-    ranges (C, 2) are sorted by their first line; cells inside may still not serve the line.
-    """
-    line = np.arange(lines)
-    first = np.searchsorted(np.maximum.accumulate(ranges[:, 1]), line, side="right")
-    stop = np.searchsorted(ranges[:, 0], line, side="right")
-    return np.stack([first, stop], -1)
 
 
 def ray_constants(pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:

@@ -11,9 +11,9 @@ import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.layout import GUARD, pitch_of
 from phyradgs_cl.operators.rays import BORDER, RayCells, RayLayout, lines_first, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _LINES = 128  # of a detector column for a work-item
 _VOXELS = 512  # of a column of the volume that they may meet in one slice

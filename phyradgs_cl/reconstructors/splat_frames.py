@@ -10,9 +10,9 @@ import numpy as np
 from phyradgs_cl.acquisition import Exact, Scan, TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators import DeviceCells
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
 _PEAK_PERCENTILE = 99.9  # noise has peaks of its own
 

@@ -89,6 +89,17 @@ def test_a_line_s_pose_is_that_of_the_middle_of_its_exposure() -> None:
         replace(strips, line_stop=strips.line_start + 1).line_poses()
 
 
+def test_cells_that_serve_a_line() -> None:
+    """Sorted by first line, but of any length, with gaps and with lines that nothing serves."""
+    ranges = np.array([[1, 2], [1, 9], [2, 3], [4, 6], [10, 12], [10, 11]])
+    one = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, 14)
+    served = replace(one, line_start=ranges[:, 0], line_stop=ranges[:, 1], weight=np.ones(6)).line_cells()
+    for line, (first, stop) in enumerate(served):
+        inside = np.flatnonzero((ranges[:, 0] <= line) & (line < ranges[:, 1]))
+        assert all(first <= cell < stop for cell in inside)
+    assert served[0, 0] >= served[0, 1] and served[13, 0] >= served[13, 1]
+
+
 def test_cells_with_motion_are_for_splats() -> None:
     moving = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, 2)
     with pytest.raises(InputError, match="--motion: found cells with motion"):
