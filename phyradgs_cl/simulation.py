@@ -317,7 +317,7 @@ def _recorded(
 ) -> np.ndarray:
     """What the panel shows of frames (F, v, u): light, noise and lag; lines without light are 0 (and masked)."""
     share = shutter.lit_share(shutter.lines(frames.shape[1:]))
-    share = share[:, None] if shutter.axis == "rows" else share
+    share = shutter.readout.spread(share)
     recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
     return recorded if np.all(share > 0) else recorded * (share > 0)
 

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
@@ -58,6 +59,11 @@ class TimeCells:
         for start, stop, weight in zip(self.line_start, self.line_stop, self.weight, strict=True):
             total[start:stop] += weight
         return total
+
+    @property
+    def readout(self) -> Readout:
+        """How frames and poses turn to lines first."""
+        return Readout(self.axis)
 
     @property
     def is_moving(self) -> bool:

@@ -49,10 +49,9 @@ class Projector:
         self._length_mm = scan.grid.half_longest_mm  # the kernels' float32 likes lengths of order 1
         tables = [model.cells(scan, f).scaled(1 / self._length_mm) for f in chosen]
         self._cells = [DeviceCells.upload(rt, table) for table in tables]
-        self._by_row = scan.shutter.axis == "rows"
-        rows, columns = scan.geometry.detector_shape
-        self.frames_shape = (len(self._cells), rows, columns)
-        shape = (rows, columns) if self._by_row else (columns, rows)
+        self._readout, detector_shape = scan.shutter.readout, scan.geometry.detector_shape
+        self.frames_shape = (len(self._cells), *detector_shape)
+        shape = self._readout.shape(detector_shape)
         self._splat = SplatProjector(
             rt, *shape, affine=affine, cutoff_sigma=cutoff_sigma, time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR)
         )
@@ -65,7 +64,7 @@ class Projector:
         """The same of parameter rows (11, G); quaternions of any length."""
         inside, _ = self._internal(rows)
         frames = [self._splat.project(inside, cells) for cells in self._cells]
-        return np.stack([self._upright(frame) for frame in frames]) * np.float32(self._length_mm)
+        return np.stack([self._readout.frames(frame) for frame in frames]) * np.float32(self._length_mm)
 
     def rows_gradient(self, rows: np.ndarray, by_frames: np.ndarray) -> np.ndarray:
         """dL/drows (11, G) of rows (11, G) and dL/dframes (F, rows, columns)."""
@@ -73,7 +72,7 @@ class Projector:
         checks.shape("by_frames", by_frames, self.frames_shape)
         total = np.zeros(inside.shape)
         for cells, by_frame in zip(self._cells, by_frames, strict=True):
-            by_line = np.ascontiguousarray(self._upright(by_frame), np.float32)
+            by_line = np.ascontiguousarray(self._readout.frames(by_frame), np.float32)
             total += self._splat.project_adjoint(inside, cells, by_line * np.float32(self._length_mm))
         total[MEAN] /= self._length_mm
         total[SCALE] /= self._length_mm
@@ -93,10 +92,6 @@ class Projector:
         inside[SCALE] /= self._length_mm
         inside[QUATERNION] /= norms
         return inside, norms
-
-    def _upright(self, frame: np.ndarray) -> np.ndarray:
-        """Between (rows, columns) and the readout's lines as rows; its own inverse."""
-        return frame if self._by_row else frame.T
 
 
 class DensityOperator:

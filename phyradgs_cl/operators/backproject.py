@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
 from phyradgs_cl.operators.rays import voxel_matrices
@@ -50,8 +50,8 @@ def backproject_lines(
     counts with the rate at which it crosses lines: once for its angular step, and where the frames were filtered
     across lines (``axis`` columns) once more for the filter's scale (docs/mathematics.md).
     """
-    if axis == "columns":
-        frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
+    readout = Readout(axis)
+    frames, pose = readout.frames(frames), readout.poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(frames), -1)
     across = np.int32(axis == "columns")
     views = _Views(frames, matrices, weight)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pitch_of
 
@@ -78,11 +77,10 @@ class DeviceCells:
 
     @classmethod
     def upload(cls, rt: Runtime, table: TimeCells) -> DeviceCells:
-        pose = transpose_pose(table.pose) if table.axis == "columns" else table.pose
+        pose = table.readout.poses(table.pose)
         poses, times = pose, np.zeros(1, np.float32)
         if table.end_poses is not None and table.line_times is not None:
-            ends = transpose_pose(table.end_poses) if table.axis == "columns" else table.end_poses
-            poses = np.concatenate([pose[:, None], ends], 1).reshape(-1, pose.shape[1])
+            poses = np.concatenate([pose[:, None], table.readout.poses(table.end_poses)], 1).reshape(-1, pose.shape[1])
             times = np.zeros((table.count, 3, pitch_of(table.lines)), np.float32)
             times[:, :, : table.lines] = table.line_times
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)

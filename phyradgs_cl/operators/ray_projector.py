@@ -64,12 +64,12 @@ class RayProjector:
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
         image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]
-        return image if self.axis == "rows" else np.ascontiguousarray(image.T)
+        return np.ascontiguousarray(table.readout.frames(image))
 
     def adjoint(self, frame: np.ndarray, table: TimeCells, volume: DeviceArray, *, add: bool = False) -> None:
         """Aᵀ of ``forward`` with the log model: a frame (rows, columns) onto a padded volume."""
         self._check(table)
-        image = self.rt.upload(pad_rows(frame if self.axis == "rows" else frame.T))
+        image = self.rt.upload(pad_rows(table.readout.frames(frame)))
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_adjoint(self.rt, self._layout, cells, self._only, image, volume, add=add)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, whole
 from phyradgs_cl.operators.layout import projection_matrices
@@ -46,9 +46,7 @@ class RayLayout:
     @classmethod
     def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> RayLayout:
         """The whole grid, with the readout's lines as rows of the frames."""
-        rows, columns = detector_shape
-        lines, width = (rows, columns) if axis == "rows" else (columns, rows)
-        return cls(grid, lines, width, whole(grid.shape))
+        return cls(grid, *Readout(axis).shape(detector_shape), whole(grid.shape))
 
     def of(self, brick: Brick) -> RayLayout:
         """The same frames with another part of the grid."""
@@ -109,7 +107,7 @@ class RayCells:
     def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> RayCells:
         counts = np.array([table.count for table in tables])
         starts = np.concatenate([[0], np.cumsum(counts)])
-        pose = np.concatenate([lines_first(table) for table in tables])
+        pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weight = np.concatenate([table.weight for table in tables])
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
@@ -215,11 +213,6 @@ def _defines(rt: Runtime, layout: RayLayout) -> dict[str, int]:
         "RAY_VOXEL_ITEMS": int(rt.pixel_items),
         "RAY_LONG": int(layout.volume_floats >= _LONG_FROM),
     }
-
-
-def lines_first(table: TimeCells) -> np.ndarray:
-    """Poses (C, 12) with the readout's lines as the slow axis of the image."""
-    return transpose_pose(table.pose) if table.axis == "columns" else table.pose
 
 
 def ray_constants(pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:

@@ -34,20 +34,19 @@ class DeviceFrames:
 
     def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
         self.count = scan.frames
-        by_column = scan.shutter.axis == "columns"
-        rows, columns = scan.geometry.detector_shape
-        self.lines, self.width = (columns, rows) if by_column else (rows, columns)
+        readout = scan.shutter.readout
+        self.lines, self.width = readout.shape(scan.geometry.detector_shape)
         tables, merges = cells_of_scan(scan, options)
         self._cells = [DeviceCells.upload(rt, table.scaled(1 / scale.length_mm)) for table in tables]
         self.intensity_unit = scale.line_integral if merges else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
-        self._measured = [rt.upload(pad_rows(m.T if by_column else m)) for m in measured]
-        self._mask, self._pixels = _upload_masks(rt, scan, by_column)
+        self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
+        self._mask, self._pixels = _upload_masks(rt, scan)
         self._transmission: list[DeviceArray] = []
         if options.poisson_weight > 0:
             valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
             trust = transmission_weights(scan.projections, valid)
-            self._transmission = [rt.upload(pad_rows(t.T if by_column else t)) for t in trust]
+            self._transmission = [rt.upload(pad_rows(readout.frames(t))) for t in trust]
 
     def cells(self, frame: int) -> DeviceCells:
         """The time cells of a frame."""
@@ -79,12 +78,12 @@ def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], b
     return tables, model == "intensity" and any(table.averages for table in tables)
 
 
-def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:
+def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
     """Masks that are 1 where a pixel counts: one for all frames, or one a frame."""
     if scan.pixel_mask is None:
         masks = [np.ones(scan.geometry.detector_shape, np.float32)]
     else:
         stack = scan.pixel_mask if scan.pixel_mask.ndim == 3 else scan.pixel_mask[None]
         masks = [(m == 0).astype(np.float32) for m in stack]
-    arrays = [rt.upload(pad_rows(m.T if by_column else m)) for m in masks]
+    arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in masks]
     return arrays, [float(m.sum()) for m in masks]
