@@ -2,48 +2,79 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import importlib
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from phyradgs_cl import __version__, signals
-from phyradgs_cl.commands import (
-    bench,
-    check,
-    devices,
-    estimate,
-    evaluate,
-    export_volume,
-    import_scan,
-    info,
-    reconstruct,
-    report,
-    simulate,
-    sweep,
-    view,
-    watch,
-)
+from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, give_up_stdout, say, usage_text
+from phyradgs_cl.commands.help_panels import PanelledCommand
 from phyradgs_cl.commands.ranks import takes_part
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
-from phyradgs_cl.io.atomic import NO_SPACE
-from phyradgs_cl.reconstructors.interrupt import InterruptedAfterwards
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+HELP = {"help_option_names": ["-h", "--help"]}
+# by name: the module of commands/ that has NAME_command, and what it does
+COMMANDS = {
+    "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
+    "import": ("import_scan", "Turn the scan of another program into a scan file."),
+    "check": ("check", "Look for what is wrong or suspicious in a scan."),
+    "reconstruct": ("reconstruct", "Reconstruct a scan into a volume."),
+    "estimate": ("estimate", "Say what time and memory a reconstruction would take."),
+    "evaluate": ("evaluate", "Measure a volume against the truth."),
+    "report": ("report", "Write one HTML page about a reconstruction."),
+    "view": ("view", "Look at a volume in napari."),
+    "export": ("export_volume", "Write a volume for 3D Slicer, ImageJ, napari and others."),
+    "bench": ("bench", "Compare methods on volumes."),
+    "sweep": ("sweep", "Reconstruct many scans with many settings."),
+    "watch": ("watch", "Reconstruct the scans of a folder as they arrive."),
+    "info": ("info", "Say what a scan or volume file holds."),
+    "devices": ("devices", "List OpenCL devices, and say which one is taken."),
+}
 
 
 class Interrupted(Exception):
     """Ctrl-C on its way past Typer, with what is to be said about it."""
 
 
+class Loaded(Mapping[str, Any]):
+    """Typer's commands by name, each imported when it is asked for: what they need takes time."""
+
+    def __getitem__(self, name: str) -> Any:
+        module_name, told = COMMANDS[name]
+        module = importlib.import_module(f"phyradgs_cl.commands.{module_name}")
+        alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP)
+        alone.command(name, cls=PanelledCommand, short_help=told, epilog=module.EXAMPLE)(getattr(module, f"{name}_command"))
+        return typer.main.get_command(alone)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
 class Commands(TyperGroup):
     """The commands. Typer would end Ctrl-C without a word; here it is handed on under another name."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = Loaded()  # type: ignore[assignment]
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def format_commands(self, ctx: typer.Context, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, told) for name, (_, told) in COMMANDS.items()])
 
     def invoke(self, ctx: typer.Context) -> object:
         try:
             return super().invoke(ctx)
-        except InterruptedAfterwards:
+        except signals.InterruptedAfterwards:
             raise Interrupted(signals.COMPLETE) from None
         except KeyboardInterrupt:
             raise Interrupted(signals.farewell) from None
@@ -54,51 +85,12 @@ app = typer.Typer(
     cls=Commands,
     add_completion=True,
     rich_markup_mode=None,
+    context_settings=HELP,
     pretty_exceptions_enable=False,
     help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result. "
     "'phyradgs COMMAND --help' explains a command.\n\n"
     "Exit status: 0 done, 2 wrong input, 3 numbers that overflowed, 4 output not written, 5 no device or one that fails, "
     "6 out of memory, 10 suspicious (check), 130 interrupted, 143 terminated.",
-)
-app.command("simulate", short_help="Simulate a fly-scan of a phantom or a volume.", epilog=simulate.EXAMPLE)(
-    simulate.simulate_command
-)
-app.command(
-    "import", short_help="Turn the scan of another program into a scan file.", epilog=import_scan.EXAMPLE
-)(import_scan.import_command)
-app.command("check", short_help="Look for what is wrong or suspicious in a scan.", epilog=check.EXAMPLE)(
-    check.check_command
-)
-app.command("reconstruct", short_help="Reconstruct a scan into a volume.", epilog=reconstruct.EXAMPLE)(
-    reconstruct.reconstruct_command
-)
-app.command(
-    "estimate", short_help="Say what time and memory a reconstruction would take.", epilog=estimate.EXAMPLE
-)(estimate.estimate_command)
-app.command("evaluate", short_help="Measure a volume against the truth.", epilog=evaluate.EXAMPLE)(
-    evaluate.evaluate_command
-)
-app.command("report", short_help="Write one HTML page about a reconstruction.", epilog=report.EXAMPLE)(
-    report.report_command
-)
-app.command("view", short_help="Look at a volume in napari.", epilog=view.EXAMPLE)(view.view_command)
-app.command(
-    "export",
-    short_help="Write a volume for 3D Slicer, ImageJ, napari and others.",
-    epilog=export_volume.EXAMPLE,
-)(export_volume.export_command)
-app.command("bench", short_help="Compare methods on volumes.", epilog=bench.EXAMPLE)(bench.bench_command)
-app.command("sweep", short_help="Reconstruct many scans with many settings.", epilog=sweep.EXAMPLE)(
-    sweep.sweep_command
-)
-app.command("watch", short_help="Reconstruct the scans of a folder as they arrive.", epilog=watch.EXAMPLE)(
-    watch.watch_command
-)
-app.command("info", short_help="Say what a scan or volume file holds.", epilog=info.EXAMPLE)(
-    info.info_command
-)
-app.command("devices", short_help="List OpenCL devices, and say which one is taken.", epilog=devices.EXAMPLE)(
-    devices.devices_command
 )
 
 
@@ -107,6 +99,8 @@ def root(
     ctx: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False
 ) -> None:
     if version:
+        from phyradgs_cl import __version__
+
         say(f"phyradgs-cl {__version__}")
         raise typer.Exit
     if ctx.invoked_subcommand is None:
@@ -127,6 +121,8 @@ def run(arguments: list[str]) -> int:
     except _CLICK_ERROR as error:
         return complain(usage_text(error, arguments))
     except OSError as error:  # one that no reader or writer has named
+        from phyradgs_cl.io.atomic import NO_SPACE
+
         text = f"{error.filename or 'operating system'}: {error.strerror or error}"
         return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
     except SystemExit:  # Typer's answer to a reader of its help that has gone away, as in `| head`

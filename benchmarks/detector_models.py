@@ -26,6 +26,7 @@ from scans import append, read_lines
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
@@ -84,7 +85,7 @@ def effects() -> list[Effect]:
 def scene_of(rt: Runtime, name: str, pixel_samples: int) -> Scene:
     box = Grid.cube(VOXELS, 2.0)
     if name.endswith(".h5"):
-        return volume_scene(rt, name, GEOMETRY, box, VOXELS, "rows", pixel_samples)
+        return volume_scene(rt, load_attenuation(name), f"volume {name}", GEOMETRY, box, VOXELS, "rows", pixel_samples)
     return phantom_scene(rt, name, GEOMETRY, box, VOXELS, "rows", 0, pixel_samples)
 
 

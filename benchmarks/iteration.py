@@ -26,9 +26,9 @@ MOTIONS = {"static": Static(), "8x5": MicroViews(8, 5), "exact": Exact()}
 STAGES = {
     "prepare": ("splat_prepare",),
     "binning": ("bin_count", "bin_within", "bin_starts", "bin_fill"),  # the sub-volume of TV is binned too
-    "forward": ("splat_forward", "intensity_merge"),
+    "forward": ("splat_forward_rows", "intensity_merge"),
     "loss": ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient", "intensity_split"),
-    "backward": ("splat_backward", "splat_chain"),
+    "backward": ("splat_backward_rows", "splat_chain"),
     "tv": ("voxel_prepare", "voxel_forward", "total_variation", "voxel_backward", "voxel_chain"),
     "adam": ("activate", "chain_activations", "adam_step"),
 }

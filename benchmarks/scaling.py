@@ -26,7 +26,7 @@ from phyradgs_cl.runtime.layout import pad_rows
 GAUSSIANS, PIXELS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 500_000), (128, 256, 512, 1024)
 FIXED_GAUSSIANS, FIXED_PIXELS, VOXELS = 50_000, 256, 128
 FITTED_FROM = 10_000
-STEPS = {"forward": "splat_forward", "backward": "splat_backward", "voxelise": "voxel_forward"}
+STEPS = {"forward": "splat_forward_rows", "backward": "splat_backward_rows", "voxelise": "voxel_forward"}
 Step = Callable[[], dict[str, float]]
 
 

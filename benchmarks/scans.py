@@ -9,6 +9,7 @@ from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Protocol, Scan
 from phyradgs_cl.bench.case import FLY, SyntheticCase
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import volume_scene
 
@@ -25,7 +26,7 @@ def make_scan(
     """
     detector = 2 * size
     geometry = ConeGeometry(5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2)
-    scene = volume_scene(rt, str(path), geometry, Grid.cube(size, 2.0), size, "rows")
+    scene = volume_scene(rt, load_attenuation(path), f"volume {path}", geometry, Grid.cube(size, 2.0), size, "rows")
     return SyntheticCase(rt, scene, geometry, protocol, "rows", seed).scan(FLY)
 
 

@@ -72,8 +72,8 @@ def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[s
                 box, evaluated, footprints = projector.count_pairs(gaussians, cells)
                 result[name] = {"box_pairs": box, "evaluated_pairs": evaluated, "footprints": footprints}
                 continue
-            seconds[name]["forward"].append(kernels["splat_forward"])
-            seconds[name]["backward"].append(kernels["splat_backward"])
+            seconds[name]["forward"].append(kernels["splat_forward_rows"])
+            seconds[name]["backward"].append(kernels["splat_backward_rows"])
             seconds[name]["all"].append(sum(kernels.values()))
     for name, times in seconds.items():
         facts = result[name]

@@ -3,14 +3,12 @@
 #include "common/precise.h"
 #include "common/gradient.h"
 #include "common/splat.h"
+#include "common/splat_sums.h"
 
-#define SUMS 16
 #if MOVING
-#define SUM_COUNT 12
 #define TURNED 4 /* what the record keeps of S: (along, across) by (u, v) */
 #define POSES 3
 #else
-#define SUM_COUNT 10
 #define TURNED 0
 #define POSES 1
 #endif
@@ -55,14 +53,9 @@ __kernel void splat_chain(
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
-    __global const float *g = gaussians + first;
-    const v3 mean = v3_make(V_LOAD(g), V_LOAD(g + stride), V_LOAD(g + 2 * stride));
-    const v3 scale = v3_make(V_LOAD(g + 3 * stride), V_LOAD(g + 4 * stride), V_LOAD(g + 5 * stride));
-    const vf qw = V_LOAD(g + 6 * stride), qx = V_LOAD(g + 7 * stride);
-    const vf qy = V_LOAD(g + 8 * stride), qz = V_LOAD(g + 9 * stride);
-    const frame3 axes = quaternion_frame(qw, qx, qy, qz);
-    const vf density = V_LOAD(g + 10 * stride);
-    const v3 inv_scale = v3_make(1.0f / scale.x, 1.0f / scale.y, 1.0f / scale.z);
+    const gaussian g = gaussian_load(gaussians, first, stride);
+    const v3 mean = g.mean, scale = g.scale, inv_scale = g.inv_scale;
+    const frame3 axes = g.axes;
     const vf det = scale.x * scale.y * scale.z;
 
     const vf zero = (vf)(0.0f);
@@ -82,33 +75,33 @@ __kernel void splat_chain(
                 fields[f * LANES + lane] = here ? sums[at * SUMS + f] : 0.0f;
 #if MOVING
             __global const float *rec = records + at * RECORD;
-            fields[12 * LANES + lane] = here ? rec[REC_ALONG_U] : 1.0f;
-            fields[13 * LANES + lane] = here ? rec[REC_ALONG_V] : 0.0f;
-            fields[14 * LANES + lane] = here ? rec[REC_ACROSS_U] : 0.0f;
-            fields[15 * LANES + lane] = here ? rec[REC_ACROSS_V] : 1.0f;
+            fields[SUM_COUNT * LANES + lane] = here ? rec[REC_ALONG_U] : 1.0f;
+            fields[(SUM_COUNT + 1) * LANES + lane] = here ? rec[REC_ALONG_V] : 0.0f;
+            fields[(SUM_COUNT + 2) * LANES + lane] = here ? rec[REC_ACROSS_U] : 0.0f;
+            fields[(SUM_COUNT + 3) * LANES + lane] = here ? rec[REC_ACROSS_V] : 1.0f;
 #endif
         }
         if (!drawn)
             continue;
-        const vf w = V_LOAD(fields), by_ik = V_LOAD(fields + LANES);
+        const vf w = V_LOAD(fields + SUM_W * LANES), by_ik = V_LOAD(fields + SUM_IK * LANES);
 #if MOVING
         /* by S: with (along, across) = V D, D D' = V^-1 (..)(..)' V^-T */
-        const vf zz = V_LOAD(fields + 2 * LANES), zc = V_LOAD(fields + 3 * LANES), cc = V_LOAD(fields + 4 * LANES);
-        const vf along_u = V_LOAD(fields + 12 * LANES), along_v = V_LOAD(fields + 13 * LANES);
-        const vf across_u = V_LOAD(fields + 14 * LANES), across_v = V_LOAD(fields + 15 * LANES);
+        const vf zz = V_LOAD(fields + SUM_ZZ * LANES), zc = V_LOAD(fields + SUM_ZC * LANES), cc = V_LOAD(fields + SUM_CC * LANES);
+        const vf along_u = V_LOAD(fields + SUM_COUNT * LANES), along_v = V_LOAD(fields + (SUM_COUNT + 1) * LANES);
+        const vf across_u = V_LOAD(fields + (SUM_COUNT + 2) * LANES), across_v = V_LOAD(fields + (SUM_COUNT + 3) * LANES);
         const vf per = 1.0f / (along_u * across_v - along_v * across_u);
         const vf uz = across_v * per, uc = -along_v * per, vz = -across_u * per, vc = along_u * per;
         vf s_uu = uz * (uz * zz + 2.0f * uc * zc) + uc * uc * cc;
         vf s_uv = 2.0f * (uz * (vz * zz + vc * zc) + uc * (vz * zc + vc * cc));
         vf s_vv = vz * (vz * zz + 2.0f * vc * zc) + vc * vc * cc;
-        const vf s_z = V_LOAD(fields + 5 * LANES), s_c = V_LOAD(fields + 6 * LANES);
-        const vf s_tz = V_LOAD(fields + 10 * LANES), s_tc = V_LOAD(fields + 11 * LANES);
+        const vf s_z = V_LOAD(fields + SUM_Z * LANES), s_c = V_LOAD(fields + SUM_C * LANES);
+        const vf s_tz = V_LOAD(fields + SUM_TZ * LANES), s_tc = V_LOAD(fields + SUM_TC * LANES);
 #else
-        vf s_uu = V_LOAD(fields + 2 * LANES), s_uv = 2.0f * V_LOAD(fields + 3 * LANES);
-        vf s_vv = V_LOAD(fields + 4 * LANES);
-        const vf s_u = V_LOAD(fields + 5 * LANES), s_v = V_LOAD(fields + 6 * LANES);
+        vf s_uu = V_LOAD(fields + SUM_UU * LANES), s_uv = 2.0f * V_LOAD(fields + SUM_UV * LANES);
+        vf s_vv = V_LOAD(fields + SUM_VV * LANES);
+        const vf s_u = V_LOAD(fields + SUM_U * LANES), s_v = V_LOAD(fields + SUM_V * LANES);
 #endif
-        const vf s_b = V_LOAD(fields + 7 * LANES), by_b1 = V_LOAD(fields + 8 * LANES), by_b2 = V_LOAD(fields + 9 * LANES);
+        const vf s_b = V_LOAD(fields + SUM_B * LANES), by_b1 = V_LOAD(fields + SUM_BU * LANES), by_b2 = V_LOAD(fields + SUM_BV * LANES);
 
         __global const float *cell = cells + c * CELL;
         __global const coefficient *m = matrices + c * POSES * 12;
@@ -218,7 +211,8 @@ __kernel void splat_chain(
 #endif
     }
     __global float *out = gradients + first;
-    gradient_store(out, stride, 0, by_mean, by_scale, torque_of(forth, back, scale, inv_scale), qw, qx, qy, qz, by_log_density / density);
+    gradient_store(out, stride, 0, by_mean, by_scale, torque_of(forth, back, scale, inv_scale), g.qw, g.qx, g.qy, g.qz,
+                   by_log_density / g.density);
     V_STORE(by_u0 * half_width, out + (size_t)ROW_STATISTIC * stride);
     V_STORE(by_v0 * half_lines, out + (size_t)(ROW_STATISTIC + 1) * stride);
 }

@@ -109,13 +109,9 @@ __kernel void splat_prepare(
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
-    __global const float *g = gaussians + first;
-    const v3 mean = v3_make(V_LOAD(g), V_LOAD(g + stride), V_LOAD(g + 2 * stride));
-    const v3 scale = v3_make(V_LOAD(g + 3 * stride), V_LOAD(g + 4 * stride), V_LOAD(g + 5 * stride));
-    const frame3 axes = quaternion_frame(V_LOAD(g + 6 * stride), V_LOAD(g + 7 * stride),
-                                         V_LOAD(g + 8 * stride), V_LOAD(g + 9 * stride));
-    const vf density = V_LOAD(g + 10 * stride);
-    const v3 inv_scale = v3_make(1.0f / scale.x, 1.0f / scale.y, 1.0f / scale.z);
+    const gaussian g = gaussian_load(gaussians, first, stride);
+    const v3 mean = g.mean, scale = g.scale, inv_scale = g.inv_scale;
+    const frame3 axes = g.axes;
     const vf inv_det = inv_scale.x * inv_scale.y * inv_scale.z;
     const vi exists = V_INT((vf)(first) + V_IOTA) < count;
 
@@ -163,7 +159,7 @@ __kernel void splat_prepare(
         const vf ik = inv_kappa;
         const vf ray_length = (vf)(1.0f);
 #endif
-        vf amp = cell[CELL_WEIGHT] * 2.50662827463f * density * factor * ray_length;
+        vf amp = cell[CELL_WEIGHT] * 2.50662827463f * g.density * factor * ray_length;
 #if FOOTPRINT
         amp *= widened_by_pixel(&l11, &l12, &l22);
 #endif

@@ -20,31 +20,24 @@ __kernel void voxel_backward(
     vf w_ = (vf)(0.0f), x_ = w_, y_ = w_, z_ = w_, xx = w_, xy = w_, xz = w_, yy = w_, yz = w_, zz = w_;
     for (int z = whole[VOX_LO + 2]; z <= whole[VOX_HI + 2]; ++z)
         for (int y = whole[VOX_LO + 1]; y <= whole[VOX_HI + 1]; ++y) {
-            const float dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
-            const float dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];
-            const float a0 = rec[VOX_U12] * dy + rec[VOX_U13] * dz;
-            const float b = rec[VOX_U22] * dy + rec[VOX_U23] * dz, c = rec[VOX_U33] * dz;
-            const float k = b * b + c * c;
-            if (k > limit) /* a corner of the box */
+            const voxel_row r = voxel_row_at(rec, y, z);
+            if (r.k > limit) /* a corner of the box */
                 continue;
             __global const float *row = by_volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
             for (int x = whole[VOX_LO]; x <= whole[VOX_HI]; x += LANES) {
-                const vf dx = ((float)(x - whole[VOX_WHOLE]) + V_IOTA) - rec[VOX_REST];
-                const vf a = rec[VOX_U11] * dx + a0;
-                const vf q = a * a + k;
-                const vf value = rec[VOX_DENSITY] * falling_exp2(MINUS_HALF_LOG2E * q);
-                const vf w = V_PICK(0.0f, V_LOAD(row + x) * value, q <= limit);
+                const vf dx = voxel_dx(r, x);
+                const vf w = voxel_value(r, dx, V_LOAD(row + x), limit);
                 const vf wx = w * dx;
                 w_ += w;
                 x_ += wx;
-                y_ += w * dy;
-                z_ += w * dz;
+                y_ += w * r.dy;
+                z_ += w * r.dz;
                 xx += wx * dx;
-                xy += wx * dy;
-                xz += wx * dz;
-                yy += w * (dy * dy);
-                yz += w * (dy * dz);
-                zz += w * (dz * dz);
+                xy += wx * r.dy;
+                xz += wx * r.dz;
+                yy += w * (r.dy * r.dy);
+                yz += w * (r.dy * r.dz);
+                zz += w * (r.dz * r.dz);
             }
         }
     out[0] = v_sum(w_);
@@ -69,12 +62,9 @@ __kernel void voxel_chain(
         return;
     float fields[10 * LANES];
     gather_sums(sums + (size_t)first * SUMS, SUMS, 10, fields);
-    __global const float *g = gaussians + first;
-    const v3 scale = v3_make(V_LOAD(g + 3 * stride), V_LOAD(g + 4 * stride), V_LOAD(g + 5 * stride));
-    const vf qw = V_LOAD(g + 6 * stride), qx = V_LOAD(g + 7 * stride);
-    const vf qy = V_LOAD(g + 8 * stride), qz = V_LOAD(g + 9 * stride);
-    const frame3 axes = quaternion_frame(qw, qx, qy, qz);
-    const v3 inv = v3_make(1.0f / scale.x, 1.0f / scale.y, 1.0f / scale.z);
+    const gaussian g = gaussian_load(gaussians, first, stride);
+    const v3 scale = g.scale, inv = g.inv_scale;
+    const frame3 axes = g.axes;
     const v3 inv2 = v3_mul(inv, inv);
     const vf w = weight * V_LOAD(fields);
     const v3 n = to_local(axes, v3_make(weight * pitch.x * V_LOAD(fields + LANES),
@@ -100,6 +90,6 @@ __kernel void voxel_chain(
     const v3 torque = v3_make(-bc * (inv.y * inv.z) * out_of_round(scale.y, scale.z, inv.y, inv.z),
                               -ac * (inv.z * inv.x) * out_of_round(scale.z, scale.x, inv.z, inv.x),
                               -ab * (inv.x * inv.y) * out_of_round(scale.x, scale.y, inv.x, inv.y));
-    gradient_store(gradients + first, stride, add, by_mean, by_scale, torque, qw, qx, qy, qz,
-                   w / V_LOAD(g + 10 * stride));
+    gradient_store(gradients + first, stride, add, by_mean, by_scale, torque, g.qw, g.qx, g.qy, g.qz,
+                   w / g.density);
 }

@@ -1,5 +1,6 @@
 /* Voxeliser: every tile of voxels sums its list of Gaussians. A work-item owns rows of x (BLOCK_PIXEL 0) or
    one voxel (BLOCK_PIXEL 1, where a work-group runs along x). */
+#include "common/tile.h"
 #include "common/voxel.h"
 
 __kernel void voxel_forward(
@@ -19,16 +20,9 @@ __kernel void voxel_forward(
     }
     const int t = ((z / tile.z) * tiles.y + y / tile.y) * tiles.x + x / tile.x;
     float sum = 0.0f;
-    for (int e = starts[t]; e < starts[t + 1]; ++e) {
-        __global const float *rec = records + (size_t)entries[e] * VOXEL_RECORD;
-        __global const int *whole = (__global const int *)rec;
-        const float dx = (float)(x - whole[VOX_WHOLE]) - rec[VOX_REST];
-        const float dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];
-        const float dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
-        const float a = rec[VOX_U11] * dx + (rec[VOX_U12] * dy + rec[VOX_U13] * dz);
-        const float b = rec[VOX_U22] * dy + rec[VOX_U23] * dz, c = rec[VOX_U33] * dz;
-        const float q = a * a + (b * b + c * c);
-        sum += q <= limit ? rec[VOX_DENSITY] * exp2(MINUS_HALF_LOG2E * q) : 0.0f;
+    FOR_ENTRIES(e, starts, t) {
+        const voxel_row r = voxel_row_at(records + (size_t)entries[e] * VOXEL_RECORD, y, z);
+        sum += voxel_value(r, voxel_dx(r, x), 1.0f, limit);
     }
     volume[at] = sum;
 #else
@@ -41,7 +35,7 @@ __kernel void voxel_forward(
         for (int y = y_first; y <= y_last; ++y)
             for (int x = 0; x < pitch; x += LANES)
                 V_STORE((vf)(0.0f), volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch + x);
-    for (int e = starts[t]; e < starts[t + 1]; ++e) {
+    FOR_ENTRIES(e, starts, t) {
         __global const float *rec = records + (size_t)entries[e] * VOXEL_RECORD;
         __global const int *whole = (__global const int *)rec;
         const int z_lo = max(z_first, whole[VOX_LO + 2]), z_hi = min(z_last, whole[VOX_HI + 2]);
@@ -49,21 +43,12 @@ __kernel void voxel_forward(
         const int x_lo = whole[VOX_LO], x_hi = whole[VOX_HI];
         for (int z = z_lo; z <= z_hi; ++z)
             for (int y = y_lo; y <= y_hi; ++y) {
-                const float dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
-                const float dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];
-                const float a0 = rec[VOX_U12] * dy + rec[VOX_U13] * dz;
-                const float b = rec[VOX_U22] * dy + rec[VOX_U23] * dz, c = rec[VOX_U33] * dz;
-                const float k = b * b + c * c;
-                if (k > limit) /* a corner of the box */
+                const voxel_row r = voxel_row_at(rec, y, z);
+                if (r.k > limit) /* a corner of the box */
                     continue;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
-                for (int x = x_lo; x <= x_hi; x += LANES) {
-                    const vf dx = ((float)(x - whole[VOX_WHOLE]) + V_IOTA) - rec[VOX_REST];
-                    const vf a = rec[VOX_U11] * dx + a0;
-                    const vf q = a * a + k;
-                    const vf value = rec[VOX_DENSITY] * falling_exp2(MINUS_HALF_LOG2E * q);
-                    V_STORE(V_LOAD(row + x) + V_PICK(0.0f, value, q <= limit), row + x);
-                }
+                for (int x = x_lo; x <= x_hi; x += LANES)
+                    V_STORE(V_LOAD(row + x) + voxel_value(r, voxel_dx(r, x), (vf)(1.0f), limit), row + x);
             }
     }
     for (int z = z_first; z <= z_last; ++z)

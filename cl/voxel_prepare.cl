@@ -18,12 +18,9 @@ __kernel void voxel_prepare(
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
-    __global const float *g = gaussians + first;
-    const vf mx = V_LOAD(g), my = V_LOAD(g + stride), mz = V_LOAD(g + 2 * stride);
-    const v3 scale = v3_make(V_LOAD(g + 3 * stride), V_LOAD(g + 4 * stride), V_LOAD(g + 5 * stride));
-    const frame3 axes = quaternion_frame(V_LOAD(g + 6 * stride), V_LOAD(g + 7 * stride),
-                                         V_LOAD(g + 8 * stride), V_LOAD(g + 9 * stride));
-    const v3 inv_scale = v3_make(1.0f / scale.x, 1.0f / scale.y, 1.0f / scale.z);
+    const gaussian g = gaussian_load(gaussians, first, stride);
+    const v3 mean = g.mean, scale = g.scale, inv_scale = g.inv_scale;
+    const frame3 axes = g.axes;
     const vf inv_det = inv_scale.x * inv_scale.y * inv_scale.z;
     const v3 ex = v3_make(axes.a.x, axes.b.x, axes.c.x);
     const v3 ey = v3_make(axes.a.y, axes.b.y, axes.c.y);
@@ -38,9 +35,9 @@ __kernel void voxel_prepare(
     const vf u33 = inv_det * inv_u11 / u22;
     vf rest[3];
     /* split in the whole grid's frame, so that a part has the bits of the whole */
-    const vf whole[3] = {wide_split(wide_dot(matrix, mx, my, mz), rest) - (float)start.x,
-                         wide_split(wide_dot(matrix + 4, mx, my, mz), rest + 1) - (float)start.y,
-                         wide_split(wide_dot(matrix + 8, mx, my, mz), rest + 2) - (float)start.z};
+    const vf whole[3] = {wide_split(wide_dot(matrix, mean.x, mean.y, mean.z), rest) - (float)start.x,
+                         wide_split(wide_dot(matrix + 4, mean.x, mean.y, mean.z), rest + 1) - (float)start.y,
+                         wide_split(wide_dot(matrix + 8, mean.x, mean.y, mean.z), rest + 2) - (float)start.z};
     const vf sigma[3] = {sqrt(v3_dot(sx, sx)) / pitch.x, sqrt(v3_dot(sy, sy)) / pitch.y, sqrt(v3_dot(sz, sz)) / pitch.z};
     const int sizes[3] = {shape.x, shape.y, shape.z};
 
@@ -55,7 +52,7 @@ __kernel void voxel_prepare(
     V_STORE(u22 * pitch.y, fields + VOX_U22 * LANES);
     V_STORE(u23 * pitch.z, fields + VOX_U23 * LANES);
     V_STORE(u33 * pitch.z, fields + VOX_U33 * LANES);
-    V_STORE(V_LOAD(g + 10 * stride), fields + VOX_DENSITY * LANES);
+    V_STORE(g.density, fields + VOX_DENSITY * LANES);
     vi drawn = V_INT((vf)(first) + V_IOTA) < count;
     vi lo[3], hi[3];
     for (int k = 0; k < 3; ++k) {

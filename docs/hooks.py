@@ -23,6 +23,11 @@ def on_config(config: Any) -> Any:
     return config
 
 
+def on_page_content(html: str, **_: Any) -> str:
+    """A | in the code of a table's cell is written \\|, which GitHub reads as | and this Markdown as it stands."""
+    return html.replace(r"\|", "|")
+
+
 class Formulas(Extension):
     """$inline$ and $$block$$ formulas."""
 

@@ -28,15 +28,20 @@ def cli_page() -> str:
         "# Command line reference\n",
         "What `--help` says. With explanations: [command line](../cli.md).\n",
     ]
-    text += [f"```text\n{_help(group, 'phyradgs')}```\n"]
+    whole = _context(group, "phyradgs")
+    text += [f"```text\n{_help(whole)}```\n"]
     for name, command in group.commands.items():  # type: ignore[attr-defined]
-        text += [f"## phyradgs {name}\n", f"```text\n{_help(command, f'phyradgs {name}')}```\n"]
+        text += [f"## phyradgs {name}\n", f"```text\n{_help(_context(command, name, whole))}```\n"]
     return "\n".join(text)
 
 
-def _help(command: click.Command, name: str) -> str:
-    context = click.Context(command, info_name=name, terminal_width=100, max_content_width=100)
-    return "\n".join(line.rstrip() for line in command.get_help(context).splitlines()) + "\n"
+def _context(command: click.Command, name: str, parent: click.Context | None = None) -> click.Context:
+    settings = {**command.context_settings, "terminal_width": 100, "max_content_width": 100}
+    return click.Context(command, parent=parent, info_name=name, **settings)
+
+
+def _help(context: click.Context) -> str:
+    return "\n".join(line.rstrip() for line in context.get_help().splitlines()) + "\n"
 
 
 def api_page() -> str:

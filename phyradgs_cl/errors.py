@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from phyradgs_cl.text import plain_text
+
 
 class PhyradgsError(Exception):
     """Base of every error that this package raises on purpose.
@@ -37,7 +39,7 @@ class PhyradgsError(Exception):
         expected = f"expected {self.expected}" if self.expected else ""
         details = "; ".join(part for part in (found, expected, self.remedy) if part)
         text = f"{self.culprit}: {details}" if details else self.culprit
-        return " ".join(text.split())  # messages of other libraries bring line breaks along
+        return plain_text(" ".join(text.split()))  # messages of other libraries bring line breaks along
 
 
 class InputError(PhyradgsError):

@@ -10,6 +10,7 @@ import typer
 
 from phyradgs_cl.reconstructors import Progress
 
+_OVER = "\r\x1b[K"  # what stands in the line
 _TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0
 
 
@@ -21,14 +22,20 @@ class Ticker:
         self.is_terminal = sys.stderr is not None and sys.stderr.isatty()
         self.started = self.last = time.monotonic()
         self.first: int | None = None
-        self.is_open = False
+        self.is_open = self.is_counting = False
 
     def __enter__(self) -> Ticker:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.is_open:
-            _say("")
+            _say("" if self.is_counting else _OVER, ends_line=self.is_counting)
+
+    def stage(self, text: str) -> None:
+        """Says at once, on a terminal, what is under way before there is something to count."""
+        if self.is_terminal:
+            _say(f"{_OVER}{text}", ends_line=False)
+            self.is_open, self.is_counting = True, False
 
     def progress(self, p: Progress) -> None:
         """The report of a reconstruction."""
@@ -45,8 +52,8 @@ class Ticker:
             return
         self.last = now
         line = f"{self.noun} {done}/{total}{more}{self._rate(done, total, now)}"
-        _say(f"\r\x1b[K{line}" if self.is_terminal else line, ends_line=not self.is_terminal)
-        self.is_open = self.is_terminal
+        _say(f"{_OVER}{line}" if self.is_terminal else line, ends_line=not self.is_terminal)
+        self.is_open = self.is_counting = self.is_terminal
 
     def _rate(self, done: int, total: int, now: float) -> str:
         since_first = done - (self.first or 0)

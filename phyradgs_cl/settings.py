@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -14,7 +14,8 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.reconstructors import InputOptions, input_options, method_options
+from phyradgs_cl.io.tables import read_toml
+from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options
 from phyradgs_cl.runtime import bytes_of
 
 if sys.version_info >= (3, 11):
@@ -98,7 +99,7 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
         "phyradgs" if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
     )
     with chosen.naming_origins():
-        return replace(chosen, before=input_options(changes))
+        return replace(chosen, method=method_name(chosen.method), before=input_options(changes))
 
 
 def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
@@ -116,15 +117,7 @@ def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
     if path is None:
         return {}
-    if path.exists() and not path.is_file():  # a device or a pipe may never end
-        raise InputError(f"{option} {path}", "not a regular file", "a TOML file")
-    try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{option} {path}", error.strerror or str(error), "a TOML file") from error
-    except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
-        raise InputError(f"{option} {path}", f"not TOML ({error})", "a TOML file") from error
+    return read_toml(path, f"{option} {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:
@@ -157,17 +150,6 @@ def device_wish(value: object, culprit: str = "--device") -> str | None:
     return value
 
 
-def file_parser(culprit: str) -> Callable[[str], Path]:
-    """Reads the file name given for ``culprit``; an empty one would pass for the current folder."""
-
-    def file(text: str) -> Path:
-        if not text.strip():
-            raise InputError(culprit, repr(text), "a file name", "name a file")
-        return Path(text)
-
-    return file
-
-
 def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:
     """Two lengths "V,U" in mm."""
     if text is None:
@@ -179,6 +161,15 @@ def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:
     if not all(math.isfinite(x) and abs(x) <= LARGEST_OFFSET_MM for x in (v_mm, u_mm)):
         raise InputError(option, repr(text), f"two lengths of at most {LARGEST_OFFSET_MM:g} mm")
     return v_mm, u_mm
+
+
+def numbers(text: str) -> float | list[float] | str:
+    """A number, or several with commas between; a text that is neither as it is, for the error of whoever wants numbers."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        return text
+    return found if len(found) > 1 else found[0]
 
 
 def pulse_pair(option: str, text: str | None) -> tuple[float, float] | None:

@@ -1,9 +1,9 @@
 """Ctrl-C and SIGTERM in a process of the command line: one line on stderr and an end, whatever is running.
 
 An exception raised by a signal's handler may surface in any library, which may swallow it or complain about it. So
-nothing is raised here: the process removes its half-written files and ends. Work that is worth keeping holds the signals
-until it is saved (reconstructors/interrupt.py). Nothing is imported that takes time, not even ``signal``, which builds enums
-round ``_signal``: this is to be in force as early as can be.
+nothing is raised here: the process removes its half-written files and ends. Work that is worth keeping makes signals wait
+(reconstructors/interrupt.py). Nothing is imported that takes time, nor ``signal``, which builds enums round ``_signal``:
+this is to be in force as early as can be.
 """
 
 from __future__ import annotations
@@ -11,13 +11,11 @@ from __future__ import annotations
 import _signal as signal
 import os
 import sys
+import time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from types import FrameType
-
-    Handler = Callable[[int, FrameType | None], None]
 
 NOTHING = "interrupted, nothing written"
 COMPLETE = "interrupted, the output is complete"
@@ -25,15 +23,36 @@ COMPLETE = "interrupted, the output is complete"
 farewell = NOTHING
 """What the line will say: whoever gets further than nothing says so here."""
 number = int(signal.SIGINT)
-"""The last signal that was held."""
+"""The last signal that came."""
 unfinished: set[str] = set()
 """Temporary files and folders that nobody will miss."""
+patience_s: list[float] = []
+"""Of every open block of interrupt.py: for how long signals wait after the first; below 0: not at all."""
+asked_s: float | None = None
+"""When the first of the signals that wait came."""
+_taken: set[int] = set()
 
 
-def stop_at_once(caught: int, frame: FrameType | None) -> None:
-    """The handler of a process of ours: says ``farewell`` and ends with 128 + the signal's number."""
+class InterruptedAfterwards(KeyboardInterrupt):
+    """Ctrl-C that came during work which was finished all the same."""
+
+
+def answer(caught: int, frame: FrameType | None) -> None:
+    """The handler: notes a signal that has to wait; else ends this process, or raises where it is not the command line's."""
+    global number, asked_s
+    number, now_s = caught, time.monotonic()
+    if max(patience_s, default=-1) >= now_s - (now_s if asked_s is None else asked_s):
+        asked_s = now_s if asked_s is None else asked_s
+    elif caught in _taken:
+        _end(caught)
+    else:
+        raise KeyboardInterrupt
+
+
+def _end(caught: int) -> None:
+    """Says ``farewell`` and ends with 128 + the signal's number."""
     for path in tuple(unfinished):
-        _remove(path)
+        remove(path)
     try:
         if sys.stderr is not None:
             start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over a counter that is open
@@ -42,7 +61,8 @@ def stop_at_once(caught: int, frame: FrameType | None) -> None:
         os._exit(128 + caught)
 
 
-def _remove(path: str) -> None:
+def remove(path: str) -> None:
+    """Removes a temporary file or folder, if there is one."""
     try:
         os.unlink(path)
     except OSError:  # a folder, or there is none yet, or it has become the output
@@ -51,30 +71,28 @@ def _remove(path: str) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def handle(caught: int, handler: Handler) -> object:
-    """Sets a handler that returns, or ends the process; the handler before it.
+def handle(caught: int) -> None:
+    """Sets the handler.
 
     System calls go on after it: a compiler inside an OpenCL driver would take a reading that is cut short for an error.
     """
-    before = signal.signal(caught, handler)
+    signal.signal(caught, answer)
     if hasattr(signal, "siginterrupt"):
         signal.siginterrupt(caught, False)
-    return before
 
 
 def take_over() -> None:
-    """From now on both signals stop this process at once; those that somebody wants ignored stay ignored."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        handle(signal.SIGINT, stop_at_once)
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        handle(signal.SIGTERM, stop_at_once)
+    """From now on both signals stop this process; those that somebody wants ignored stay ignored."""
+    for caught, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+        if signal.getsignal(caught) is usual:
+            handle(caught)
+            _taken.add(int(caught))
 
 
 def let_go() -> None:
-    """Nothing is left to be interrupted: the interpreter's own end would answer Ctrl-C with a traceback."""
-    for caught, after in ((signal.SIGINT, signal.SIG_IGN), (signal.SIGTERM, signal.SIG_DFL)):
-        if signal.getsignal(caught) is stop_at_once:
-            signal.signal(caught, after)
+    """All is done and said: the interpreter's own end would answer with a traceback, or die without a word."""
+    while _taken:
+        signal.signal(_taken.pop(), signal.SIG_IGN)
 
 
 def start_afresh() -> None:
@@ -87,12 +105,6 @@ def say_at_the_end(text: str) -> None:
     """Sets what the line will say."""
     global farewell
     farewell = text
-
-
-def note(caught: int) -> None:
-    """Remembers a signal that was held, for the exit status."""
-    global number
-    number = caught
 
 
 def status() -> int:

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
-from skimage.transform import resize_local_mean
 
-from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, pixel_centres
+from phyradgs_cl import __version__, checks
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import load_attenuation
+from phyradgs_cl.io import LoadedVolume, Scanner, load_scanner, with_detector_count
 from phyradgs_cl.operators import RayProjector
 from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
+from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 
 
@@ -33,6 +34,9 @@ NOISES = ("none", "tigre", "beer")
 # Far beyond any scanner, and far from where float32 or a sampler would overflow.
 LARGEST_PEAK, LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
 SMALLEST_DOSE, LARGEST_DOSE = 1e-3, 1e12
+LARGEST_GRID, LARGEST_DETECTOR = 4096, 32_000
+SMALLEST_PHANTOM = 2  # procedural phantoms are drawn on twice as many voxels, of which they need 4
+_TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
 log = logging.getLogger(__name__)
 
 
@@ -68,6 +72,73 @@ class SimulationOptions:
         checks.within("--jitter-deg", self.jitter_deg, 0, 360)
         checks.within("--time-samples", self.time_samples, 0, 10_000)
         checks.within("--seed", self.seed, 0, 2**63)
+
+
+def scanner_for(
+    name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None
+) -> Scanner:
+    """A scanner by name or TOML file, with another number of columns (rows in proportion) or offset (v, u) of the panel."""
+    scanner = load_scanner(name, resource("data"))
+    geometry = scanner.geometry
+    if detector is not None:
+        checks.within("--detector", detector, 1, LARGEST_DETECTOR)
+        rows, columns = geometry.detector_shape
+        geometry = with_detector_count(geometry, max(1, round(detector * rows / columns)), detector)
+    if detector_offset_mm is not None:
+        geometry = replace(geometry, detector_offset_mm=detector_offset_mm)
+    return replace(scanner, geometry=geometry)
+
+
+def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
+    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the default.
+
+    Raises:
+        InputError: no such option; a value out of range.
+    """
+    own = {key: getattr(scanner, key) for key in ("readout_axis", "readout_direction", "lag")}
+    own |= {key: getattr(scanner, key) for key in ("readout_ratio", "pulse")}
+    chosen = {**own, **{key: value for key, value in given.items() if value is not None}}
+    known = ({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
+    if unknown := sorted(set(chosen) - known):
+        expected = f"one of {', '.join(sorted(known))}"
+        raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
+    timing = {key: chosen.pop(key) for key in _TIMING if key in chosen}
+    return SimulationOptions(protocol=make_protocol(protocol, **timing), **chosen)
+
+
+def simulated_scan(
+    rt: Runtime,
+    of: str | LoadedVolume,
+    scanner: Scanner,
+    options: SimulationOptions,
+    *,
+    size: int | None = None,
+    pixel_samples: int = 1,
+    name: str = "volume",
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> Scan:
+    """What a scanner records of a phantom, by its name, or of a volume, called ``name``; the truth is its reference.
+
+    size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples: rays
+    along each side of a pixel. Warns of an inverse crime.
+    """
+    if size is not None:
+        checks.within("--size", size, SMALLEST_PHANTOM if isinstance(of, str) else 1, LARGEST_GRID)
+    where, axis = (scanner.geometry, scanner.grid), options.readout_axis
+    if isinstance(of, str):
+        count = size or max(scanner.grid.shape)
+        scene = phantom_scene(rt, of, *where, count, axis, options.seed, pixel_samples)
+    else:
+        scene = volume_scene(rt, of, name, *where, size, axis, pixel_samples)
+    scene.warn_of_inverse_crime()
+    title = f"simulated scan of {scene.title}"
+    scan = simulate(
+        scene.source, scanner.geometry, scene.grid, options, reference=scene.reference, title=title, report=report
+    )
+    asked = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise")}
+    told = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
+    scan.provenance.update(told | asked)
+    return scan
 
 
 def simulate(
@@ -263,20 +334,20 @@ def phantom_scene(
 
 def volume_scene(
     rt: Runtime,
-    path: str,
+    loaded: LoadedVolume,
+    name: str,
     geometry: ConeGeometry,
     box: Grid,
     size: int | None,
     axis: str,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A volume from a file, projected at its own resolution.
+    """A volume, called ``name``, projected at its own resolution.
 
     A bare array is fitted into the scanner's box, its values being attenuation per half of the longest side (so
-    that line integrals do not depend on the scanner's size); one of our volumes keeps its own grid and 1/mm. Pixels see
+    that line integrals do not depend on the scanner's size); one with a grid keeps it and 1/mm. Pixels see
     ``pixel_samples``² rays over their area.
     """
-    loaded = load_attenuation(path)
     volume, fine = loaded.volume, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
@@ -284,13 +355,15 @@ def volume_scene(
         volume = volume / np.float32(fine.half_longest_mm)
     grid = _resized(fine, size or max(fine.shape))
     source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
-    return Scene(source, grid, block_mean(volume, grid.shape), f"volume {path}", fine.shape)
+    return Scene(source, grid, block_mean(volume, grid.shape), name, fine.shape)
 
 
 def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Means of a volume (z, y, x) over the voxels of a coarser (or equal) grid of the same box, float32."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
+    from skimage.transform import resize_local_mean  # slow to import
+
     return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(
         np.float32
     )

@@ -95,3 +95,10 @@ def test_bias_of_balls_is_resumed(tmp_path) -> None:
     first = lines.read_text()
     run("ball_bias.py", *words)
     assert lines.read_text() == first and first.count("\n") == 1
+
+
+def test_startup(tmp_path) -> None:
+    told = run("startup.py", "--repeat", "1", "--json", str(tmp_path / "facts.json"))
+    rows = json.loads((tmp_path / "facts.json").read_text())["rows"]
+    assert len(rows) == 6 and all(f"| `{row['command']}` |" in told for row in rows)
+    assert all(row["import_s"] > 0 and row["cpu_s"] > 0 for row in rows)

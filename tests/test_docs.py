@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+import yaml
 
-from phyradgs_cl import api
+from phyradgs_cl import __version__, api
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -115,3 +116,15 @@ def test_the_site_builds_without_a_broken_link(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site" / "mathematics" / "index.html").read_text(encoding="utf-8")
     assert page.count("<math") > 150 and "$$" not in page
+    options = (tmp_path / "site" / "cli" / "index.html").read_text(encoding="utf-8")
+    assert "<code>--noise none|tigre|beer</code>" in options  # written with \\| in the Markdown
+    cells = re.compile(r"\.wy-table-responsive table td,\s*\.wy-table-responsive table th\s*{\s*white-space:\s*(\w+)")
+    styles = re.findall(r'href="\.\./([^"?]+\.css)', options)
+    rules = [cells.findall((tmp_path / "site" / style).read_text(encoding="utf-8")) for style in styles]
+    assert sum(rules, [])[0] == "nowrap", "the theme's own rule has another form: look whether tables wrap"
+    assert sum(rules, [])[-1] == "normal", "tables are wider than their column"
+
+
+def test_the_citation_is_of_this_version() -> None:
+    entry = yaml.safe_load((DOCS.parent / "CITATION.cff").read_text(encoding="utf-8"))
+    assert entry["version"] == __version__ and entry["license"] == "Apache-2.0" and entry["authors"]

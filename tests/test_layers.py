@@ -28,10 +28,11 @@ def floors_of_the_page() -> dict[str, int]:
 
 
 FLOOR_OF = {"__init__": 0, **floors_of_the_page()}
-# Within floor 0: errors know nothing, checks raise them.
+# Within floor 0: text knows nothing, errors are text, checks raise them.
 GROUND_FLOOR = {
     "__init__": set(),
-    "errors": set(),
+    "text": set(),
+    "errors": {"text"},
     "checks": {"errors"},
     "resources": set(),
     "signals": set(),

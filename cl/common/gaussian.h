@@ -35,3 +35,24 @@ static inline v3 to_world(frame3 f, v3 v)
 {
     return v3_add(v3_add(v3_scale(f.a, v.x), v3_scale(f.b, v.y)), v3_scale(f.c, v.z));
 }
+
+/* LANES Gaussians of a (11, stride) matrix, from `first` on */
+typedef struct { v3 mean, scale, inv_scale; vf qw, qx, qy, qz, density; frame3 axes; } gaussian;
+
+static inline gaussian gaussian_load(__global const float *gaussians, const int first, const int stride)
+{
+    __global const float *row = gaussians + first;
+    gaussian g;
+    g.mean = v3_make(V_LOAD(row), V_LOAD(row + stride), V_LOAD(row + 2 * stride));
+    row += ROW_SCALE * stride;
+    g.scale = v3_make(V_LOAD(row), V_LOAD(row + stride), V_LOAD(row + 2 * stride));
+    g.inv_scale = v3_make(1.0f / g.scale.x, 1.0f / g.scale.y, 1.0f / g.scale.z);
+    row = gaussians + first + ROW_QUATERNION * stride;
+    g.qw = V_LOAD(row);
+    g.qx = V_LOAD(row + stride);
+    g.qy = V_LOAD(row + 2 * stride);
+    g.qz = V_LOAD(row + 3 * stride);
+    g.axes = quaternion_frame(g.qw, g.qx, g.qy, g.qz);
+    g.density = V_LOAD(gaussians + first + ROW_DENSITY * stride);
+    return g;
+}

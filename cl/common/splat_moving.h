@@ -8,13 +8,14 @@
    and a line integrates exp(-q/2) over its own part [middle - half, middle + half] of the segment. */
 #include "common/splat.h"
 
-#if MOVING
 /* rows of a cell's table of lines, `time_pitch` floats each */
 #define TIME_MIDDLE 0
 #define TIME_HALF 1
 #define TIME_WEIGHT 2 /* share of the line's window that lies in this segment */
 #define TIME_ROWS 3
+#define TIMES_OF(c, line_times, time_pitch) ((line_times) + (size_t)(c) * TIME_ROWS * (time_pitch))
 
+#if MOVING
 #define LANE(type, v, lane) (((type *)&(v))[lane])
 #define CLOSED 0 /* rules: closed form, or so many Gauss-Legendre times */
 #define GAUSS_2 0.57735026919f

@@ -14,3 +14,32 @@
 #define VOX_WHOLE 10    /* 3 ints */
 #define VOX_LO 13       /* 3 ints: x y z; empty when HI.z < LO.z */
 #define VOX_HI 16
+
+/* a Gaussian on one row of voxels */
+typedef struct { float u11, a0, k, density, dy, dz, x_rest; int x_whole; } voxel_row;
+
+ALWAYS_INLINE voxel_row voxel_row_at(__global const float *rec, const int y, const int z)
+{
+    __global const int *whole = (__global const int *)rec;
+    voxel_row r;
+    r.dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
+    r.dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];
+    r.u11 = rec[VOX_U11];
+    r.a0 = rec[VOX_U12] * r.dy + rec[VOX_U13] * r.dz;
+    const float b = rec[VOX_U22] * r.dy + rec[VOX_U23] * r.dz, c = rec[VOX_U33] * r.dz;
+    r.k = b * b + c * c; /* least |U D|^2 on the row */
+    r.density = rec[VOX_DENSITY];
+    r.x_rest = rec[VOX_REST];
+    r.x_whole = whole[VOX_WHOLE];
+    return r;
+}
+
+ALWAYS_INLINE vf voxel_dx(const voxel_row r, const int x) { return ((float)(x - r.x_whole) + V_IOTA) - r.x_rest; }
+
+/* the values at dx, times `by`, 0 beyond the cutoff */
+ALWAYS_INLINE vf voxel_value(const voxel_row r, const vf dx, const vf by, const float limit)
+{
+    const vf a = r.u11 * dx + r.a0;
+    const vf q = a * a + r.k;
+    return V_PICK(0.0f, by * (r.density * falling_exp2(MINUS_HALF_LOG2E * q)), q <= limit);
+}

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.motion import (
     StaticStart,
 )
 from phyradgs_cl.acquisition.protocol import PROTOCOLS, Protocol, make_protocol
-from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.scan import Saturation, Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import (
     CircularOrbit,
@@ -39,6 +39,7 @@ __all__ = [
     "PerRow",
     "PoseTable",
     "Protocol",
+    "Saturation",
     "Scan",
     "Shutter",
     "SpeedRamp",

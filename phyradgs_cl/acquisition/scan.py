@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from phyradgs_cl.acquisition.field_of_view import field_of_view_mm, misses
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields import Grid, GridChoice
 
 DETECTOR_MODELS = ("log", "intensity")
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """What raw counts said before they became line integrals: the largest of them, and the share of pixels clipped there."""
+
+    level: float
+    share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +33,7 @@ class Scan:
     line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
     lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
     projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
+    ``saturation`` is None where nobody looked at raw counts.
     ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
     """
 
@@ -40,6 +50,7 @@ class Scan:
     title: str = "cone-beam scan"
     provenance: dict[str, object] = field(default_factory=dict)
     lag: float = 0.0
+    saturation: Saturation | None = None
 
     def __post_init__(self) -> None:
         frames = len(self.projections)
@@ -77,8 +88,36 @@ class Scan:
         """Lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
 
+    def on_grid(self, grid: Grid) -> Scan:
+        """The same scan with another grid; a reference stays where the grid is a part of its own, else it is left out."""
+        if grid == self.grid:
+            return self
+        reference = self.reference
+        if reference is not None:
+            first = grid.start_in(self.grid)
+            reference = None if first is None else _part(reference, first, grid.shape)
+        return replace(self, grid=grid, reference=reference)
+
+    def with_grid(self, choice: GridChoice) -> Scan:
+        """The same scan with the grid that is chosen. Raises InputError for one that no ray of an orbit meets."""
+        grid = choice.of(self.grid)
+        if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):
+            half_mm = ", ".join(f"±{half:.4g}" for half in field_of_view_mm(self.geometry))
+            expected = f"a box that meets the field of view, (z, y, x) {half_mm} mm"
+            raise InputError("--roi-mm", str(choice.roi_mm), expected)
+        return self.on_grid(grid)
+
     def check_timing(self) -> None:
-        """Asks the trajectory for the ends of every frame's window, so that a short table is named early."""
+        """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
+
+        Raises InputError for that, and for an exposure too short for the scan's times.
+        """
+        self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
+
+
+def _part(volume: np.ndarray, first: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
+    z, y, x = (slice(start, start + count) for start, count in zip(first, shape, strict=True))
+    return volume[z, y, x]

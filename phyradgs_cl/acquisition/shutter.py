@@ -10,6 +10,7 @@ from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
+_STEPS = 1000  # of float64 in an exposure: a moment in it is then known to a thousandth
 _DARK = 1e-9  # of the longest lit window: less is what rounding leaves of a line that the pulse misses
 
 
@@ -51,6 +52,14 @@ class Shutter:
             found = f"{start_s:g} to {start_s + length_s:g} s"
             expected = f"a pulse that meets the frame's window, 0 to {self.span_s:g} s"
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
+
+    def check_resolved(self, frame_start_s: np.ndarray, culprit: str = "exposure_s") -> None:
+        """InputError for an exposure that frames' opening times (F,) cannot tell from none: its angles would be noise."""
+        latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
+        shortest_s = _STEPS * float(np.spacing(latest_s))
+        if 0 < self.exposure_s < shortest_s:
+            expected = f"0, or at least the {shortest_s:.2g} s that times of up to {latest_s:.3g} s can tell apart"
+            raise InputError(culprit, f"{self.exposure_s:.6g} s", expected, "correct the value or its unit")
 
     @property
     def readout(self) -> Readout:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+import scipy
 
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
@@ -140,7 +140,8 @@ class PoseTable:
         in_body = np.einsum("tji,tkj->tki", frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp knows no slack
         body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
-        turn = Slerp(self.time_s, Rotation.from_matrix(frames))(flat).as_matrix()
+        turns = scipy.spatial.transform.Rotation.from_matrix(frames)
+        turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
         return np.einsum("tij,tkj->tki", turn, body).reshape(*t.shape, POSE_LENGTH)
 
 

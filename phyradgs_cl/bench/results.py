@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from phyradgs_cl.io import json_lines
+from phyradgs_cl.io.facts import FINITE, SCALAR, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
 from phyradgs_cl.io.json_lines import Line, append_line, refuse_irregular
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]
@@ -28,22 +28,21 @@ KEY = (
     "iterations",
 )
 
-# What tables read of a line with numbers besides.
-_WORDS = (
-    "study",
-    "volume",
-    "run",
-    "acquisition",
-    "protocol",
-    "axis",
-    "device",
-    "platform",
-    "version",
-    "python",
-    "numpy",
-)
-_COUNTS = ("voxels", "pixels", "seed", "views")
 _TIMES = ("seconds", "processor_s")
+# What is read of every line, and what tables read of one with numbers besides.
+_KINDS: Schema = {
+    **dict.fromkeys(KEY, SCALAR),
+    **dict.fromkeys(_TIMES, SECONDS),
+    **dict.fromkeys(("label", "method", "error"), TEXT),
+    "metrics": FINITE,
+    "options": TABLE,
+}
+_MEASURED: Schema = {
+    **dict.fromkeys(("study", "volume", "run", "acquisition", "protocol", "axis"), TEXT),
+    **dict.fromkeys(("device", "platform", "version", "python", "numpy"), TEXT),
+    **dict.fromkeys(("voxels", "pixels", "seed", "views"), WHOLE),
+    "metrics": FINITE,
+}
 
 
 def read_lines(path: Path) -> list[Line]:
@@ -57,22 +56,8 @@ def read_lines(path: Path) -> list[Line]:
 
 def _is_sound(line: Line) -> bool:
     """Whether what is read of a line is of its kind, as it may not be once a hand has edited it."""
-    if any(isinstance(line.get(name), list | dict) for name in KEY):
-        return False
-    if "metrics" not in line:
-        return True
-    metrics = line["metrics"]
-    return (
-        all(isinstance(line.get(name), str) for name in _WORDS)
-        and all(type(line.get(name)) is int for name in _COUNTS)
-        and isinstance(metrics, dict)
-        and all(value is None or _is_number(value) for value in metrics.values())
-        and all(_is_number(line[name]) for name in _TIMES if name in line)
-    )
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
+    times = [name for name in _TIMES if name in line]
+    return not damage(line, _KINDS, times) and ("metrics" not in line or not damage(line, _MEASURED, _MEASURED))
 
 
 def key_of(line: Mapping[str, Any]) -> tuple[Any, ...]:

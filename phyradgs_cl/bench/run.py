@@ -233,7 +233,7 @@ def _scene(job: BenchJob, rt: Runtime, run: PlannedRun, geometry: ConeGeometry) 
     box = Grid.cube(voxels, _BOX_SIDE)
     if run.source is None:
         return phantom_scene(rt, run.volume, geometry, box, voxels, job.axis, 0)
-    return volume_scene(rt, str(run.source), geometry, box, voxels, job.axis)
+    return volume_scene(rt, load_attenuation(run.source), f"volume {run.source}", geometry, box, voxels, job.axis)
 
 
 def _number(value: float) -> float | None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from pathlib import Path
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.text import near_miss
 
 _COUNTED = re.compile(r"(?P<name>.+)_(?P<count>\d+)")
 
@@ -32,9 +32,7 @@ def find_volumes(folder: Path, names: Sequence[str] | None, voxels: int) -> dict
         raise InputError("--volumes", f"no .h5 file in {folder}", expected)
     for name in names or ():
         if name not in found:
-            close = get_close_matches(name, found, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else ""
-            raise InputError("--names", repr(name), f"one of {', '.join(found)}", remedy)
+            raise InputError("--names", repr(name), f"one of {', '.join(found)}", near_miss(name, found, ""))
     chosen = list(dict.fromkeys(names)) if names else list(found)
     return {name: _best(found[name], 2 * voxels) for name in chosen}
 

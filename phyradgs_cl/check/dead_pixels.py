@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import binary_propagation, maximum_filter, median_filter, minimum_filter
+import scipy
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
@@ -63,8 +63,9 @@ def _constant(frames: np.ndarray) -> np.ndarray:
     sides = np.zeros_like(constant)
     sides[:, [0, -1]] = constant[:, [0, -1]]
     if sides[:, [0, -1]].mean() > _STILL_SIDES:
-        constant = constant & ~binary_propagation(sides, _AROUND, mask=constant & _as_air(frames[0], sides))
-    return constant & (median_filter(swing, size=3) > 0)
+        air = constant & _as_air(frames[0], sides)
+        constant = constant & ~scipy.ndimage.binary_propagation(sides, _AROUND, mask=air)
+    return constant & (scipy.ndimage.median_filter(swing, size=3) > 0)
 
 
 def _as_air(frame: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -78,9 +79,9 @@ def _apart(frames: np.ndarray) -> np.ndarray:
     """Pixels beyond all their neighbours in most frames, by far: edges of the object pass, or have neighbours alike."""
     ring = _AROUND.copy()
     ring[1, 1] = False
-    above = np.mean([frame > maximum_filter(frame, footprint=ring) for frame in frames], axis=0)
-    below = np.mean([frame < minimum_filter(frame, footprint=ring) for frame in frames], axis=0)
-    apart = np.median([frame - median_filter(frame, size=3) for frame in frames], axis=0)
+    above = np.mean([frame > scipy.ndimage.maximum_filter(frame, footprint=ring) for frame in frames], axis=0)
+    below = np.mean([frame < scipy.ndimage.minimum_filter(frame, footprint=ring) for frame in frames], axis=0)
+    apart = np.median([frame - scipy.ndimage.median_filter(frame, size=3) for frame in frames], axis=0)
     usual = _NORMAL_MAD * float(np.median(np.abs(apart - np.median(apart))))
     floor = 1e-3 * float(np.percentile(frames, 99.9))
     far = np.abs(apart - np.median(apart)) > _DEVIATIONS * max(usual, floor, 1e-12)
@@ -97,7 +98,7 @@ def _near_axis(scan: Scan) -> np.ndarray:
 
 def _shared(frames: np.ndarray) -> np.ndarray:
     """Pixels whose distance from the median of 5 × 5 their four neighbours share (one of which may be dead itself)."""
-    apart = np.median([frame - median_filter(frame, size=5) for frame in frames], axis=0)
+    apart = np.median([frame - scipy.ndimage.median_filter(frame, size=5) for frame in frames], axis=0)
     wide = np.pad(apart, 1, mode="edge")
     sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)
     return sides * np.sign(apart) > _SHARED * np.abs(apart)

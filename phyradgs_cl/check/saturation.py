@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Saturation, Scan
 from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
-from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.detector import clustered_share, counts_to_attenuation
 
 _SHARE = 1e-3  # of the pixels at one end
-_TOUCHING = 0.5  # of those, with all four neighbours at the same end
 _ZERO = 1e-6  # line integral
 _QUESTION = "saturation"
 
@@ -33,7 +32,7 @@ class CountReader:
         if quantity == "counts":
             frames = data[image_key == 0]
             self.ceiling = float(data[image_key != 2].max())
-            self.at_ceiling = _clustered(frames == self.ceiling)
+            self.at_ceiling = clustered_share(frames == self.ceiling)
         return counts_to_attenuation(data, image_key, quantity)
 
 
@@ -44,17 +43,17 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     asked: it is air in simulated and in clipped scans.
     """
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
-        text = f"{100 * counts.at_ceiling:.3g} % of the pixels lie together at {counts.ceiling:g} counts"
-        advice = "the detector is saturated there: lower the exposure, or mask these pixels"
-        return Finding(_QUESTION, SUSPICIOUS, counts.at_ceiling, _SHARE, "share of pixels", text, advice)
+        return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
+    if scan.saturation is not None and scan.saturation.share > _SHARE:
+        return _clipped(scan.saturation, "lower the exposure; the import has masked these pixels, or taken them as air")
     p = np.asarray(scan.projections)
     masked = (
         np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)
     )
     lowest, highest = float(p[~masked].min()), float(p[~masked].max())
     ends = {
-        "least": (0.0 if abs(lowest) < _ZERO else _clustered((p == lowest) & ~masked), lowest),
-        "largest": (_clustered((p == highest) & ~masked) if highest > _ZERO else 0.0, highest),
+        "least": (0.0 if abs(lowest) < _ZERO else clustered_share((p == lowest) & ~masked), lowest),
+        "largest": (clustered_share((p == highest) & ~masked) if highest > _ZERO else 0.0, highest),
     }
     name, (share, value) = max(ends.items(), key=lambda item: item[1][0])
     text = f"{100 * share:.3g} % of the pixels lie together at the {name} line integral, {value:.4g}"
@@ -67,13 +66,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     return Finding(_QUESTION, SUSPICIOUS, share, _SHARE, "share of pixels", text, advice)
 
 
-def _clustered(extreme: np.ndarray) -> float:
-    """The share of pixels (F, v, u) at an extreme, if most of those have four such neighbours; else 0."""
-    count = int(np.count_nonzero(extreme))
-    if count == 0 or min(extreme.shape[1:]) < 3:
-        return 0.0
-    middle = extreme[:, 1:-1, 1:-1]
-    around = extreme[:, :-2, 1:-1] & extreme[:, 2:, 1:-1] & extreme[:, 1:-1, :-2] & extreme[:, 1:-1, 2:]
-    inner = int(np.count_nonzero(middle))
-    touching = int(np.count_nonzero(middle & around)) / inner if inner else 0.0
-    return count / extreme.size if touching > _TOUCHING else 0.0
+def _clipped(found: Saturation, remedy: str) -> Finding:
+    text = f"{100 * found.share:.3g} % of the pixels lie together at {found.level:g} counts"
+    advice = f"the detector is saturated there: {remedy}"
+    return Finding(_QUESTION, SUSPICIOUS, found.share, _SHARE, "share of pixels", text, advice)

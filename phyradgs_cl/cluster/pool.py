@@ -1,7 +1,6 @@
-"""Runs shared out over workers: each is at one worker at a time, lost workers' runs are made again.
+"""Runs shared out over Dask's workers: no more are handed out than there are devices, the rest waits here.
 
-No more is handed out than there are devices free. What waits, waits here: so a run counts the deaths of workers that it was
-itself at, a new worker gets work at once, and when the scheduler is lost, nothing is that cannot be handed out again.
+What Dask holds at a worker shares that worker's deaths: so a run that kills workers takes no other with it.
 """
 
 from __future__ import annotations
@@ -12,9 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
-from contextlib import suppress
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +20,10 @@ from phyradgs_cl.cluster.local import RESOURCE, local_cluster
 from phyradgs_cl.cluster.workers import Workers
 from phyradgs_cl.errors import DeviceError, InputError
 
-_LOOK_EVERY_S, _COUNT_EVERY_S, _SAY_EVERY_S = 0.05, 0.5, 60.0
-_CONNECT_S, _RECONNECT_S, _GATHER_S = 10.0, 600.0, 30.0
-_REVIVE_S, _STARTS = 20.0, 3
-_TEMPORARY = (
-    TimeoutError,
-    asyncio.TimeoutError,
-    CancelledError,
-    OSError,
-)  # up to Python 3.10 the first two differ
+_LOOK_EVERY_S, _CONNECT_S = 0.2, 10.0
+_WITHOUT_WORKERS_S, _REVIVALS = 20.0, 3
+# asyncio.TimeoutError is another class up to Python 3.10
+_NO_ANSWER = (TimeoutError, asyncio.TimeoutError, CancelledError, OSError)
 log = logging.getLogger(__name__)
 
 
@@ -58,28 +50,23 @@ class Pool:
         self.workers = workers
         self._cluster: Any = None
         self._client: Any = None
-        self._numbers = count()
-        self._addresses: set[str] = set()
-        self._devices = 0
-        self._counted_s, self._said_s, self._seen_s = 0.0, -_SAY_EVERY_S, time.monotonic()
 
     def __enter__(self) -> Pool:
         distributed()
-        if self.workers.is_local:
-            self._cluster = self._started()
         try:
+            if self.workers.is_local:
+                self._cluster = local_cluster(self.workers)
             self._client = self._connected()
-        except _TEMPORARY as error:
+        except (RuntimeError, ValueError, *_NO_ANSWER) as error:  # ValueError: no address, or no JSON
+            found = f"no answer ({str(error) or type(error).__name__})"
+            if self.workers.is_local:
+                remedy = "try fewer --workers"
+                raise DeviceError("local workers", found, "processes that stay", remedy) from error
             expected = "the address of a Dask scheduler that runs, or its scheduler file"
-            remedy = "start one with 'dask scheduler'"
-            found = f"no answer ({_reason(error)})"
-            raise InputError(f"--scheduler {self.workers.scheduler}", found, expected, remedy) from error
+            raise InputError(self._culprit, found, expected, "start one with 'dask scheduler'") from error
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def _close(self) -> None:
         for part in (self._client, self._cluster):
             if part is not None:
                 part.close(timeout=_CONNECT_S)
@@ -98,68 +85,70 @@ class Pool:
         """(name, ``function(argument)`` or Lost) of every argument once, as they come.
 
         An exception of ``function`` is raised here; the other runs are then given up. ``look`` is called some times a
-        second. Raises InputError when the scheduler has been gone for ten minutes.
+        second. Raises InputError when the scheduler goes away.
         """
-        waiting, running = deque(arguments), dict[str, Any]()
+        waiting, running = deque(arguments), dict[Any, str]()
+        seen_s, revivals = time.monotonic(), 0
         try:
             while waiting or running:
-                self._keep_connection()
-                self._count_devices(bool(running))
-                while waiting and len(running) < self._devices and self._client.status == "running":
+                devices = self._devices()
+                if devices:
+                    seen_s = time.monotonic()
+                elif time.monotonic() - seen_s > _WITHOUT_WORKERS_S:
+                    if self.workers.is_local:
+                        revivals += 1
+                        self._revive(revivals)
+                        waiting.extendleft(running.values())
+                        running.clear()
+                    else:
+                        self._say_no_worker()
+                    seen_s = time.monotonic()
+                while waiting and len(running) < devices:
                     name = waiting.popleft()
-                    running[name] = self._submitted(function, arguments[name], name)
-                for name, future in list(running.items()):
-                    if future.client is not self._client or future.status in ("cancelled", "lost"):
-                        # the scheduler went away, which is not the run's fault
-                        del running[name]
-                        waiting.appendleft(name)
-                    elif future.done() and (found := self._outcome(future)) is not None:
-                        del running[name]
-                        yield name, found
-                look(PoolState(len(waiting), len(running), self._devices))
-                time.sleep(_LOOK_EVERY_S)
+                    running[self._submitted(function, arguments[name], name)] = name
+                look(PoolState(len(waiting), len(running), devices))
+                for future in self._finished(running):
+                    revivals = 0
+                    yield running.pop(future), self._outcome(future)
         finally:
-            for future in running.values():
-                future.release()
+            if self._client.status == "running":
+                self._client.cancel(list(running))
 
     def _submitted(self, function: Callable[[Any], Any], argument: Any, name: str) -> Any:
-        """A future under a key of its own, so that no result of an earlier scheduler is taken for this one's."""
-        key = f"{name}-{time.time_ns():x}-{next(self._numbers)}"
+        key = f"{name}-{time.time_ns():x}"  # of this call alone: no result of an earlier one is taken for it
         return self._client.submit(function, argument, key=key, resources={RESOURCE: 1}, pure=False)
 
-    def _outcome(self, future: Any) -> Any:
-        """A result; None if it was lost on its way, which its status will say."""
-        if future.status == "error":
-            error = future.exception(timeout=_GATHER_S)
-            if isinstance(error, distributed().KilledWorker):
-                return Lost(f"{error.allowed_failures + 1} workers died at it")
-            if isinstance(error, ImportError):
-                expected, remedy = "the phyradgs-cl of this process", "install the same version there"
-                raise InputError("a worker", str(error), expected, remedy)
-            raise error
+    def _finished(self, running: Mapping[Any, str]) -> set[Any]:
+        if not running:
+            time.sleep(_LOOK_EVERY_S)
+            return set()
         try:
-            return future.result(timeout=_GATHER_S)
-        except _TEMPORARY:
-            return None
+            options = {"timeout": _LOOK_EVERY_S, "return_when": "FIRST_COMPLETED"}
+            with self._client.as_current():
+                return set(distributed().wait(list(running), **options).done)
+        except (TimeoutError, asyncio.TimeoutError):
+            return set()
+        except CancelledError as error:
+            raise self._scheduler_gone() from error
+
+    def _outcome(self, future: Any) -> Any:
+        try:
+            return future.result(timeout=_CONNECT_S)
+        except distributed().KilledWorker as error:
+            return Lost(f"{error.allowed_failures + 1} workers died at it")
+        except ImportError as error:
+            expected, remedy = "the phyradgs-cl of this process", "install the same version there"
+            raise InputError("a worker", str(error), expected, remedy) from error
+        except _NO_ANSWER as error:
+            if future.status == "error":
+                raise
+            raise self._scheduler_gone() from error
 
     # --- the scheduler --------------------------------------------------------------------------------
 
-    def _started(self) -> Any:
-        """Local workers; a process that ends while it starts ends them all, and they are started again."""
-        for _ in range(_STARTS):
-            try:
-                return local_cluster(self.workers)
-            except (RuntimeError, *_TEMPORARY) as error:
-                reason = _reason(error)
-        remedy = "try fewer --workers"
-        raise DeviceError("local workers", f"that do not start ({reason})", "processes that stay", remedy)
-
-    def _revive(self) -> None:
-        """A nanny whose worker was killed as it started does not try again."""
-        log.warning("no local worker is left: starting them anew")
-        self._close()
-        self._cluster = self._started()
-        self._client = self._connected()
+    @property
+    def _culprit(self) -> str:
+        return "local workers" if self.workers.is_local else f"--scheduler {self.workers.scheduler}"
 
     def _connected(self) -> Any:
         package, scheduler = distributed(), self.workers.scheduler
@@ -169,54 +158,29 @@ class Pool:
         if is_file and not Path(scheduler).is_file():  # Dask would wait for it without a word
             raise FileNotFoundError("no such file")
         where = {"scheduler_file": scheduler} if is_file else {"address": scheduler}
+        return package.Client(**where, timeout=_CONNECT_S, set_as_default=False)
+
+    def _devices(self) -> int:
+        """How many runs the workers may have at a time."""
         try:
-            return package.Client(**where, timeout=_CONNECT_S, set_as_default=False)
-        except ValueError as error:  # no address at all, or no JSON
-            raise OSError(str(error)) from error
+            workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        except _NO_ANSWER as error:
+            raise self._scheduler_gone() from error
+        if self._client.status != "running":
+            raise self._scheduler_gone()
+        return sum(int(worker.get("resources", {}).get(RESOURCE, 0)) for worker in workers)
 
-    def _keep_connection(self) -> None:
-        """Waits for a scheduler that went away; its runs then count as cancelled."""
-        if self._client.status == "running":
-            return
-        log.warning("the scheduler %s is gone: waiting for it", self.workers.scheduler)
-        deadline = time.monotonic() + _RECONNECT_S
-        while self._client.status != "running":
-            if time.monotonic() > deadline:
-                found = f"gone for {_RECONNECT_S / 60:.0f} minutes"
-                remedy = "start it, and repeat the command to go on"
-                raise InputError(f"--scheduler {self.workers.scheduler}", found, "a scheduler", remedy)
-            if self._client.status == "closed":
-                with suppress(*_TEMPORARY):
-                    self._client = self._connected()
-            time.sleep(_LOOK_EVERY_S)
-        self._addresses, self._devices, self._counted_s = set(), 0, 0.0
-        log.warning("the scheduler %s is back: going on", self.workers.scheduler)
+    def _scheduler_gone(self) -> InputError:
+        return InputError(self._culprit, "gone", "a scheduler", "start it, and repeat the command to go on")
 
-    def _count_devices(self, is_busy: bool) -> None:
-        now = time.monotonic()
-        if now - self._counted_s < _COUNT_EVERY_S:
-            return
-        self._counted_s = now
-        try:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        except _TEMPORARY:
-            return
-        able = {name: int(w.get("resources", {}).get(RESOURCE, 0)) for name, w in workers.items()}
-        addresses = {name for name, devices in able.items() if devices > 0}
-        for gone in sorted(self._addresses - addresses) if is_busy else ():
-            log.warning("worker %s is gone: its run is made again", gone)
-        self._addresses, self._devices = addresses, sum(able.values())
-        if self._devices > 0:
-            self._seen_s = now
-        elif self.workers.is_local:
-            if now - self._seen_s > _REVIVE_S:
-                self._revive()
-                self._seen_s = time.monotonic()
-        elif now - self._said_s > _SAY_EVERY_S:
-            self._said_s = now
-            start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
-            log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)
+    def _revive(self, times: int) -> None:
+        """A nanny whose worker was killed as it started does not try again."""
+        if times > _REVIVALS:
+            raise DeviceError(self._culprit, "all gone", "processes that stay", "try fewer --workers")
+        log.warning("no local worker is left: starting them anew")
+        self.__exit__()
+        self.__enter__()
 
-
-def _reason(error: BaseException) -> str:
-    return str(error) or type(error).__name__
+    def _say_no_worker(self) -> None:
+        start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
+        log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)

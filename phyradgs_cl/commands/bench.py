@@ -24,10 +24,11 @@ from phyradgs_cl.bench import (
 )
 from phyradgs_cl.cluster import LOCAL, Workers
 from phyradgs_cl.commands.console import complain, remark, say
+from phyradgs_cl.commands.files import file_parser
 from phyradgs_cl.commands.options import Axis, Device, Scheduler, WorkerCount
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import device_wish, file_parser
+from phyradgs_cl.settings import device_wish
 
 EXAMPLE = (
     "Example: phyradgs bench table1 --volumes VOLUMES -o results --size S --seeds 0,1,2\n\n"

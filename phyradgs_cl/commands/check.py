@@ -11,7 +11,8 @@ import typer
 
 from phyradgs_cl.check import SUSPICIOUS, CheckResult, CountReader, check
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Device, file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Device
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, read_scan
 from phyradgs_cl.io.scan_copy import copy_with_offset
@@ -50,7 +51,6 @@ def check_command(
     counts = CountReader()
     with expecting(scan, "scan"):
         loaded = read_scan(scan, counts)
-    loaded.check_timing()
     with Ticker("question") as ticker:
         found = check(loaded, Runtime(wish), counts, ticker.show)
     say(_as_json(found, scan) if as_json else _as_text(found))

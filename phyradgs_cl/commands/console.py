@@ -10,14 +10,14 @@ from typing import Any
 
 import typer
 
-from phyradgs_cl.checks import shown
 from phyradgs_cl.errors import OutputError
+from phyradgs_cl.text import plain_text
 
 
 def say(text: str) -> None:
     """One result on stdout."""
     try:
-        typer.echo(text)
+        typer.echo(plain_text(text))
     except BrokenPipeError:  # nobody reads on, as after `| head`: no error, and no reason to stop
         give_up_stdout()
     except OSError as error:
@@ -29,13 +29,15 @@ def say(text: str) -> None:
 def complain(text: str, status: int = 2) -> int:
     """One line on stderr; the exit status to end with."""
     with suppress(OSError):  # nobody is left to be told
-        typer.echo("phyradgs: " + " ".join(text.split()), err=True)
+        typer.echo("phyradgs: " + plain_text(" ".join(text.split())), err=True)
     return status
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
     """What Typer found wrong with the words of a command, with the value that it could not read."""
     text = str(error.format_message()).replace("Value error, ", "")
+    from phyradgs_cl.checks import shown
+
     value = _value_of(getattr(error, "param", None), arguments)
     return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {shown(value)}"
 
@@ -54,7 +56,7 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
 def remark(text: str) -> None:
     """One line on stderr that is neither a result nor trouble."""
     with suppress(OSError):
-        typer.echo(text, err=True)
+        typer.echo(plain_text(text), err=True)
 
 
 def give_up_stdout() -> None:

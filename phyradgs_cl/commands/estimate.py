@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument
+from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
 from phyradgs_cl.reconstructors import Reconstruction, method_options
@@ -25,7 +25,6 @@ def estimate_command(
     settings = request.settings()
     options = method_options(settings.method, settings.preset, settings.changes)
     loaded = load_scan(scan)
-    loaded.check_timing()
     with settings.naming_origins():
         rt = Runtime(settings.device, memory=settings.memory)
     before_s = seconds_since_start()  # a run will have started, and read the scan, as this did

@@ -9,17 +9,17 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"
 
 
 def evaluate_command(
-    volume: Annotated[Path, file_argument("VOLUME", "Volume file.")],
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
     reference: Annotated[
         Path,
-        file_option("--reference", help="Scan with a known truth, or a volume on the same grid."),
+        file_option("--reference", help="Scan with a known truth, or a volume; VOLUME is resampled onto its grid (linear)."),
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     picture: Annotated[
@@ -32,7 +32,8 @@ def evaluate_command(
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    facts = run_evaluation(volume, reference, picture or volume.with_suffix(".png"))
+    unpacked = volume.with_suffix("") if volume.suffix == ".gz" else volume
+    facts = run_evaluation(volume, reference, picture or unpacked.with_suffix(".png"))
     if as_json:
         say(json.dumps(facts))
     else:

@@ -9,23 +9,17 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument, file_option
-from phyradgs_cl.exporters import EXPORTS, export_volume
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.exporters import CLOUDS, EXPORTS, export_volume, format_of
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting
 
-EXAMPLE = "Example: phyradgs export volume.h5 --to nii --mu-water-per-mm 0.0195"
+EXAMPLE = "Example: phyradgs export volume.h5 -o volume.nii --mu-water-per-mm 0.0195"
 Export = Enum("Export", {name: name for name in EXPORTS}, type=str)  # type: ignore[misc]
 
 
 def export_command(
     volume: Annotated[Path, file_argument("VOLUME", "Volume file.")],
-    to: Annotated[
-        Export,  # type: ignore[valid-type]
-        typer.Option(
-            "--to", help="nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians."
-        ),
-    ],
     output: Annotated[
         Path | None,
         file_option(
@@ -33,6 +27,14 @@ def export_command(
             "-o",
             help="File to write, or for dicom a new folder; nii.gz is compressed.",
             show_default="VOLUME with the format's suffix",
+        ),
+    ] = None,
+    to: Annotated[
+        Export | None,  # type: ignore[valid-type]
+        typer.Option(
+            "--to",
+            help="nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians.",
+            show_default="what the output's suffix says",
         ),
     ] = None,
     mu_water_per_mm: Annotated[
@@ -43,7 +45,8 @@ def export_command(
     ] = None,
 ) -> None:
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
+    form = format_of(output) if to is None else str(to.value)
     with finish_despite_interrupt(), expecting(volume, "volume"):
-        written = export_volume(volume, to.value, output, mu_water_per_mm)  # type: ignore[attr-defined]
-    unit = "" if to.value in ("ply", "npz") else ", HU" if mu_water_per_mm is not None else ", 1/mm"  # type: ignore[attr-defined]
-    say(f"{written}: {to.value}{unit}")  # type: ignore[attr-defined]
+        written = export_volume(volume, form, output, mu_water_per_mm)
+    unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"
+    say(f"{written}: {form}{unit}")

@@ -10,9 +10,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Axis, DetectorModel, file_argument, file_option
+from phyradgs_cl.commands.console import remark, say
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, VoxelMm
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
@@ -120,6 +122,9 @@ def import_command(
             help="Where this scan begins in a JSON of several (phyradgs-real).", show_default="the whole"
         ),
     ] = None,
+    size: Size = None,
+    voxel_mm: VoxelMm = None,
+    roi_mm: RoiMm = None,
 ) -> None:
     """Import a scan of another program: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF."""
     options = ImportOptions(
@@ -143,11 +148,15 @@ def import_command(
         part=str(_value(part)),
         first_view=first_view,
     )
+    grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
     check_writable(output)
     chosen = _value(form) or recognise(source)
     with only_run(output):
-        scan = import_scan(source, options, chosen)
+        stored = import_scan(source, options, chosen)
+        scan = stored.with_grid(grid)
+        if stored.reference is not None and scan.reference is None:
+            remark(f"{output}: the reference of {source} is on another grid and is left out")
         with finish_despite_interrupt():
             write_scan(output, scan)
     frames, rows, columns = scan.projections.shape

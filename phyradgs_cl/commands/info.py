@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
+import typer
+
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import file_argument
+from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.workflow import summary
 
 EXAMPLE = "Example: phyradgs info scan.h5"
+_LONGEST = 2000
 
 
 def info_command(
-    file: Annotated[Path, file_argument("FILE", "Scan or volume file.")],
+    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Say what a file holds."""
-    for key, value in summary(file).items():
-        say(f"{key.replace('_', ' '):24s} {value}")
+    facts = summary(file)
+    if as_json:
+        say(json.dumps(facts, default=str))
+        return
+    for key, value in facts.items():
+        text = str(value)
+        say(f"{key.replace('_', ' '):24s} {text[:_LONGEST]}{'…' if len(text) > _LONGEST else ''}")

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
+from phyradgs_cl.commands.files import file_option
 from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import file_parser
+from phyradgs_cl.settings import numbers
 
 MethodName = Enum("MethodName", {name: name for name in METHODS}, type=str)  # type: ignore[misc]
 
@@ -31,17 +32,6 @@ class Axis(str, Enum):
 class DetectorModel(str, Enum):
     log = "log"
     intensity = "intensity"
-
-
-def file_option(*names: str, help: str, show_default: bool | str = True) -> Any:
-    """An option that takes a file name."""
-    parser = file_parser(names[-1])
-    return typer.Option(*names, parser=parser, metavar="FILE", help=help, show_default=show_default)
-
-
-def file_argument(name: str, help: str) -> Any:
-    """An argument that is a file name."""
-    return typer.Argument(parser=file_parser(name), metavar=name, help=help)
 
 
 Device = Annotated[
@@ -66,6 +56,9 @@ Memory = Annotated[
     ),
 ]
 
+RANKS = "Under mpiexec (docs: cluster.md)"
+"""What the help of a command calls its options for ranks, which stand at its end."""
+
 # where many runs are made
 Scheduler = Annotated[
     str | None,
@@ -78,10 +71,42 @@ WorkerCount = Annotated[
     int | None, typer.Option(metavar="N", help="Local workers, each a process.", show_default="one a device")
 ]
 
+# which voxels; Any, as the numbers are checked where they are used
+Size = Annotated[
+    Any,
+    typer.Option(
+        parser=numbers,
+        metavar="N|Z,Y,X",
+        help="Voxels of the volume, of a single number along its longest side; the box stays as it is.",
+        show_default="the scan's",
+    ),
+]
+VoxelMm = Annotated[
+    Any,
+    typer.Option(
+        parser=numbers,
+        metavar="D|Z,Y,X",
+        help="Sides of a voxel, mm; the box stays as it is, but for whole voxels.",
+        show_default="the scan's",
+    ),
+]
+RoiMm = Annotated[
+    Any,
+    typer.Option(
+        "--roi-mm",
+        "--roi",
+        parser=numbers,
+        metavar="Z0,Z1,Y0,Y1,X0,X1",
+        help="Box of the volume, mm about the axis; the voxels stay as they are.",
+        show_default="the scan's",
+    ),
+]
+
 # what a reconstruction is asked for; commands that speak of one share these words
 Method = Annotated[
     MethodName | None,  # type: ignore[valid-type]
     typer.Option(
+        case_sensitive=False,
         help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
         "naf, sax-nerf: neural fields; the others are iterative on voxels.",
         show_default="phyradgs",
@@ -130,7 +155,10 @@ GaussianCount = Annotated[
 Batch = Annotated[
     int | None,
     typer.Option(
-        metavar="B", help="Frames a step, for splats (docs: cluster.md).", show_default="as many as ranks"
+        metavar="B",
+        help="Frames a step, for splats.",
+        show_default="as many as ranks",
+        rich_help_panel=RANKS,
     ),
 ]
 Seed = Annotated[

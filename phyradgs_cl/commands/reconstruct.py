@@ -10,18 +10,22 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say
-from phyradgs_cl.commands.options import Output, file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Output
 from phyradgs_cl.commands.ranks import last_words
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
+from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
+from phyradgs_cl.reconstructors import ProgressReport
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import ReconstructionJob, profile_report, run_reconstruction
 
 EXAMPLE = (
     "Example: phyradgs reconstruct scan.h5 -o volume.h5 --iterations 2000\n\n"
-    "Ctrl-C keeps what there is and leaves a checkpoint; --resume goes on from it."
+    "Ctrl-C keeps what there is, here as volume.partial.h5, and a checkpoint; --resume goes on from it."
 )
 
 
@@ -43,7 +47,8 @@ def reconstruct_command(
     preview: Annotated[
         Path | None,
         file_option(
-            "--preview", help="PNG of the three middle slices, made anew every five seconds of the run."
+            "--preview",
+            help="PNG of the three middle slices; of the run under way, every five seconds, as NAME.partial.png.",
         ),
     ] = None,
     profile: Annotated[
@@ -70,27 +75,35 @@ def reconstruct_command(
 
     ranks = launched_ranks()
     runtimes: list[Runtime] = []
+    ticker = Ticker("iteration")
 
     def runtime() -> Runtime:
         with settings.naming_origins():
             chosen = {"profile": profile, "memory": settings.memory, "ranks": ranks}
             runtimes.append(Runtime(settings.device, **chosen))
+        ticker.stage("building kernels")
         return runtimes[-1]
 
-    with failing_together(ranks, last_words), Ticker("iteration") as ticker:
+    with failing_together(ranks, last_words), ticker:
+        ticker.stage(f"reading {scan}")
+        report: ProgressReport = ticker.progress
         if preview is not None:
-            check_preview(preview, scan, output)
-        report = Preview(preview, ticker.progress) if preview else ticker.progress
+            check_preview(preview, scan, output, partial_path(output))
+            report = Preview(preview, ticker.progress)
         result, metrics = run_reconstruction(job, runtime, report, ranks)
-    interrupted = result.facts.get("interrupted_at")
+        if isinstance(report, Preview) and result.state is None and ranks.rank == 0:
+            with finish_despite_interrupt():
+                report.finish(result.volume, result.grid)
+    written = output if result.state is None else partial_path(output)
     say(
-        f"{output}: {job.method}{_early_stop(result.facts)}, {result.facts['seconds']:.1f} s"
+        f"{written}: {job.method}{_early_stop(result.facts)}, {result.facts['seconds']:.1f} s"
         + _metrics_text(metrics)
     )
     if profile:
         say(profile_report(runtimes[-1], result))
-    if interrupted is not None:
-        complain(f"interrupted after iteration {interrupted}: repeat the command with --resume to go on")
+    if result.state is not None:
+        at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
+        complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to go on")
         raise typer.Exit(signals.status())
 
 

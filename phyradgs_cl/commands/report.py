@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Device, Output, file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import Device, Output
 from phyradgs_cl.report import write_report
 from phyradgs_cl.report.page import DEFAULT_VIEWS
 from phyradgs_cl.runtime import Runtime

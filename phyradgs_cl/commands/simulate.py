@@ -9,19 +9,13 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output, file_option
+from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, offset_pair, pulse_pair
-from phyradgs_cl.simulation import SimulationOptions
-from phyradgs_cl.workflow import (
-    SimulationJob,
-    load_scanner_for,
-    make_scan_protocol,
-    refuse_jitter,
-    refuse_noise_options,
-    run_simulation,
-)
+from phyradgs_cl.simulation import scanner_for, scanner_options
+from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_options, run_simulation
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
 
@@ -52,7 +46,10 @@ def simulate_command(
     ] = None,
     volume: Annotated[
         Path | None,
-        file_option("--volume", help="HDF5 file with a dataset /volume (z, y, x), or one of our volumes."),
+        file_option(
+            "--volume",
+            help="Volume file: ours, an HDF5 file with a dataset /volume (z, y, x), mha, nii, nrrd, npy or tiff.",
+        ),
     ] = None,
     scanner: Annotated[str, typer.Option(help="Scanner by name (r2, carm) or a TOML file.")] = "r2",
     protocol: Annotated[
@@ -151,43 +148,31 @@ def simulate_command(
     memory: Memory = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
-    readout_axis = readout.value if readout else None
     refuse_jitter(protocol.value, jitter_deg)
     refuse_noise_options(noise.value, {"--dose": dose, "--electronic-noise": electronic_noise})
     wish = device_wish(device)
-    job = SimulationJob(
-        output,
-        phantom.value if phantom else None,
-        volume,
-        scanner,
-        detector,
-        offset_pair("--detector-offset", detector_offset),
-        size,
-        pixel_samples,
-    )
-    described = load_scanner_for(job)
-    options = SimulationOptions(
-        protocol=make_scan_protocol(
-            protocol.value,
-            described,
-            views=views,
-            exposure_deg=exposure_deg,
-            readout_ratio=readout_ratio,
-            pulse=pulse_pair("--pulse", pulse),
-            start_deg=start_deg,
-        ),
-        readout_axis=readout_axis or described.readout_axis,
-        readout_direction=described.readout_direction if readout_direction is None else readout_direction,
+    described = scanner_for(scanner, detector, offset_pair("--detector-offset", detector_offset))
+    options = scanner_options(
+        described,
+        protocol.value,
+        views=views,
+        exposure_deg=exposure_deg,
+        readout_ratio=readout_ratio,
+        pulse=pulse_pair("--pulse", pulse),
+        start_deg=start_deg,
+        readout_axis=readout.value if readout else None,
+        readout_direction=readout_direction,
         detector_model=detector_model.value,
         peak=peak,
         noise=noise.value,
-        dose=SimulationOptions.dose if dose is None else dose,
-        electronic_noise=SimulationOptions.electronic_noise if electronic_noise is None else electronic_noise,
-        jitter_deg=0.0 if jitter_deg is None else jitter_deg,
-        lag=described.lag if lag is None else lag,
+        dose=dose,
+        electronic_noise=electronic_noise,
+        jitter_deg=jitter_deg,
+        lag=lag,
         time_samples=time_samples,
         seed=seed,
     )
+    job = SimulationJob(output, phantom.value if phantom else None, volume, scanner, size, pixel_samples)
     with Ticker("frame") as ticker:
         scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)
     frames, rows, columns = scan.projections.shape

@@ -10,7 +10,8 @@ import typer
 from phyradgs_cl import signals
 from phyradgs_cl.cluster import LOCAL, Workers, has_dask
 from phyradgs_cl.commands.console import complain, remark, say
-from phyradgs_cl.commands.options import Scheduler, WorkerCount, file_argument
+from phyradgs_cl.commands.files import file_argument
+from phyradgs_cl.commands.options import Scheduler, WorkerCount
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.json_lines import Line
 from phyradgs_cl.progress import Ticker

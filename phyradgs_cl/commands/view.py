@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from phyradgs_cl.commands.options import file_argument
+from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.report import view_volume
 
 EXAMPLE = "Example: phyradgs view volume.h5"

@@ -1,6 +1,10 @@
 """The detector: counts and line integrals, noise, and averaging over the exposure."""
 
-from phyradgs_cl.detector.attenuation import attenuation_to_counts, counts_to_attenuation
+from phyradgs_cl.detector.attenuation import (
+    attenuation_to_counts,
+    counts_to_attenuation,
+    frames_to_attenuation,
+)
 from phyradgs_cl.detector.average import average
 from phyradgs_cl.detector.lag import add_lag, lagged, remove_lag, without_lag
 from phyradgs_cl.detector.noise import (
@@ -11,6 +15,7 @@ from phyradgs_cl.detector.noise import (
     tigre_noise,
 )
 from phyradgs_cl.detector.noise_level import noise_level
+from phyradgs_cl.detector.saturation import clustered_share, find_saturation
 from phyradgs_cl.detector.transmission import transmission_weights
 
 __all__ = [
@@ -19,7 +24,10 @@ __all__ = [
     "average",
     "beer_lambert_counts",
     "beer_lambert_noise",
+    "clustered_share",
     "counts_to_attenuation",
+    "find_saturation",
+    "frames_to_attenuation",
     "lagged",
     "noise_level",
     "remove_lag",

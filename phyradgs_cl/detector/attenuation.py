@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -13,6 +15,8 @@ QUANTITIES = ("attenuation", "transmission", "counts")
 # Transmission is kept at or above this before the logarithm (a line integral of 13.8): beyond what
 # 16-bit detectors resolve, and finite.
 TRANSMISSION_FLOOR = 1e-6
+_LARGEST = float(np.finfo(np.float32).max)
+_BLOCK = 1 << 18  # pixels that are converted at a time
 
 
 def counts_to_attenuation(
@@ -42,17 +46,47 @@ def counts_to_attenuation(
     shape("data", frames, (None, None, None))
     shape("image_key", key, (frames.shape[0],))
     _check_keys(key)
-    chosen = np.flatnonzero(key == PROJECTION)
-    result = np.empty((chosen.size, *frames.shape[1:]), dtype=np.float32)
+    return _converted(frames, np.flatnonzero(key == PROJECTION), quantity, frames[key == FLAT], frames[key == DARK])
+
+
+def frames_to_attenuation(
+    frames: NDArray[np.generic],
+    quantity: str,
+    flats: NDArray[np.generic] | None = None,
+    darks: NDArray[np.generic] | None = None,
+    largest: float = _LARGEST,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own.
+
+    Attenuation above ``largest`` must not be used either.
+    """
+    return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
+
+
+def _converted(
+    frames: NDArray[np.generic],
+    chosen: Sequence[int] | NDArray[np.intp],
+    quantity: str,
+    flats: NDArray[np.generic] | None,
+    darks: NDArray[np.generic] | None,
+    largest: float = _LARGEST,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    panel = frames.shape[1:]
+    result = np.empty((len(chosen), *panel), dtype=np.float32)
     unusable = np.empty(result.shape, dtype=bool)
-    dark, gain = _calibration(frames, key) if quantity == "counts" else (0.0, np.ones(frames.shape[1:]))
-    for i, frame in enumerate(chosen):  # a frame at a time: float64 copies of a whole scan are large
-        values = frames[frame].astype(np.float64)
-        if quantity == "attenuation":
-            unusable[i] = ~(np.abs(values) <= np.finfo(np.float32).max)  # NaN compares false
-            result[i] = np.where(unusable[i], 0.0, values)
-        else:
-            result[i], unusable[i] = _minus_log(values - dark, gain)
+    rows = max(1, _BLOCK // max(1, panel[1]))
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is marked as unusable
+        plain = np.broadcast_to(0.0, panel), np.broadcast_to(1.0, panel)
+        dark, gain = _calibration(flats, darks) if quantity == "counts" else plain
+        for i, frame in enumerate(chosen):
+            for start in range(0, panel[0], rows):  # float64 copies of a scan, or of one huge frame, are large
+                part = slice(start, start + rows)
+                values = frames[frame, part].astype(np.float64)
+                if quantity == "attenuation":
+                    bad = ~(np.abs(values) <= largest)  # NaN compares false
+                    result[i, part], unusable[i, part] = np.where(bad, 0.0, values), bad
+                else:
+                    result[i, part], unusable[i, part] = _minus_log(values - dark[part], gain[part])
     return result, unusable
 
 
@@ -90,15 +124,15 @@ def _check_keys(key: NDArray[np.generic]) -> None:
 
 
 def _calibration(
-    frames: NDArray[np.generic], key: NDArray[np.generic]
+    flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean dark and mean flat minus dark, each (v, u); frames with NaN spoil their pixel only."""
-    if not (key == FLAT).any():
+    if flats is None or len(flats) == 0:
         remedy = "add flat frames, or store transmission or attenuation"
         raise InputError("image_key", "no flat (key 1) among counts", "at least one flat frame", remedy)
-    flat = frames[key == FLAT].mean(axis=0, dtype=np.float64)
-    has_dark = (key == DARK).any()
-    dark = frames[key == DARK].mean(axis=0, dtype=np.float64) if has_dark else np.zeros(flat.shape)
+    flat = flats.mean(axis=0, dtype=np.float64)
+    has_dark = darks is not None and len(darks) > 0
+    dark = darks.mean(axis=0, dtype=np.float64) if has_dark else np.zeros(flat.shape)
     return dark, flat - dark
 
 

@@ -17,7 +17,7 @@ from phyradgs_cl.exporters.placed import Placed, hounsfield, placed
 from phyradgs_cl.exporters.tiff import write_tiff
 from phyradgs_cl.io import read_volume
 
-__all__ = ["EXPORTS", "Placed", "default_output", "export_volume", "hounsfield", "placed"]
+__all__ = ["CLOUDS", "EXPORTS", "Placed", "default_output", "export_volume", "format_of", "hounsfield", "placed"]
 
 VOXELS: dict[str, Callable[[Path, Placed], None]] = {
     "nii": write_nifti,
@@ -64,6 +64,16 @@ def export_volume(
 def default_output(path: Path, to: str) -> Path:
     """The volume's name with the format's suffix; for DICOM a folder."""
     return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
+
+
+def format_of(output: str | Path | None) -> str:
+    """The one of ``EXPORTS`` whose suffix an output's name has; InputError, which lists them, for any other."""
+    for to in EXPORTS:
+        if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
+            return to
+    known = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))
+    found = "neither a format nor an output" if output is None else f"output {output}"
+    raise InputError("--to", found, f"a suffix of {known}", "name the output so, or say --to, for dicom always")
 
 
 def _suffixes(to: str) -> tuple[str, ...]:

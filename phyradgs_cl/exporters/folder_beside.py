@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
+from phyradgs_cl.io.atomic import temporary_name
 
 
 @contextmanager
@@ -24,8 +24,7 @@ def folder_written_beside(path: Path) -> Iterator[Path]:
         raise OutputError(
             str(path), "something that is there already", "a new or an empty folder", "choose another name"
         )
-    temporary = target.with_name(f".{target.name[:60]}.{secrets.token_hex(4)}.part")
-    signals.unfinished.add(str(temporary))  # Ctrl-C may end the process at any line
+    temporary = temporary_name(target)
     try:
         temporary.mkdir()
         yield temporary

@@ -9,7 +9,6 @@ import numpy as np
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, written_beside
 
-_SHAPES = {"mean": 3, "scale": 3, "quaternion": 4, "density": None}
 _PLY_NAMES = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2"),
     *("rot_0", "rot_1", "rot_2", "rot_3", "density"),
@@ -21,16 +20,7 @@ def gaussians_of(stored: StoredVolume, culprit: str) -> dict[str, np.ndarray]:
     if stored.gaussians is None:
         remedy = "reconstruct with --method phyradgs or r2"
         raise InputError(f"{culprit}:/entry/gaussians", "nothing there", "Gaussians", remedy)
-    count = len(stored.gaussians.get("mean", ()))
-    found = {}
-    for name, width in _SHAPES.items():
-        values = stored.gaussians.get(name)
-        shape = (count,) if width is None else (count, width)
-        if values is None or values.shape != shape:
-            what = "nothing there" if values is None else f"shape {values.shape}"
-            raise InputError(f"{culprit}:/entry/gaussians/{name}", what, f"shape {shape}")
-        found[name] = values.astype(np.float32)
-    return found
+    return vars(stored.gaussians)
 
 
 def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:

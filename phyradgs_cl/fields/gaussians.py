@@ -8,8 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import expit, logit
+import scipy
 
 from phyradgs_cl.errors import InputError
 
@@ -66,16 +65,14 @@ class Gaussians:
 
         Sampled at the centres of voxels of that size this is, to the Gaussians' second moments, the mean over a voxel.
         """
-        turn = (
-            Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]).as_matrix()
-            if self.count
-            else np.zeros((0, 3, 3))
-        )
+        if self.count == 0:
+            return self
+        turn = scipy.spatial.transform.Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]).as_matrix()
         covariance = np.einsum("gij,gj,gkj->gik", turn, self.scale.astype(np.float64) ** 2, turn)
         variance, axes = np.linalg.eigh(covariance + np.diag(np.square(box)) / 12)
         axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a turn, not a mirror
         scale = np.sqrt(variance)
-        x, y, z, w = Rotation.from_matrix(axes).as_quat().T if self.count else np.zeros((4, 0))
+        x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         density = self.density * np.prod(self.scale, axis=1) / np.prod(scale, axis=1)
         return Gaussians(self.mean, scale, np.stack([w, x, y, z], -1), density)
 
@@ -90,7 +87,7 @@ class Activation:
     def apply(self, raw: np.ndarray) -> np.ndarray:
         """Raw (11, G) to parameter rows (11, G); the float64 twin of ``activate`` in cl/adam.cl."""
         rows = np.array(raw, dtype=np.float64)
-        rows[SCALE] = self.scale_min + (self.scale_max - self.scale_min) * expit(raw[SCALE])
+        rows[SCALE] = self.scale_min + (self.scale_max - self.scale_min) * scipy.special.expit(raw[SCALE])
         rows[QUATERNION] = raw[QUATERNION] / np.linalg.norm(raw[QUATERNION], axis=0)
         rows[DENSITY] = np.maximum(np.logaddexp(0.0, raw[DENSITY]), _DENSITY_FLOOR)
         return rows
@@ -99,7 +96,7 @@ class Activation:
         """Parameter rows (11, G) to raw ones; scales are kept a little inside their bounds."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
-        raw[SCALE] = logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))
+        raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))
         density = np.maximum(rows[DENSITY], _DENSITY_FLOOR)
         raw[DENSITY] = density + np.log(-np.expm1(-density))
         return raw

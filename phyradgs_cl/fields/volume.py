@@ -11,6 +11,7 @@ from phyradgs_cl.errors import InputError
 
 MOST_VOXELS = 2**38
 """A terabyte of float32: what asks for more is damage."""
+_SAME_PLACE = 1e-3  # of a voxel: what grids stored in float32 need
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,12 @@ class Grid:
         return (z, y, x)
 
     @property
+    def box_mm(self) -> np.ndarray:
+        """Where the voxels begin and end: (3, 2) float64, z, y and x."""
+        half_mm, centre_mm = np.array(self.size_mm) / 2, np.array(self.offset_mm)
+        return np.stack([centre_mm - half_mm, centre_mm + half_mm], -1)
+
+    @property
     def half_longest_mm(self) -> float:
         """Half the longest side: the unit of length inside the reconstruction."""
         return max(self.size_mm) / 2
@@ -69,6 +76,12 @@ class Grid:
         )
         return z, y, x
 
+    def is_close(self, other: Grid) -> bool:
+        """Whether two grids are one but for what files round off."""
+        near_mm = 1e-5 * max(self.size_mm)
+        same_voxels = np.allclose(self.voxel_size_mm, other.voxel_size_mm, rtol=1e-5)
+        return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
+
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
         """The voxels [start, start + shape) (z, y, x) as a grid of their own."""
         z, y, x = (
@@ -76,6 +89,17 @@ class Grid:
             for first, s, n, d in zip(self.first_centre_mm, start, shape, self.voxel_size_mm, strict=True)
         )
         return Grid(shape, self.voxel_size_mm, (z, y, x))
+
+    def start_in(self, whole: Grid) -> tuple[int, int, int] | None:
+        """The first voxel (z, y, x) of a grid that is a part of ``whole``; None for one that is not."""
+        if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
+            return None
+        exact = np.subtract(self.first_centre_mm, whole.first_centre_mm) / whole.voxel_size_mm
+        start = np.round(exact)
+        if np.abs(exact - start).max() > _SAME_PLACE or (start < 0).any() or (start + self.shape > whole.shape).any():
+            return None
+        z, y, x = (int(n) for n in start)
+        return z, y, x
 
     def scaled(self, factor: float) -> Grid:
         """The same voxels with every length multiplied by ``factor``."""

@@ -1,6 +1,6 @@
-"""Scans in other programs' formats: read, checked as if by strangers, and turned into this package's conventions.
+"""Scans and volumes in other programs' formats: read, checked as if by strangers, and turned into our conventions.
 
-`import_scan` is the door; one module a format.
+`import_scan` and `load_volume` are the doors; one module a format.
 """
 
 from __future__ import annotations
@@ -21,9 +21,18 @@ from phyradgs_cl.importers.r2_gaussian import import_r2
 from phyradgs_cl.importers.recognise import recognise
 from phyradgs_cl.importers.rtk import import_rtk
 from phyradgs_cl.importers.tiff_folder import import_tiff
+from phyradgs_cl.importers.volumes import foreign_volume, load_attenuation, load_volume
 from phyradgs_cl.io.held_warnings import held_warnings
 
-__all__ = ["FORMATS", "ImportOptions", "import_scan", "recognise"]
+__all__ = [
+    "FORMATS",
+    "ImportOptions",
+    "foreign_volume",
+    "import_scan",
+    "load_attenuation",
+    "load_volume",
+    "recognise",
+]
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], Scan]] = {
     "r2": import_r2,

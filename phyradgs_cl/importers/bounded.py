@@ -1,17 +1,30 @@
-"""Reading small texts and NumPy arrays whose size is bounded by the file's own."""
+"""Reading small texts and NumPy arrays whose size is bounded by the file's own, and by this machine's memory."""
 
 from __future__ import annotations
 
 import json
 import math
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.folder import regular_file
+from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
+from phyradgs_cl.io.tables import LARGEST
 
 MOST_TEXT_BYTES = 64 << 20
+MOST_INFLATION = 1040  # deflate cannot do more than 1032
+
+
+def check_room(culprit: str, needed_bytes: int) -> None:
+    """InputError for what would take more than its share of this machine's memory."""
+    most = HOST_SHARE * host_bytes()
+    if needed_bytes > most:
+        found, expected = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, most))
+        remedy = "import fewer frames at a time, or bin them"
+        raise InputError(culprit, f"{found} to unpack", f"at most {expected} on this machine", remedy)
 
 
 def read_bytes(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
@@ -36,6 +49,25 @@ def read_json(path: Path) -> dict[str, object]:
     return content
 
 
+def read_numbers(path: Path, count: int, what: str) -> np.ndarray:
+    """(count,) finite numbers of a text file, one a line; empty lines and what follows a # are passed over."""
+    values = []
+    for number, line in enumerate(read_bytes(path).decode("utf-8-sig", "replace").splitlines(), start=1):
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not abs(value) <= LARGEST:
+            raise InputError(f"{path} line {number}", repr(text[:40]), "a finite number")
+        values.append(value)
+    if len(values) != count:
+        raise InputError(str(path), f"{len(values)} {what}", f"{count}, one for each frame")
+    return np.array(values)
+
+
 def read_npy(path: Path, ndim: int) -> np.ndarray:
     """A numeric array of a .npy file, C order; never a pickle, never larger than the file says."""
     culprit = str(path)
@@ -55,6 +87,30 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
         raise InputError(culprit, f"a damaged .npy file ({error})", "a NumPy array") from error
     values = values.reshape(shape, order="F" if fortran else "C")
     return np.ascontiguousarray(values)
+
+
+def read_raw(path: Path, start: int, shape: tuple[int, ...], dtype: np.dtype, packed: bool) -> np.ndarray:
+    """The array (C order) at byte ``start`` to the end of a file, ``packed`` by zlib or gzip or not at all."""
+    available = path.stat().st_size - start
+    check_array(str(path), shape, dtype, available * (MOST_INFLATION if packed else 1), len(shape))
+    count = math.prod(shape)
+    with open(path, "rb") as file:
+        file.seek(start)
+        if not packed:
+            return np.fromfile(file, dtype, count).reshape(shape)
+        return np.frombuffer(_inflated(path, file.read(), count * dtype.itemsize), dtype).reshape(shape)
+
+
+def _inflated(path: Path, packed: bytes, size: int) -> bytes:
+    """Exactly ``size`` bytes; not one more is unpacked."""
+    machine = zlib.decompressobj(wbits=47)  # zlib or gzip
+    try:
+        data = machine.decompress(packed, size)
+    except zlib.error as error:
+        raise InputError(str(path), f"compressed data that are damaged ({error})", "zlib data") from error
+    if len(data) != size:
+        raise InputError(str(path), f"{len(data)} bytes after unpacking", f"{size} bytes")
+    return data
 
 
 def check_array(

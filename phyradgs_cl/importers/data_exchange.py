@@ -44,7 +44,7 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
         title = _title(source, path)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
     turned = {name: None if s is None else upright(s, options, "top") for name, s in stacks.items()}
-    projections, mask = line_integrals(
+    integrals = line_integrals(
         f"{path}:{_EXCHANGE}/data",
         upright(frames, options, "top"),
         options,
@@ -52,9 +52,7 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
         darks=turned["data_dark"],
     )
     trajectory = turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
-    return put_together(
-        projections, mask, trajectory, geometry, timing, options, title=title, source=str(path)
-    )
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _optional_frames(source: Hdf5Source, name: str, panel: tuple[int, int]) -> np.ndarray | None:

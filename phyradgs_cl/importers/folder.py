@@ -7,12 +7,13 @@ but regular files.
 from __future__ import annotations
 
 import re
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import regular
 
 _MOST_FILES = 200_000
 _LONGEST_NAME = 4096
@@ -69,19 +70,31 @@ def checked_name(name: object, culprit: str) -> str:
 
 def regular_file(path: Path, culprit: str) -> Path:
     """The path of a file that exists and is neither a folder nor a device."""
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):
-        raise InputError(culprit, f"no file {path}", "a file that exists", "check the path") from None
-    if not stat.S_ISREG(mode):  # a pipe would never end
-        what = "a folder" if stat.S_ISDIR(mode) else "something that is not a regular file"
-        raise InputError(culprit, f"{what} at {path}", "a regular file", "check the path")
+    regular.regular_file(path, culprit)
     return path
 
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Sorted by name with numbers by value: 2.tif before 10.tif."""
     return sorted(paths, key=lambda path: _natural(path.name))
+
+
+def check_numbering(paths: Sequence[Path], remedy: str) -> None:
+    """InputError for frames, in natural order, that share a number or leave one out: all later angles would be wrong.
+
+    Numbers are those in the one place where the names differ; names that differ elsewhere too are no numbering.
+    """
+    names = [_natural(path.stem) for path in paths]
+    places = [place for place in zip(*names, strict=False) if len(set(place)) > 1]
+    if len({len(name) for name in names}) > 1 or len(places) > 1 or any(word for _, _, word in sum(places, ())):
+        return
+    numbers = [number for _, number, _ in places[0]] if places else [0] * len(names)
+    steps = [after - before for before, after in pairwise(numbers)]
+    usual = min((step for step in steps if step > 0), default=1)
+    for (before, after), step in zip(pairwise(paths), steps, strict=True):
+        if step != usual:
+            found = f"{after.name} after {before.name}: {'one number' if step == 0 else 'a hole'} in the numbering"
+            raise InputError(str(after.parent), found, "every number once", remedy)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -1,21 +1,19 @@
-"""MetaImage stacks (.mha, .mhd): a text header, then voxels, raw or deflated, here or in one file beside it."""
+"""MetaImage (.mha, .mhd), volumes and stacks of projections: a text, then voxels, raw or deflated, here or beside."""
 
 from __future__ import annotations
 
-import math
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.bounded import check_array
+from phyradgs_cl.importers.bounded import read_raw
 from phyradgs_cl.importers.folder import SafeFolder, regular_file
+from phyradgs_cl.importers.voxels import Voxels
 
 SUFFIXES = (".mha", ".mhd")
 _MOST_HEADER_BYTES = 1 << 16
-_MOST_INFLATION = 1040  # deflate cannot do more than 1032
 _TYPES = {
     **{"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4"},
     **{
@@ -38,12 +36,22 @@ class MetaStack:
     step_v_mm: np.ndarray
 
 
-def read_meta_image(path: Path) -> MetaStack:
-    """A stack of projections, third axis the frames."""
+def read_meta_stack(path: Path) -> MetaStack:
+    """A stack of projections, third axis the frames, which must lie on top of each other."""
+    image = read_meta_image(path)
+    step = image.steps_mm
+    if np.abs(step[:2, 2]).max() + np.abs(step[2, :2]).max() > 1e-9 * np.abs(step).max():
+        found = str(step.tolist())[:80]
+        raise InputError(f"{path} TransformMatrix", found, "axes of a stack: columns, rows, frames")
+    return MetaStack(image.values, image.origin_mm[:2], step[0, :2], step[1, :2])
+
+
+def read_meta_image(path: Path) -> Voxels:
+    """An image of three axes."""
     header, start = _header(path)
     culprit = str(path)
     if header.get("NDims") != "3":
-        raise InputError(f"{culprit} NDims", header.get("NDims", "nothing"), "3: columns, rows, frames")
+        raise InputError(f"{culprit} NDims", header.get("NDims", "nothing"), "3 axes")
     if header.get("ElementNumberOfChannels", "1") != "1":
         raise InputError(f"{culprit} ElementNumberOfChannels", header["ElementNumberOfChannels"], "1")
     shape = tuple(int(n) for n in _numbers(culprit, header, "DimSize", 3)[::-1])
@@ -52,26 +60,23 @@ def read_meta_image(path: Path) -> MetaStack:
         raise InputError(f"{culprit} ElementType", word[:40], ", ".join(_TYPES))
     big = _first(header, "BinaryDataByteOrderMSB", "ElementByteOrderMSB") in ("True", "true", "1")
     dtype = np.dtype(_TYPES[word]).newbyteorder(">" if big else "<")
-    frames = _voxels(path, header, start, shape, dtype)
+    values = _voxels(path, header, start, shape, dtype)
     spacing = _numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
     if spacing.min() <= 0:
         raise InputError(f"{culprit} ElementSpacing", str(spacing.tolist()), "lengths above 0")
     places = [key for key in ("Offset", "Position", "Origin") if key in header]
     origin = _numbers(culprit, header, places[0] if places else "Offset", 3, "0 0 0")
-    axes = _axes(culprit, header)
-    return MetaStack(frames, origin[:2], spacing[0] * axes[0, :2], spacing[1] * axes[1, :2])
+    steps = spacing[:, None] * _axes(culprit, header)
+    return Voxels(values, steps, origin, header.get("Comment", ""))
 
 
 def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
-    """(3, 3): row i is the direction of axis i; frames must lie on top of each other."""
+    """(3, 3): row i is the direction of axis i."""
     keys = [key for key in ("TransformMatrix", "Rotation", "Orientation") if key in header]
     key = keys[0] if keys else "TransformMatrix"
     axes = _numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
-    plane = np.abs(axes[:2, 2]).max() + np.abs(axes[2, :2]).max()
-    if plane > 1e-9 or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
-        raise InputError(
-            f"{culprit} {key}", str(axes.tolist())[:80], "axes of a stack: columns, rows, frames"
-        )
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+        raise InputError(f"{culprit} {key}", str(axes.tolist())[:80], "three directions at right angles")
     return axes
 
 
@@ -104,26 +109,7 @@ def _voxels(
     if header.get("HeaderSize", "0") not in ("0", "-1"):
         raise InputError(f"{path} HeaderSize", header["HeaderSize"][:20], "0")
     packed = header.get("CompressedData", "False").lower() in ("true", "1")
-    available = data_path.stat().st_size - start
-    check_array(f"{data_path}", shape, dtype, available * (_MOST_INFLATION if packed else 1), 3)
-    count = math.prod(shape)
-    with open(data_path, "rb") as file:
-        file.seek(start)
-        if not packed:
-            return np.fromfile(file, dtype, count).reshape(shape)
-        return np.frombuffer(_inflated(data_path, file.read(), count * dtype.itemsize), dtype).reshape(shape)
-
-
-def _inflated(path: Path, packed: bytes, size: int) -> bytes:
-    """Exactly ``size`` bytes; not one more is unpacked."""
-    machine = zlib.decompressobj(wbits=47)  # zlib or gzip
-    try:
-        data = machine.decompress(packed, size)
-    except zlib.error as error:
-        raise InputError(str(path), f"compressed data that are damaged ({error})", "zlib data") from error
-    if len(data) != size:
-        raise InputError(str(path), f"{len(data)} bytes after unpacking", f"{size} bytes")
-    return data
+    return read_raw(data_path, start, shape, dtype, packed)
 
 
 def _first(header: dict[str, str], *keys: str) -> str:

@@ -13,12 +13,12 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tigre_frame
-from phyradgs_cl.importers.fields import Fields, described
 from phyradgs_cl.importers.frames import line_integrals, upright
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.pickle_reader import read_pickle
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
+from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
@@ -40,11 +40,10 @@ def import_naf(path: Path, options: ImportOptions) -> Scan:
         volume = _array(data, "image", 3)
         reference = tigre_frame.turned_volume(data.name("image"), volume, grid, _PER_MM)
     frames = upright(frames, options, tigre_frame.ROW_0)
-    projections, mask = line_integrals(str(path), frames, options, custom="attenuation")
+    integrals = line_integrals(str(path), frames, options, custom="attenuation")
     trajectory = turning(geometry, angle_rad, timing)
     return put_together(
-        projections,
-        mask,
+        integrals,
         trajectory,
         geometry,
         timing,
@@ -75,4 +74,4 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
         raise InputError(table.name(key), found, f"an array of numbers with {ndim} axes")
     if 0 in values.shape:
         raise InputError(table.name(key), f"shape {values.shape}", "no empty axis")
-    return values
+    return np.asarray(values)

@@ -1,12 +1,14 @@
 """NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from options.
 
-Row 0 is taken as the lowest, as that reader takes it; flips that the file declares, in either of the ways in which
-the nxtomo package has written them, are undone, and the rotation axis's column becomes a detector offset.
+The format does not say which row is on top. Row 0 is taken as the lowest, as that reader takes it, and this is said;
+flips that the file declares, in either of the ways in which the nxtomo package has written them, are undone first. The
+rotation axis's column becomes a detector offset.
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,7 +16,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.frames import line_integrals, upright
+from phyradgs_cl.importers.frames import line_integrals, united, upright
 from phyradgs_cl.importers.hdf5_frames import gantry_sign, opened, optional_length, read_frames
 from phyradgs_cl.importers.moving_poses import Turned
 from phyradgs_cl.importers.options import ImportOptions, option_name
@@ -59,8 +61,11 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         quantity = read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, used)
         title = _title(source, entry, path)
+    if options.row_0 is None:
+        text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
+        _log.warning(text, path, option_name("row_0"))
     frames = upright(turn.frames(frames), options, "bottom")
-    projections, bad = line_integrals(
+    integrals = line_integrals(
         f"{path}:{detector}/data",
         frames[used],
         options,
@@ -70,10 +75,8 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     )
     if mask is not None:
         mask = upright(turn.frames(mask), options, "bottom")
-        bad = mask if bad is None else mask | bad
-    return put_together(
-        projections, bad, trajectory, geometry, timing, options, title=title, source=str(path)
-    )
+        integrals = replace(integrals, mask=united(mask, integrals.mask))
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _refuse_ours(source: Hdf5Source, entry: str) -> None:

@@ -16,14 +16,14 @@ from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tiff
 from phyradgs_cl.importers.bounded import read_json
-from phyradgs_cl.importers.fields import Fields
-from phyradgs_cl.importers.folder import SafeFolder
+from phyradgs_cl.importers.folder import SafeFolder, check_numbering
 from phyradgs_cl.importers.frames import line_integrals
 from phyradgs_cl.importers.moving_poses import plain_geometry, turn_of
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.phyradgs_synthetic import readout_ratio, start_times_s
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing
+from phyradgs_cl.io.tables import Fields
 
 OPTIONS = (
     "exposure_s",
@@ -86,13 +86,13 @@ def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     timing = Timing(shutter, timing.start_s, True)
     poses = turn.poses(poses, panel)
     times = timing.start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
-    projections, mask = line_integrals(
+    integrals = line_integrals(
         str(description), turn.frames(frames), _with_flat(options, frames), custom="counts"
     )
     trajectory = PoseTable(times.ravel(), poses.reshape(-1, 12), f"{description} views")
     plain = plain_geometry(poses[:, 0], panel)
     title = path.resolve().stem
-    return put_together(projections, mask, trajectory, plain, timing, options, title=title, source=str(path))
+    return put_together(integrals, trajectory, plain, timing, options, title=title, source=str(path))
 
 
 def geometry_file(folder: SafeFolder) -> Path:
@@ -114,6 +114,7 @@ def _frames_and_views(
         folder = SafeFolder(folder.root / PROJECTIONS)
     paths = folder.matching(*tiff.SUFFIXES)
     if options.first_view is not None:
+        check_numbering(paths, "complete the frames")  # each takes the view of its place
         views = views[options.first_view : options.first_view + len(paths)]
     if not paths or len(paths) != len(views):
         remedy = f"say {option_name('first_view')} if the JSON holds several scans"

@@ -12,11 +12,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.fields import Fields
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.r2_gaussian import R2Folder, entries_of
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing
+from phyradgs_cl.io.tables import Fields
 
 META = "meta_data_motion_blur_rolling_shutter_fps18.json"
 OPTIONS = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
@@ -33,10 +33,9 @@ def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
     timing = timing_of_marks(opened.meta, marks, options)
     sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
     grid, reference = opened.reference()
-    projections, mask = opened.projections(entries, options)
+    integrals = opened.projections(entries, options)
     return put_together(
-        projections,
-        mask,
+        integrals,
         CircularOrbit(opened.geometry, sweeps),
         opened.geometry,
         timing,

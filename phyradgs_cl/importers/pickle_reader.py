@@ -1,254 +1,183 @@
-"""Pickles without trust: a small machine that knows plain containers and NumPy arrays, and runs nothing else.
+"""Pickles without trust: the standard library's unpickler, with an allow-list in place of whatever a file names.
 
-Python's unpickler calls whatever a file names. This one interprets the opcodes itself: a name outside of
-``_NAMES`` is refused before anything happens, and the names inside stand for functions of pickle_arrays.
+What a name of the list stands for is a function of this module, not NumPy's: none of them allocates by a number in the
+file or takes a state that it does not check. The unpickler is the one written in Python, because the one in C hashes keys
+before anyone can look at them: integers that share one hash, or tuples of tuples, keep it for hours.
 """
 
 from __future__ import annotations
 
 import io
-import pickletools
+import math
+import pickle
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.bounded import check_room
 from phyradgs_cl.importers.folder import regular_file
-from phyradgs_cl.importers.pickle_arrays import CALLS, ArrayOnItsWay, DtypeOnItsWay, array_view
 
-_MOST_OPCODES = 3_000_000  # some seconds
-_MOST_COPIES, _FREE_BYTES = 4, 1 << 20
-_MARK = object()
-
-
-@dataclass
-class _Name:
-    """A global of the file, by its meaning here."""
-
-    meaning: str
-
-
-_NUMPY_CORES = ("numpy.core.", "numpy._core.")
-_NAMES = {
-    ("numpy", "ndarray"): "ndarray",
-    ("numpy", "dtype"): "dtype",
-    ("_codecs", "encode"): "encode",
-    ("builtins", "bytearray"): "bytearray",
-    **{(f"{core}multiarray", "_reconstruct"): "reconstruct" for core in _NUMPY_CORES},
-    **{(f"{core}multiarray", "scalar"): "scalar" for core in _NUMPY_CORES},
-    **{(f"{core}numeric", "_frombuffer"): "frombuffer" for core in _NUMPY_CORES},
-}
+_MOST_OPCODES = 1_000_000  # two seconds
+_MOST_COPIES, _FREE_BYTES = 4, 1 << 20  # of the file's size: one text may be made an array again and again
+_BESIDE = 3  # arrays and line integrals, for every byte of the file
+_LARGEST_KEY = 1 << 60  # smaller integers are their own hashes
+_REFUSED = ("INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "EMPTY_SET", "FROZENSET")
+_LATIN1 = ("latin1", "latin-1")
 
 
 def read_pickle(path: Path) -> object:
     """What a pickle file holds: dicts, lists, tuples, text, numbers, NumPy arrays. InputError for anything else."""
-    regular_file(path, str(path))
-    machine = _Machine(str(path))
+    culprit = str(path)
+    check_room(culprit, _BESIDE * regular_file(path, culprit).stat().st_size)
     try:
-        return machine.run(path.read_bytes())
+        return PlainUnpickler(culprit, path.read_bytes()).load()
     except InputError:
         raise
     except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from error
-    except MemoryError:
-        raise
+        raise InputError(culprit, error.strerror or str(error), "a readable file") from error
     except Exception as error:  # a stranger's opcodes in any order: every failure is the file's
         found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(str(path), found, "a pickle of plain containers and NumPy arrays") from error
+        raise InputError(culprit, found, "a pickle of plain containers and NumPy arrays") from error
 
 
-class _Machine:
-    """Stack and memo of one run."""
+class PlainUnpickler(pickle._Unpickler):
+    """Plain containers, and arrays of real numbers, of the pickle ``data``; ``culprit`` is how errors name it."""
 
-    def __init__(self, culprit: str) -> None:
-        self.culprit = culprit
-        self.stack: list[object] = []
-        self.memo: dict[int, object] = {}
-        self.bytes_left = 0
+    def __init__(self, culprit: str, data: bytes) -> None:
+        super().__init__(io.BytesIO(data), encoding="latin1")  # Python 2 wrote an array's bytes as text
+        self._culprit = culprit
+        self._bytes_left = _MOST_COPIES * len(data) + _FREE_BYTES
+        self._names = {
+            ("numpy", "ndarray"): object(),  # named in the arguments of _reconstruct, never called
+            ("numpy", "dtype"): _Allowed(_Dtype),
+            ("numpy.core.multiarray", "_reconstruct"): _Allowed(lambda *_: _Array(self._spend)),
+            ("numpy.core.multiarray", "scalar"): _Allowed(lambda dtype, raw: self._array(raw, dtype, ()).item()),
+            ("numpy.core.numeric", "_frombuffer"): _Allowed(self._array),
+            ("_codecs", "encode"): _Allowed(self._encoded),
+        }
+        self.dispatch = _Opcodes(pickle._Unpickler.dispatch)
+        self.dispatch[pickle.EMPTY_DICT[0]] = lambda machine: machine.append(_Table())
+        self.dispatch[pickle.DICT[0]] = _load_table
+        for name in _REFUSED:
+            self.dispatch[getattr(pickle, name)[0]] = lambda machine, n=name: machine.refuse(f"the opcode {n}")
 
-    def run(self, data: bytes) -> object:
-        """Interpret a pickle to its STOP."""
-        self.bytes_left = _MOST_COPIES * len(data) + _FREE_BYTES
-        for count, (opcode, argument, _) in enumerate(pickletools.genops(io.BytesIO(data))):
-            if count >= _MOST_OPCODES:
-                raise InputError(
-                    self.culprit, f"more than {_MOST_OPCODES} opcodes", "arrays, not lists of numbers"
-                )
-            if opcode.name == "STOP":
-                return self.stack.pop()
-            self._step(opcode.name, argument)
-        raise ValueError("no STOP")
+    def find_class(self, module: str, name: str) -> object:
+        """What a name of the list stands for; NumPy 2 calls its core by another name."""
+        known = module.replace("numpy._core.", "numpy.core."), name
+        if known not in self._names:
+            self.refuse(f"a call of {module[:60]}.{name[:60]}")
+        return self._names[known]
 
-    def _step(self, name: str, argument: object) -> None:
-        if name in _LITERALS:
-            self.stack.append(argument)
-        elif name in _CONSTANTS:
-            self.stack.append(_CONSTANTS[name]())
-        elif name in _ACTIONS:
-            _ACTIONS[name](self, argument)
-        elif name not in ("PROTO", "FRAME"):
-            found = f"the opcode {name}"
-            raise InputError(self.culprit, found, "plain containers and NumPy arrays", "nothing was executed")
+    def persistent_load(self, pid: object) -> NoReturn:
+        """An object that lies elsewhere."""
+        self.refuse("a persistent object")
 
-    def spend(self, value: object) -> None:
-        """Counts bytes that a call has copied: one text of the file may be encoded again and again."""
-        self.bytes_left -= len(value) if isinstance(value, (bytes, str)) else 0
-        if self.bytes_left < 0:
+    def refuse(self, found: str) -> NoReturn:
+        """Raises InputError for what no plain file holds."""
+        raise InputError(self._culprit, found, "plain containers and NumPy arrays", "nothing was executed")
+
+    def _spend(self, count: int) -> None:
+        self._bytes_left -= count
+        if self._bytes_left < 0:
             raise ValueError("more bytes than the file holds")
 
-    def popped_to_mark(self) -> list[object]:
-        """What lies on the stack above the last mark, taken off with it."""
-        for at in range(len(self.stack) - 1, -1, -1):
-            if self.stack[at] is _MARK:
-                items = self.stack[at + 1 :]
-                del self.stack[at:]
-                return items
-        raise ValueError("no mark")
+    def _array(self, raw: object, dtype: object, shape: object, order: object = "C") -> np.ndarray:
+        made = _Array(self._spend)
+        made.__setstate__((1, shape, dtype, order == "F", raw))
+        return made
 
-    def named(self, module: object, name: object) -> None:
-        """Push a global, if it is one of the few."""
-        meaning = _NAMES.get((str(module), str(name)))
-        if meaning is None:
-            found = f"a call of {str(module)[:60]}.{str(name)[:60]}"
-            raise InputError(self.culprit, found, "plain containers and NumPy arrays", "nothing was executed")
-        self.stack.append(_Name(meaning))
+    def _encoded(self, text: object, encoding: object) -> bytes:
+        if not isinstance(text, str) or encoding not in _LATIN1:
+            raise ValueError("an encoding that is not latin1")
+        self._spend(len(text))
+        return text.encode("latin1")
 
 
-def _reduce(machine: _Machine, _: object) -> None:
-    arguments, callee = machine.stack.pop(), machine.stack.pop()
-    if not isinstance(callee, _Name) or not isinstance(arguments, tuple):
-        raise ValueError("a call of something that is no function")
-    result = CALLS[callee.meaning](*arguments)
-    machine.spend(result)
-    machine.stack.append(result)
+class _Opcodes(dict[int, Callable[..., None]]):
+    """What each opcode does, for as many of them as an import may take."""
+
+    left = _MOST_OPCODES
+
+    def __getitem__(self, code: int) -> Callable[..., None]:
+        self.left -= 1
+        if self.left < 0:
+            raise ValueError(f"more than {_MOST_OPCODES} opcodes, where arrays belong")
+        return super().__getitem__(code)
 
 
-def _build(machine: _Machine, _: object) -> None:
-    state, target = machine.stack.pop(), machine.stack[-1]
-    if isinstance(target, DtypeOnItsWay) and isinstance(state, tuple) and state[1] in ("<", ">", "|", "="):
-        target.order = state[1]
-    elif isinstance(target, ArrayOnItsWay) and isinstance(state, tuple) and len(state) == 5:
-        _, shape, dtype, fortran, raw = state
-        if isinstance(raw, str):
-            machine.spend(raw)
-        values = array_view(raw, dtype, shape, "F" if fortran else "C")
-        machine.stack[-1] = values
-        for entry in target.entries:
-            machine.memo[entry] = values
-    else:
+class _Table(dict[object, object]):
+    """A dict whose keys are quick to hash, and hard to give one hash."""
+
+    __slots__ = ()
+
+    def __setitem__(self, key: object, value: object) -> None:
+        if not (isinstance(key, (str, bytes)) or (isinstance(key, int) and abs(key) < _LARGEST_KEY)):
+            raise ValueError("a key that is neither text nor a small integer")
+        super().__setitem__(key, value)
+
+
+def _load_table(machine: PlainUnpickler) -> None:
+    items, table = machine.pop_mark(), _Table()
+    for key, value in zip(items[::2], items[1::2], strict=True):
+        table[key] = value
+    machine.append(table)
+
+
+class _Allowed:
+    """A function that a pickle may call, and whose own state it cannot set."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: object) -> object:
+        return self._function(*arguments)
+
+    def __setstate__(self, state: object) -> None:
         raise ValueError("a state for something that has none")
 
 
-def _put(machine: _Machine, index: object) -> None:
-    top = machine.stack[-1]
-    machine.memo[int(index)] = top  # type: ignore[call-overload]
-    if isinstance(top, ArrayOnItsWay):
-        top.entries.append(int(index))  # type: ignore[call-overload]
+class _Dtype:
+    """A NumPy type of plain real numbers: its code, and the byte order that its state sets."""
+
+    __slots__ = ("dtype",)
+
+    def __init__(self, code: object, *_: object) -> None:
+        if not isinstance(code, str) or not re.fullmatch(r"[<>=|]?(b1|[iu][1248]|f[248])", code):
+            shown = repr(code[:20]) if isinstance(code, str) else f"a {type(code).__name__}"
+            raise ValueError(f"NumPy type {shown}, where plain real numbers belong")
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: object) -> None:
+        if not isinstance(state, tuple) or len(state) < 2 or state[1] not in ("<", ">", "|", "="):
+            raise ValueError("a NumPy type without byte order")
+        self.dtype = self.dtype.newbyteorder(state[1])
 
 
-def _set_items(target: object, pairs: list[object]) -> None:
-    if type(target) is not dict or len(pairs) % 2:
-        raise ValueError("items for something that is no dict")
-    for key, value in zip(pairs[::2], pairs[1::2], strict=True):
-        if not isinstance(key, (str, int, float, bytes)):  # tuples can take for ever to hash
-            raise ValueError("a key that is neither text nor a number")
-        target[key] = value
+class _Array(np.ndarray):
+    """An array that is filled by its state, with exactly as many bytes as its shape needs."""
 
+    def __new__(cls, spend: Callable[[int], None]) -> _Array:
+        made = super().__new__(cls, (0,), np.uint8)
+        made._spend = spend
+        return made
 
-def _made_dict(pairs: list[object]) -> dict[object, object]:
-    made: dict[object, object] = {}
-    _set_items(made, pairs)
-    return made
-
-
-def _append(target: object, items: list[object]) -> None:
-    if type(target) is not list:
-        raise ValueError("items for something that is no list")
-    target.extend(items)
-
-
-def _tuple_of(count: int) -> Callable[[_Machine, object], None]:
-    def make(machine: _Machine, _: object) -> None:
-        items = tuple(machine.stack[-count:])
-        if len(items) < count:
-            raise ValueError("too few items")
-        machine.stack[-count:] = [items]
-
-    return make
-
-
-def _stack_global(machine: _Machine, _: object) -> None:
-    name, module = machine.stack.pop(), machine.stack.pop()
-    machine.named(module, name)
-
-
-def _set_one(machine: _Machine, _: object) -> None:
-    value, key = machine.stack.pop(), machine.stack.pop()
-    _set_items(machine.stack[-1], [key, value])
-
-
-def _set_many(machine: _Machine, _: object) -> None:
-    pairs = machine.popped_to_mark()
-    _set_items(machine.stack[-1], pairs)
-
-
-def _append_one(machine: _Machine, _: object) -> None:
-    item = machine.stack.pop()
-    _append(machine.stack[-1], [item])
-
-
-def _append_many(machine: _Machine, _: object) -> None:
-    items = machine.popped_to_mark()
-    _append(machine.stack[-1], items)
-
-
-_LITERALS = frozenset(
-    [
-        *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
-        *(
-            "STRING",
-            "BINSTRING",
-            "SHORT_BINSTRING",
-            "UNICODE",
-            "BINUNICODE",
-            "SHORT_BINUNICODE",
-            "BINUNICODE8",
-        ),
-        *("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
-    ]
-)
-_CONSTANTS: dict[str, Callable[[], object]] = {
-    "NONE": lambda: None,
-    "NEWTRUE": lambda: True,
-    "NEWFALSE": lambda: False,
-    "EMPTY_DICT": dict,
-    "EMPTY_LIST": list,
-    "EMPTY_TUPLE": tuple,
-    "MARK": lambda: _MARK,
-}
-_ACTIONS: dict[str, Callable[[_Machine, object], None]] = {
-    "POP": lambda m, _: m.stack.pop(),
-    "POP_MARK": lambda m, _: m.popped_to_mark(),
-    "DUP": lambda m, _: m.stack.append(m.stack[-1]),
-    "DICT": lambda m, _: m.stack.append(_made_dict(m.popped_to_mark())),
-    "LIST": lambda m, _: m.stack.append(m.popped_to_mark()),
-    "TUPLE": lambda m, _: m.stack.append(tuple(m.popped_to_mark())),
-    "TUPLE1": _tuple_of(1),
-    "TUPLE2": _tuple_of(2),
-    "TUPLE3": _tuple_of(3),
-    "APPEND": _append_one,
-    "APPENDS": _append_many,
-    "SETITEM": _set_one,
-    "SETITEMS": _set_many,
-    "PUT": _put,
-    "BINPUT": _put,
-    "LONG_BINPUT": _put,
-    "MEMOIZE": lambda m, _: _put(m, len(m.memo)),
-    "GET": lambda m, i: m.stack.append(m.memo[i]),  # type: ignore[index]
-    "BINGET": lambda m, i: m.stack.append(m.memo[i]),  # type: ignore[index]
-    "LONG_BINGET": lambda m, i: m.stack.append(m.memo[i]),  # type: ignore[index]
-    "GLOBAL": lambda m, text: m.named(*str(text).split(" ", 1)),
-    "STACK_GLOBAL": _stack_global,
-    "REDUCE": _reduce,
-    "BUILD": _build,
-}
+    def __setstate__(self, state: object) -> None:
+        if not isinstance(state, tuple) or len(state) != 5:
+            raise ValueError("an array without shape, type and bytes")
+        _, shape, dtype, fortran, raw = state
+        if isinstance(raw, str):
+            raw = raw.encode("latin1")
+        if not isinstance(dtype, _Dtype) or not isinstance(raw, (bytes, bytearray)):
+            raise ValueError("an array without numbers")
+        if not isinstance(shape, tuple) or len(shape) > 8 or any(type(n) is not int or n < 0 for n in shape):
+            raise ValueError("an array with an impossible shape")
+        if math.prod(shape) * dtype.dtype.itemsize != len(raw):
+            raise ValueError(f"an array of shape {shape} in {len(raw)} bytes")
+        self._spend(len(raw))
+        super().__setstate__((1, shape, dtype.dtype, fortran is True or fortran == 1, bytes(raw)))

@@ -14,12 +14,12 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import tigre_frame
 from phyradgs_cl.importers.bounded import read_json, read_npy
-from phyradgs_cl.importers.fields import Fields
 from phyradgs_cl.importers.folder import SafeFolder
-from phyradgs_cl.importers.frames import line_integrals, upright
+from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, upright
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
+from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
 OPTIONS = (
@@ -56,10 +56,8 @@ class R2Folder:
         checks.shape(str(self.folder.root / chosen), image, self.geometry.detector_shape)
         return image
 
-    def projections(
-        self, entries: list[Fields], options: ImportOptions
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Line integrals and mask of the listed frames, upright."""
+    def projections(self, entries: list[Fields], options: ImportOptions) -> LineIntegrals:
+        """Line integrals of the listed frames, upright."""
         names = [entry.word("file_path") for entry in entries]
         if len(set(names)) < len(names):  # a short list must not ask for more memory than its files hold
             at = next(i for i, name in enumerate(names) if name in names[:i])
@@ -95,10 +93,9 @@ def import_r2(path: Path, options: ImportOptions) -> Scan:
     angle_rad = np.array([entry.number("angle") for entry in entries])
     timing = make_timing(str(path), len(entries), options)
     grid, reference = opened.reference()
-    projections, mask = opened.projections(entries, options)
+    integrals = opened.projections(entries, options)
     return put_together(
-        projections,
-        mask,
+        integrals,
         turning(opened.geometry, angle_rad, timing),
         opened.geometry,
         timing,

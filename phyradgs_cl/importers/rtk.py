@@ -10,7 +10,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.folder import SafeFolder
 from phyradgs_cl.importers.frames import line_integrals
-from phyradgs_cl.importers.meta_image import SUFFIXES, MetaStack, read_meta_image
+from phyradgs_cl.importers.meta_image import SUFFIXES, MetaStack, read_meta_stack
 from phyradgs_cl.importers.moving_poses import Turned, plain_geometry, table_over_time, turn_of
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.rtk_xml import RtkGeometry, read_rtk_xml
@@ -29,18 +29,16 @@ def import_rtk(path: Path, options: ImportOptions) -> Scan:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else _only(folder, (".xml",), "geometry")
     stack_path = _only(folder, SUFFIXES, "stack of projections")
-    rtk, stack = read_rtk_xml(description), read_meta_image(stack_path)
+    rtk, stack = read_rtk_xml(description), read_meta_stack(stack_path)
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
         raise InputError(str(stack_path), found, "one frame a projection")
     timing = make_timing(str(description), rtk.frames, options)
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
     custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
-    projections, mask = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
+    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
     title = description.stem
-    return put_together(
-        projections, mask, trajectory, geometry, timing, options, title=title, source=str(path)
-    )
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _trajectory(

@@ -9,14 +9,14 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers.frames import LineIntegrals
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io import default_grid
 
 
 def put_together(
-    projections: np.ndarray,
-    mask: np.ndarray | None,
+    integrals: LineIntegrals,
     trajectory: CircularOrbit | PoseTable,
     geometry: ConeGeometry,
     timing: Timing,
@@ -28,9 +28,9 @@ def put_together(
     reference: np.ndarray | None = None,
     lag: float = 0.0,
 ) -> Scan:
-    """A scan of line integrals (F, v, u), upright already; the grid is the cone's cube where none is given."""
+    """A scan of line integrals, upright already; the grid is the cone's cube where none is given."""
     return Scan(
-        projections=np.ascontiguousarray(projections, np.float32),
+        projections=integrals.values,
         geometry=geometry,
         trajectory=trajectory,
         shutter=timing.shutter,
@@ -38,11 +38,12 @@ def put_together(
         grid=grid or default_grid(geometry),
         is_fly=timing.is_fly,
         detector_model=options.detector_model or "log",
-        pixel_mask=mask,
+        pixel_mask=integrals.mask,
         reference=reference,
         title=title,
         provenance={"imported_from": source},
         lag=lag,
+        saturation=integrals.saturation,
     )
 
 

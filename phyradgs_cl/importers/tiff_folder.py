@@ -6,8 +6,7 @@ The tables [source], [detector], [volume], [readout] and [beam] are those of a s
 
 from __future__ import annotations
 
-import difflib
-import sys
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -15,20 +14,15 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tiff
-from phyradgs_cl.importers.bounded import read_bytes
-from phyradgs_cl.importers.fields import Fields
-from phyradgs_cl.importers.folder import SafeFolder, checked_name, in_natural_order
-from phyradgs_cl.importers.frames import line_integrals, united, upright
+from phyradgs_cl.importers.bounded import read_numbers
+from phyradgs_cl.importers.folder import SafeFolder, check_numbering, checked_name, in_natural_order
+from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, united, upright
 from phyradgs_cl.importers.hdf5_frames import gantry_sign
 from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, QUANTITIES, ROTATES, ROW_0, ImportOptions
 from phyradgs_cl.importers.scan_parts import put_together, with_options
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.scanner_file import Scanner, scanner_from
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
 OPTIONS = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
@@ -37,9 +31,11 @@ OPTIONS = (
 )
 _OWN = {
     "frames": ("projections", "flats", "darks", "mask", "quantity", "flat_value", "row_0", "column_0"),
-    "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "rotates", "at"),
+    "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s"),
 }
+_TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
+_PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
 _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
 
 
@@ -50,14 +46,16 @@ def import_tiff(path: Path, options: ImportOptions) -> Scan:
     description = path if path.is_file() else description_of(folder)
     tables = _tables(description)
     said = _with_file(options, tables["frames"], tables["angles"])
-    projections, mask = _frames(folder, tables["frames"], said, str(description))
-    scanner = _scanner(description, tables[""], (projections.shape[1], projections.shape[2]))
+    stacks = _stacks(folder, tables["frames"], tables["angles"])
+    frames, rows, columns = stacks["projections"].shape
+    scanner = _scanner(description, tables[""], (rows, columns))
     geometry = with_options(scanner.geometry, options)
-    timing = make_timing(str(description), len(projections), said, _stored_timing(tables["timing"], scanner))
-    angle_rad = gantry_sign(said, "gantry") * _angles_rad(tables["angles"], len(projections))
+    stored = _stored_timing(tables["timing"], tables["angles"], scanner)
+    timing = make_timing(str(description), frames, options, stored)
+    angle_rad = gantry_sign(said, "gantry") * _angles_rad(folder, tables["angles"], frames)
+    integrals = _line_integrals(stacks, said, tables["frames"], str(description))
     return put_together(
-        projections,
-        mask,
+        integrals,
         turning(geometry, angle_rad, timing),
         geometry,
         timing,
@@ -80,23 +78,10 @@ def description_of(folder: SafeFolder) -> Path:
 
 def _tables(path: Path) -> dict[str, Fields]:
     """The file's own tables by name, and under "" what a scanner file has; unknown names are refused."""
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(str(path), f"text that is not TOML ({error})", "a TOML file") from error
-    _refuse_unknown(str(path), content, (*_SCANNER, *_OWN))
-    tables = {name: Fields(f"{path} [{name}]", content.get(name, {})) for name in _OWN}
-    for name, table in tables.items():
-        _refuse_unknown(table.culprit, table.values, _OWN[name])
+    content = read_toml(path)
+    refuse_unknown(str(path), content, (*_SCANNER, *_OWN), "a name")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), _OWN[name]) for name in _OWN}
     return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in _OWN}), **tables}
-
-
-def _refuse_unknown(culprit: str, found: object, allowed: tuple[str, ...]) -> None:
-    for key in found:  # type: ignore[attr-defined]
-        if key not in allowed:
-            close = difflib.get_close_matches(str(key), allowed, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else "remove it"
-            raise InputError(f"{culprit} {key}", "a name that is not known", ", ".join(allowed), remedy)
 
 
 def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
@@ -107,28 +92,37 @@ def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> Import
         "row_0": frames.word("row_0", ROW_0) if frames.has("row_0") else None,
         "column_0": frames.word("column_0", COLUMN_0) if frames.has("column_0") else None,
         "rotates": angles.word("rotates", ROTATES) if angles.has("rotates") else None,
-        "angle_at": angles.word("at", ANGLE_AT) if angles.has("at") else None,
     }
     return ImportOptions(**{**vars(options), **{k: getattr(options, k) or v for k, v in said.items()}})
 
 
-def _frames(
-    folder: SafeFolder, frames: Fields, said: ImportOptions, culprit: str
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Line integrals (F, v, u) of all that [frames] names, and the pixels not to be used."""
-    stacks = {name: _stack(folder, frames, name) for name in ("projections", "flats", "darks", "mask")}
-    turned = {name: None if s is None else upright(s, said, "top") for name, s in stacks.items()}
+def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
+    """All images (n, v, u) that [frames] names, as stored."""
+    found = {}
+    for name in ("projections", "flats", "darks", "mask"):
+        if name != "projections" and not frames.has(name):
+            continue
+        paths = _files(folder, frames, name)
+        if name == "projections" and not any(angles.has(key) for key in _PER_FRAME):
+            check_numbering(paths, "complete the frames, or give every one its angle: [angles] values_deg or file")
+        found[name] = tiff.read_tiffs(paths)
+    return found
+
+
+def _line_integrals(
+    stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, culprit: str
+) -> LineIntegrals:
+    """Line integrals of the projections, with the pixels not to be used."""
+    turned = {name: upright(stack, said, "top") for name, stack in stacks.items()}
     stack = turned["projections"]
-    projections, bad = line_integrals(culprit, stack, said, flats=turned["flats"], darks=turned["darks"])
-    if turned["mask"] is None:
-        return projections, bad
-    return projections, united(bad, _mask(turned["mask"], stack.shape, frames.name("mask")))
+    found = line_integrals(culprit, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
+    if "mask" not in turned:
+        return found
+    return replace(found, mask=united(found.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
 
 
-def _stack(folder: SafeFolder, frames: Fields, name: str) -> np.ndarray | None:
-    """Images (n, v, u) of the files that match a pattern; only the projections have to be there."""
-    if name != "projections" and not frames.has(name):
-        return None
+def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
+    """The files that match a pattern, in natural order of their names."""
     pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
     below, last = PurePosixPath(pattern).parent, PurePosixPath(pattern).name
     if "*" in str(below) or "**" in last:
@@ -139,7 +133,7 @@ def _stack(folder: SafeFolder, frames: Fields, name: str) -> np.ndarray | None:
         found = in_natural_order([folder.file(text, frames.name(name)) for text in names])
     if not found:
         raise InputError(frames.name(name), f"no file that matches {pattern!r}", "at least one TIFF")
-    return tiff.read_tiffs(found)
+    return found
 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
@@ -153,11 +147,12 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
     return described
 
 
-def _stored_timing(timing: Fields, scanner: Scanner) -> StoredTiming:
+def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTiming:
     exposure_s = timing.number("exposure_s") if timing.has("exposure_s") else None
     readout_s = timing.number("readout_s") if timing.has("readout_s") else None
     if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
         readout_s = scanner.readout_ratio * exposure_s
+    written = [timing.name(key) for key in ("exposure_s", "readout_s") if timing.has(key)]
     return StoredTiming(
         exposure_s=exposure_s,
         readout_s=readout_s,
@@ -166,11 +161,22 @@ def _stored_timing(timing: Fields, scanner: Scanner) -> StoredTiming:
         axis=scanner.readout_axis,
         direction=scanner.readout_direction,
         pulse=scanner.pulse,
+        angle_at=angles.word("at", ANGLE_AT, default="start"),
+        written=(*written, *([angles.name("at")] if angles.has("at") else [])),
     )
 
 
-def _angles_rad(angles: Fields, frames: int) -> np.ndarray:
-    """(F,) as stored: a list, or the first with the last or a step."""
+def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
+    """(F,) as stored: a list, a file of one angle a line, or the first with the last or a step."""
+    given = [key for key in _ANGLES if angles.has(key)]
+    if len(given) != 1:
+        raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
+    if angles.has("unit") and not angles.has("file"):
+        raise InputError(angles.name("unit"), "no file beside it", "the unit of a file of angles", "leave it out")
+    if angles.has("file"):
+        unit = angles.word("unit", tuple(_TO_RAD), default="deg")
+        path = folder.file(angles.get("file"), angles.name("file"))
+        return _TO_RAD[unit] * read_numbers(path, frames, "angles")
     if angles.has("values_deg"):
         return np.deg2rad(angles.numbers("values_deg", frames))
     first = angles.number("first_deg", 0.0)

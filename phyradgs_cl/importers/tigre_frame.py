@@ -11,7 +11,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.fields import Fields
+from phyradgs_cl.io.tables import Fields
 
 ROW_0 = "top"
 
@@ -69,4 +69,7 @@ def turned_volume(culprit: str, volume: np.ndarray, grid: Grid, per_mm: float) -
     checks.shape(culprit, volume, grid.shape[::-1])
     checks.finite(culprit, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
+    largest = float(np.abs(turned).max())
+    if largest > float(np.finfo(np.float32).max):
+        raise InputError(culprit, f"a density of {largest:.3g} 1/mm", "one that float32 holds", "check the file")
     return np.ascontiguousarray(turned, np.float32)

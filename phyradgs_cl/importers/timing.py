@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions, option_name
+
+_log = logging.getLogger(__name__)
+_OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +36,10 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """What a format itself says; None where it is silent. ``start_s`` (F,) means that the gantry did not stop."""
+    """What a format itself says; None where it is silent. ``start_s`` (F,) means that the gantry did not stop.
+
+    ``written``: by what names a description that the user wrote says any of it; a file's header does not count.
+    """
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -42,6 +49,7 @@ class StoredTiming:
     direction: int = 1
     pulse: tuple[float, float] | None = None  # in exposures, as the scanner's TOML gives it
     angle_at: str = "start"
+    written: tuple[str, ...] = ()
 
 
 def make_timing(
@@ -50,7 +58,7 @@ def make_timing(
     """Timing of ``frames`` frames; the options win over what is stored.
 
     Start times, or the time from frame to frame, say that the gantry turned all the while; then there must be an
-    exposure. Without them every frame is taken at rest.
+    exposure. Without them every frame is taken at rest, and what a user says of a turn in between is refused.
     """
     stored = stored or StoredTiming()
     exposure_s = _first(options.exposure_s, stored.exposure_s, 0.0)
@@ -66,6 +74,7 @@ def make_timing(
     elif frame_time_s is not None:
         start_s = np.arange(frames) * frame_time_s
     else:
+        _check_rest(culprit, shutter, options, stored)
         return Timing(shutter, np.arange(frames) * max(shutter.span_s, 1.0), False, angle_at)
     _check_flight(culprit, shutter, start_s)
     return Timing(shutter, start_s, True, angle_at)
@@ -89,6 +98,17 @@ def turning(geometry: ConeGeometry, angle_rad: np.ndarray, timing: Timing) -> Ci
 
 def _first(*values: float | None) -> float | None:
     return next((value for value in values if value is not None), None)
+
+
+def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
+    """Refuses what a user says of a turn without the time from frame to frame; warns where a file has an exposure."""
+    asked = [option_name(name) for name in _OF_A_TURN if getattr(options, name) is not None]
+    remedy = f"say {option_name('frame_time_s')}"
+    for name in (*asked, *stored.written):
+        raise InputError(name, "no time from frame to frame beside it", "both, or neither for frames taken at rest", remedy)
+    if shutter.exposure_s > 0:
+        text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; %s if the gantry did not stop"
+        _log.warning(text, culprit, shutter.exposure_s, option_name("frame_time_s"))
 
 
 def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray) -> None:

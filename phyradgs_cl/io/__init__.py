@@ -1,15 +1,29 @@
 """Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
 
 from phyradgs_cl.io.atomic import check_writable, written_beside
-from phyradgs_cl.io.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
-from phyradgs_cl.io.grid_io import default_grid, with_grid_count
-from phyradgs_cl.io.hashing import sha256_of
+from phyradgs_cl.io.checkpoint import (
+    checkpoint_path,
+    former_checkpoint_path,
+    partial_path,
+    read_checkpoint,
+    write_checkpoint,
+)
+from phyradgs_cl.io.grid_io import default_grid
+from phyradgs_cl.io.hashing import hashing, sha256_of
 from phyradgs_cl.io.lock import only_run
 from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
 from phyradgs_cl.io.scan_writer import write_scan
 from phyradgs_cl.io.scanner_file import Scanner, load_scanner, with_detector_count
-from phyradgs_cl.io.volume_file import StoredVolume, file_kind, read_volume, volume_summary, write_volume
-from phyradgs_cl.io.voxel_file import LoadedVolume, load_attenuation, load_volume
+from phyradgs_cl.io.volume_file import (
+    LoadedVolume,
+    StoredVolume,
+    file_kind,
+    load_attenuation,
+    load_volume,
+    read_volume,
+    volume_summary,
+    write_volume,
+)
 
 __all__ = [
     "LoadedVolume",
@@ -20,10 +34,13 @@ __all__ = [
     "checkpoint_path",
     "default_grid",
     "file_kind",
+    "former_checkpoint_path",
+    "hashing",
     "load_scanner",
     "load_attenuation",
     "load_volume",
     "only_run",
+    "partial_path",
     "read_checkpoint",
     "read_scan",
     "read_volume",
@@ -31,7 +48,6 @@ __all__ = [
     "sha256_of",
     "volume_summary",
     "with_detector_count",
-    "with_grid_count",
     "write_checkpoint",
     "write_scan",
     "write_volume",

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import errno
+import glob
 import os
+import platform
+import re
 import secrets
 import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from zlib import crc32
 
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """What an operating system says where there is no room: the disk, the largest file, the user's share."""
-_SUFFIX = ".part"
+_LONGEST = 50  # characters of the target's name, of up to four bytes each: names end at 255
+_WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part$")
 
 
 def check_writable(path: str | Path) -> None:
@@ -80,8 +86,7 @@ def _target(path: str | Path) -> Path:
 
 def _create_beside(target: Path) -> Path:
     """A new empty file in the target's folder, with the permissions that the user's umask gives."""
-    temporary = target.with_name(f".{target.name[:60]}.{secrets.token_hex(4)}{_SUFFIX}")
-    signals.unfinished.add(str(temporary))  # Ctrl-C may end the process at any line
+    temporary = temporary_name(target)
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
@@ -93,6 +98,39 @@ def _create_beside(target: Path) -> Path:
             "choose another folder or change its permissions",
         ) from error
     return temporary
+
+
+def temporary_name(target: Path) -> Path:
+    """A new name beside ``target`` that says who writes there; what dead writers of such targets left is removed."""
+    for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part"):
+        writer = _WRITER.search(path.name)
+        if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
+            signals.remove(str(path))
+    writer_now = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.name[:_LONGEST]}.{writer_now}.part")
+    signals.unfinished.add(str(temporary))  # Ctrl-C may end the process at any line
+    return temporary
+
+
+@cache
+def _machine() -> str:
+    """Where process numbers mean the same: a machine, or a container on it."""
+    namespace = ""
+    with suppress(OSError):
+        namespace = os.readlink("/proc/self/ns/pid")
+    return f"{crc32(f'{platform.node()} {namespace}'.encode()):08x}"
+
+
+def _is_dead(process: int) -> bool:
+    if os.name != "posix":  # elsewhere asking ends the process
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    except OSError:  # somebody else's
+        return False
+    return False
 
 
 def _remove(temporary: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.atomic import written_beside
-from phyradgs_cl.io.npz import read_npz
+from phyradgs_cl.io.names import beside
 
 _FORMAT = 1
 _MOST_DIFFERENCES, _LONGEST_NAME = 3, 60
@@ -20,7 +20,18 @@ _RESTART = "start without --resume"
 
 def checkpoint_path(output: str | Path) -> Path:
     """Where the checkpoint of a run that writes ``output`` lies."""
-    return Path(f"{output}.checkpoint.npz")
+    return beside(output, ".checkpoint.npz")
+
+
+def former_checkpoint_path(output: str | Path) -> Path:
+    """Where the checkpoint of an earlier run is kept that another run of the same output has found."""
+    return beside(output, ".checkpoint.npz.bak")
+
+
+def partial_path(output: str | Path) -> Path:
+    """Where an interrupted run that was to write ``output`` leaves what it has: NAME.partial.SUFFIX."""
+    path = Path(output)
+    return beside(path.with_suffix(""), f".partial{path.suffix}")
 
 
 def write_checkpoint(path: str | Path, arrays: dict[str, np.ndarray], fingerprint: str) -> None:
@@ -33,7 +44,14 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
     """The arrays of a checkpoint. Raises InputError if it is missing, damaged or of another scan or options."""
     if not Path(path).is_file():
         raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
-    arrays = read_npz(path, "checkpoint", _RESTART)  # nothing is compressed: together no larger than the file
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        if not all(isinstance(values, np.ndarray) for values in arrays.values()):
+            raise ValueError("no array")
+    except Exception as error:  # zipfile, zlib and NumPy's parser hand on whatever they stumble over
+        reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
+        raise InputError(str(path), f"a damaged checkpoint{reason}", "a whole one", _RESTART) from error
     if not np.array_equal(arrays.pop("format", None), _FORMAT):
         raise InputError(str(path), "another checkpoint format", str(_FORMAT), _RESTART)
     found = str(arrays.pop("fingerprint", ""))

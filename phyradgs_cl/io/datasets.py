@@ -13,8 +13,10 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.io.hdf5 import Hdf5Source
+from phyradgs_cl.io.memory import HOST_SHARE, at_most, host_bytes
 from phyradgs_cl.io.units import Quantity
 
+_BUFFERS = 4  # of a chunk's size: as stored, and between filters
 _log = logging.getLogger(__name__)
 
 
@@ -26,12 +28,26 @@ def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: 
         if kind not in kinds:
             wanted = "numbers" if "f" in kinds else "whole numbers"
             raise InputError(culprit, f"type {dataset.dtype}", wanted, "store them as plain HDF5 numbers")
-        return np.asarray(dataset[()])
+        return np.asarray(_unfolded(dataset))
     except MemoryError as error:
         found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
         raise OutOfMemoryError(culprit, found, "data that this machine's memory can hold") from error
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(culprit, f"data that HDF5 cannot read ({error})", "readable data") from error
+        raise InputError(culprit, _damage(error), "readable data") from error
+
+
+def _unfolded(dataset: h5py.Dataset) -> object:
+    """All that a dataset holds, in no more memory than its header promises and its filters need."""
+    if dataset.nbytes > HOST_SHARE * host_bytes():
+        raise MemoryError
+    chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
+    with at_most(dataset.nbytes + _BUFFERS * chunk_bytes):
+        return dataset[()]
+
+
+def _damage(error: Exception) -> str:
+    bomb = ", or that unfold to more than their header promises" if "filter" in str(error) else ""
+    return f"data that HDF5 cannot read{bomb} ({error})"
 
 
 def read_array(
@@ -88,9 +104,9 @@ def read_word(
     if dataset.size != 1:  # many entries may all be one long text, which the file's size does not bound
         raise InputError(source.name(address), f"shape {dataset.shape}", "a string")
     try:
-        word = as_text(dataset[()])
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(source.name(address), f"data that HDF5 cannot read ({error})", "a string") from error
+        word = as_text(_unfolded(dataset))
+    except (MemoryError, OSError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(source.name(address), _damage(error), "a string") from error
     if word is None:
         raise InputError(source.name(address), f"type {dataset.dtype}, shape {dataset.shape}", "a string")
     if allowed is not None:

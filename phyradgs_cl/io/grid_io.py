@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import h5py
 
 from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition.field_of_view import field_of_view_mm
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
@@ -45,27 +45,7 @@ def write_grid(parent: h5py.Group, grid: Grid) -> None:
 
 
 def default_grid(geometry: ConeGeometry) -> Grid:
-    """The cube that a full turn of the cone covers, in voxels of one pixel pitch at the axis.
-
-    Its half side is the distance from the axis to the cone's edge ray, DSO·sin(atan(half width/DSD));
-    a panel that is shifted sideways counts with its far edge.
-    """
-    (_, columns), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
-    half_width_mm = columns * pitch_u / 2 + abs(geometry.detector_offset_mm[1])
-    half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
-    side_mm = 2 * geometry.source_to_axis_mm * math.sin(half_fan_rad)
-    voxel_mm = min(pitch_v, pitch_u) / geometry.magnification
+    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
+    side_mm = 2 * field_of_view_mm(geometry)[1]
+    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
     return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)
-
-
-def with_grid_count(grid: Grid, count: int) -> Grid:
-    """The same box with ``count`` voxels along its longest side, and as cubic as they were.
-
-    Shorter sides get the nearest whole count; every side keeps its length.
-    """
-    if count < 1:
-        raise InputError("grid count", str(count), "at least 1 voxel")
-    longest = max(grid.shape)
-    z, y, x = (max(1, round(n * count / longest)) for n in grid.shape)
-    dz, dy, dx = (side / n for side, n in zip(grid.size_mm, (z, y, x), strict=True))
-    return replace(grid, shape=(z, y, x), voxel_size_mm=(dz, dy, dx))

@@ -7,6 +7,7 @@ whose declared size the file cannot hold. Every defect is an InputError about "F
 from __future__ import annotations
 
 import difflib
+import math
 import posixpath
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ import h5py
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5_trial import survive
+from phyradgs_cl.io.regular import regular_file
 
 _MOST_SOFT_LINKS = 16
 # Masks of zeros shrink a thousandfold, frames hardly at all: a file of some size may unfold to so many times that.
@@ -31,11 +33,8 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
     Errors of HDF5 in the body come out as InputError too, so the body should do nothing but read.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(str(path), "no such file", "an HDF5 file", "check the path")
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "something that is not a regular file"
-        raise InputError(str(path), what, "an HDF5 file", "name an HDF5 file")
+    if regular_file(path, str(path), "an HDF5 file").st_size == 0:  # of /proc, or cut off
+        raise InputError(str(path), "an empty file", "an HDF5 file", "copy or write it again")
     survive(path)
     try:
         file = h5py.File(path, "r")
@@ -190,6 +189,7 @@ class Hdf5Source:
         try:
             elsewhere = dataset.is_virtual or bool(dataset.external)
             shape, chunks, declared_bytes = dataset.shape, dataset.chunks, dataset.nbytes
+            chunk_bytes = math.prod(chunks or ()) * dataset.dtype.itemsize
         except (OSError, RuntimeError, TypeError, ValueError) as error:
             raise InputError(self.name(address), f"a damaged dataset ({error})", "numbers or text") from error
         if elsewhere:
@@ -199,8 +199,10 @@ class Hdf5Source:
             raise InputError(self.name(address), "an empty dataset", "a value")
         file_bytes = self.path.stat().st_size
         most = file_bytes if chunks is None else _MOST_EXPANSION * file_bytes + _FREE_BYTES
-        if declared_bytes > most:
-            found = f"shape {shape}, {declared_bytes / 2**30:.3g} GiB in a file of {file_bytes} bytes"
+        if max(declared_bytes, chunk_bytes) > most:
+            what, size = ("shape", shape) if declared_bytes > most else ("chunks of", chunks)
+            declared = f"{max(declared_bytes, chunk_bytes) / 2**30:.3g} GiB"
+            found = f"{what} {size}, {declared} in a file of {file_bytes} bytes"
             raise InputError(
                 self.name(address), found, "a size that the file can hold", "write the file again"
             )

@@ -2,30 +2,33 @@
 
 The HDF5 library follows damaged headers without looking: a flipped bit can end the process that reads it, or keep it for
 ever. The other process (`hdf5_look`) opens every object, reads every attribute and every small dataset; a file that it does
-not survive is refused. Damage inside large datasets is met, and reported, by the reading itself. One process, started with
-the first file, looks at all of them; it leaves with this one.
+not survive is refused. Damage inside large datasets is met, and reported, by the reading itself. Linux copies this process
+for it, which takes milliseconds; elsewhere, where a copy may not use the system's libraries, an interpreter is started.
 """
 
 from __future__ import annotations
 
-import atexit
-import json
+import faulthandler
 import logging
 import os
+import signal
 import subprocess
 import sys
-import threading
-from contextlib import suppress
+import warnings
 from functools import lru_cache
 from pathlib import Path
 
+from h5py._objects import phil
+
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hdf5_look.__main__ import LARGE, look
 
 CPU_SECONDS, SECONDS = 3, 60.0
 """What a look may take: of a processor, where the system counts that, and by the clock, for a slow disk."""
-_SMALL_BYTES, _MOST_OBJECTS, _MOST_MEMORY_BYTES = 1 << 17, 5_000, 8 << 30
+FORKS = sys.platform == "linux"
+_SMALL_BYTES, _MOST_OBJECTS, _MOST_MEMORY_BYTES = 1 << 17, 5_000, 256 << 20
 _LOOK = Path(__file__).with_name("hdf5_look")
-_SIGXCPU = 24
+_SIGXCPU, _SIGALRM = 24, 14
 _log = logging.getLogger(__name__)
 
 
@@ -43,93 +46,56 @@ def survive(path: Path) -> None:
 @lru_cache(maxsize=64)  # a command may open a file several times
 def _verdict(path: Path, mtime_ns: int, size: int) -> str:
     """What is wrong with the file; "" where nothing is, or where nobody could look."""
-    with _lock:
-        return _scout.verdict(path)
+    limits = (_SMALL_BYTES, _MOST_OBJECTS, _MOST_MEMORY_BYTES, CPU_SECONDS, SECONDS)
+    try:
+        status = _in_a_copy(str(path), limits) if FORKS else _in_an_interpreter(str(path), limits)
+    except OSError as error:
+        _log.debug("no process to try HDF5 files in: %s", error)
+        return ""
+    if status == LARGE:
+        return f"a file whose headers ask HDF5 for more than {_MOST_MEMORY_BYTES >> 20} MiB"
+    if status in (-_SIGXCPU, -_SIGALRM):
+        return "a file that HDF5 does not finish reading"
+    return "a file so damaged that the HDF5 library crashes on it" if status < 0 else ""
 
 
-class _Scout:
-    """The other process, started anew after a file that it did not survive."""
-
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[str] | None = None
-        self._owner = 0
-        self._is_out = False
-
-    def verdict(self, path: Path) -> str:
-        process = self._running()
-        if process is None:
-            return ""
-        timed_out = threading.Event()
-
-        def give_up() -> None:
-            timed_out.set()
-            process.kill()
-
-        timer = threading.Timer(SECONDS, give_up)
-        timer.start()
+def _in_a_copy(path: str, limits: tuple[float, ...]) -> int:
+    """How a copy of this process that looks at the file ends: its status, or less the signal."""
+    with phil, warnings.catch_warnings():  # no other thread is inside HDF5; none goes on in the copy
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        status = 1
         try:
-            answer = self._asked(process, json.dumps(str(path)))
+            _be_silent()
+            status = look(path, *limits)  # type: ignore[arg-type]
         finally:
-            timer.cancel()
-        if answer == "done":
-            return ""
-        self.leave()
-        if answer == "large":
-            return f"a file whose headers ask HDF5 for more than {_MOST_MEMORY_BYTES >> 25} MiB"
-        if timed_out.is_set() or process.returncode == -_SIGXCPU:
-            return "a file that HDF5 does not finish reading"
-        return "a file so damaged that the HDF5 library crashes on it"
-
-    def leave(self) -> None:
-        """Ends the process."""
-        process, self._process = self._process, None
-        if process is None or self._owner != os.getpid():
-            return
-        for stream in (process.stdin, process.stdout):
-            with suppress(OSError):  # what it was not told any more
-                stream.close()  # type: ignore[union-attr]
-        try:
-            process.wait(5)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-    def _running(self) -> subprocess.Popen[str] | None:
-        """The process; None where it cannot be started: then files are read without a trial."""
-        if self._process is not None and self._owner == os.getpid() and self._process.poll() is None:
-            return self._process
-        if self._is_out:
-            return None
-        limits = [str(n) for n in (_SMALL_BYTES, _MOST_OBJECTS, _MOST_MEMORY_BYTES, CPU_SECONDS)]
-        try:
-            self._process = subprocess.Popen(
-                [sys.executable, str(_LOOK), *limits],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                text=True,
-                start_new_session=True,  # Ctrl-C is for this process
-            )
-        except (OSError, ValueError) as error:
-            return self._give_up(str(error))
-        self._owner = os.getpid()
-        if self._process.stdout.readline() != "ready\n":  # type: ignore[union-attr]
-            self.leave()
-            return self._give_up("it ended at once")
-        return self._process
-
-    def _asked(self, process: subprocess.Popen[str], question: str) -> str:
-        try:
-            process.stdin.write(question + "\n")  # type: ignore[union-attr]
-            process.stdin.flush()  # type: ignore[union-attr]
-        except OSError:
-            return ""
-        return process.stdout.readline().strip()  # type: ignore[union-attr]
-
-    def _give_up(self, reason: str) -> None:
-        self._is_out = True
-        _log.debug("no process to try HDF5 files in: %s", reason)
+            os._exit(status)
+    try:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    except BaseException:  # Ctrl-C
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        raise
 
 
-_lock, _scout = threading.Lock(), _Scout()
-atexit.register(_scout.leave)
+def _be_silent() -> None:
+    """In the copy: signals are for the process that was copied, and so is the terminal."""
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    faulthandler.disable()
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+
+
+def _in_an_interpreter(path: str, limits: tuple[float, ...]) -> int:
+    quiet = subprocess.DEVNULL
+    command = [sys.executable, str(_LOOK), path, *map(str, limits)]
+    try:
+        return subprocess.run(
+            command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True, timeout=SECONDS
+        ).returncode
+    except subprocess.TimeoutExpired:
+        return -_SIGALRM

@@ -13,9 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.io.facts import damage
+from phyradgs_cl.io.regular import read_regular, regular_file
+from phyradgs_cl.text import plain_text
 
 Line = dict[str, Any]
 log = logging.getLogger(__name__)
+_WANTED = "a results file (JSON lines)"
+_MOST_BYTES = 1 << 30
 
 
 def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True) -> list[Line]:
@@ -24,11 +29,9 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
     Raises:
         InputError: a file that cannot be read, or that has content but no result.
     """
-    refuse_irregular(path)
-    try:
-        text = path.read_bytes().decode(errors="replace") if path.exists() else ""
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a results file (JSON lines)") from error
+    text = ""
+    if path.exists():
+        text = read_regular(path, str(path), _MOST_BYTES, _WANTED).decode(errors="replace")
     lines: list[Line] = []
     damaged = []
     for number, row in enumerate(text.split("\n"), 1):
@@ -38,9 +41,7 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
         elif row.strip():
             damaged.append(number)
     if damaged and not lines and len(damaged) > 1:
-        raise InputError(
-            str(path), "no result in any line", "a results file (JSON lines)", "choose another -o"
-        )
+        raise InputError(str(path), "no result in any line", _WANTED, "choose another -o")
     if damaged:
         where = ("line %s is" if len(damaged) == 1 else "lines %s are") % ", ".join(map(str, damaged))
         log.warning("%s: %s damaged and left out", path, where)
@@ -49,14 +50,13 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
 
 def refuse_irregular(path: Path) -> None:
     """Raise InputError for what is there and no regular file: a device or a pipe may never end."""
-    if path.exists() and not path.is_file():
-        expected = "a results file (JSON lines)"
-        raise InputError(str(path), "something that is not a regular file", expected, "choose another -o")
+    if path.exists():
+        regular_file(path, str(path), _WANTED)
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
     """Add one line in a single write that is on the disk when this returns."""
-    text = json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json_text(line) + "\n"
     try:
         with open(path, "ab+") as file:
             if _is_open_ended(file):
@@ -70,12 +70,17 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
         ) from error
 
 
+def json_text(value: object) -> str:
+    """JSON of numbers that are finite, in which text stays readable."""
+    return plain_text(json.dumps(value, ensure_ascii=False, allow_nan=False))
+
+
 def _parsed(row: str) -> Line | None:
     try:
         line = json.loads(row)
     except (ValueError, RecursionError):
         return None
-    return line if isinstance(line, dict) and "run" in line else None
+    return line if isinstance(line, dict) and "run" in line and not damage(line, {}) else None
 
 
 def _is_open_ended(file: Any) -> bool:

@@ -52,8 +52,11 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     return replace(header.scan, projections=projections, pixel_mask=_united(kept, bad), reference=reference)
 
 
-def scan_summary(path: str | Path) -> dict[str, object]:
-    """Facts about a scan file, for people: checked as for reading, but without touching the pixels."""
+def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
+    """Facts about a scan file, for people: checked as for reading, but without touching the pixels.
+
+    sha256: of the file, where it is known already.
+    """
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
@@ -76,7 +79,7 @@ def scan_summary(path: str | Path) -> dict[str, object]:
         "grid_voxel_size_mm": scan.grid.voxel_size_mm,
         "grid_stored": header.has_grid,
         "reference": header.has_reference,
-        "sha256": sha256_of(path),
+        "sha256": sha256 or sha256_of(path),
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import dataclass
 
@@ -10,12 +9,13 @@ import h5py
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import scan_schema as schema
 from phyradgs_cl.io.datasets import read_attribute, read_number, read_word
+from phyradgs_cl.io.facts import read_facts
 from phyradgs_cl.io.grid_io import default_grid, read_grid
 from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.scan_detector import (
@@ -76,6 +76,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     shutter = read_shutter(source, entry, used, moving)
     is_fly = moving and shutter.exposure_s > 0
     start_s = read_starts(source, entry, used, shutter, moving)
+    shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
     scan = Scan(
@@ -90,6 +91,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         title=_optional_word(source, f"{entry}/title", "cone-beam scan"),
         provenance=_read_provenance(source, entry),
         lag=_read_lag(source, entry),
+        saturation=_read_saturation(source, entry),
     )
     scan.check_timing()
     mask_shape = check_mask(source, entry, data.shape)
@@ -148,17 +150,20 @@ def _read_lag(source: Hdf5Source, entry: str) -> float:
     return lag
 
 
+def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
+    level, share = (f"{entry}/{schema.EXTRA}/saturation_{name}" for name in ("level", "share"))
+    if source.optional(level, KNOWN) is None and source.optional(share, KNOWN) is None:
+        return None
+    found = Saturation(read_number(source, level, known=KNOWN), read_number(source, share, known=KNOWN))
+    checks.within(source.name(share), found.share, 0, 1)
+    return found
+
+
 def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
     address = f"{entry}/{schema.EXTRA}/provenance"
     if source.optional(address, KNOWN) is None:
         return {}
-    try:
-        facts = json.loads(read_word(source, address))
-    except ValueError as error:
-        raise InputError(source.name(address), f"text that is not JSON ({error})", "a JSON object") from error
-    if not isinstance(facts, dict):
-        raise InputError(source.name(address), f"JSON {type(facts).__name__}", "a JSON object")
-    return facts
+    return read_facts(source.name(address), read_word(source, address), {})
 
 
 def _optional_word(source: Hdf5Source, address: str, default: str) -> str:

@@ -39,6 +39,8 @@ KNOWN_NAMES = frozenset(
         "pulse_start",
         "pulse_length",
         "lag",
+        "saturation_level",
+        "saturation_share",
         "kinematics",
         "poses",
         "grid",

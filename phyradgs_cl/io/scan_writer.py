@@ -18,6 +18,7 @@ from phyradgs_cl.io.datasets import new_group, write_number
 from phyradgs_cl.io.grid_io import write_grid
 from phyradgs_cl.io.new_hdf5 import new_hdf5
 from phyradgs_cl.io.scan_motion import write_motion
+from phyradgs_cl.text import plain_text
 
 _log = logging.getLogger(__name__)
 
@@ -49,8 +50,8 @@ def write_scan(
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         entry = new_group(file, "entry", "NXentry")
         entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"
-        entry["definition"], entry["title"] = "NXtomo", scan.title
-        new_group(entry, schema.SAMPLE, "NXsample")["name"] = scan.title
+        entry["definition"], entry["title"] = "NXtomo", plain_text(scan.title)
+        new_group(entry, schema.SAMPLE, "NXsample")["name"] = plain_text(scan.title)
         # Frames between projections (flats, darks) are filed under the projection before them.
         frame_of = np.clip(np.cumsum(key == schema.PROJECTION) - 1, 0, None)
         _write_instrument(entry, scan, frames, key, quantity, frame_of)
@@ -129,6 +130,9 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
     extra["detector_model"] = scan.detector_model
     if scan.lag > 0:
         write_number(extra, "lag", scan.lag)
+    if scan.saturation is not None:
+        write_number(extra, "saturation_level", scan.saturation.level)
+        write_number(extra, "saturation_share", scan.saturation.share)
     if scan.shutter.pulse_s is not None and _stored_durations(scan)[0] > 0:
         start_s, length_s = scan.shutter.pulse_s
         write_number(extra, "pulse_start", start_s, "s")

@@ -7,6 +7,7 @@ from phyradgs_cl.metrics.edge import edge_sharpness
 from phyradgs_cl.metrics.panels import panels_png
 from phyradgs_cl.metrics.projections import compare_projections
 from phyradgs_cl.metrics.psnr import psnr
+from phyradgs_cl.metrics.resample import resampled
 from phyradgs_cl.metrics.roundness import roundness
 from phyradgs_cl.metrics.slices import slices_png
 from phyradgs_cl.metrics.ssim import ssim, ssim_map
@@ -19,6 +20,7 @@ __all__ = [
     "panels_png",
     "psnr",
     "regional_bias",
+    "resampled",
     "roundness",
     "slices_png",
     "ssim",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_erosion
 
 from phyradgs_cl.checks import at_least, shape
 from phyradgs_cl.errors import InputError
@@ -47,4 +47,4 @@ def _eroded(mask: NDArray[np.bool_], voxels: int) -> NDArray[np.bool_]:
     """Erosion by the full 3×3×3 neighbourhood; what lies beyond the volume belongs to no region."""
     if voxels == 0:
         return mask
-    return binary_erosion(mask, np.ones((3,) * mask.ndim, bool), iterations=int(voxels))
+    return scipy.ndimage.binary_erosion(mask, np.ones((3,) * mask.ndim, bool), iterations=int(voxels))

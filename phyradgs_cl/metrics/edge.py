@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.special import erf
 
 from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
@@ -68,7 +67,7 @@ def ball_edge(volume: NDArray[np.floating], grid: Grid, ball: Ball) -> Edge:
 
     start = (1.0, min(0.5 * voxel_mm / ball.radius_mm, 0.9), 1.0, 0.0)
     bounds = ((0.5, 0.02 * voxel_mm / ball.radius_mm, -5.0, -5.0), (1.5, 1.0, 5.0, 5.0))
-    radius, sigma, share, base = least_squares(residual, start, bounds=bounds).x
+    radius, sigma, share, base = scipy.optimize.least_squares(residual, start, bounds=bounds).x
     if share <= 0:
         return Edge(np.nan, np.nan, inside, outside)
     levels_found = outside + contrast * (base + share), outside + contrast * base
@@ -79,6 +78,6 @@ def blurred_ball(distance_mm: Array, radius_mm: float, sigma_mm: float) -> Array
     """A unit ball convolved with a normalised 3D Gaussian, at distances (n,) from its centre."""
     r = np.maximum(distance_mm, 1e-4 * radius_mm)  # the limit at 0, without its 0/0
     to_edge, from_edge = (radius_mm - r) / sigma_mm, (radius_mm + r) / sigma_mm
-    within = 0.5 * (erf(from_edge / np.sqrt(2)) + erf(to_edge / np.sqrt(2)))
+    within = 0.5 * (scipy.special.erf(from_edge / np.sqrt(2)) + scipy.special.erf(to_edge / np.sqrt(2)))
     shells = np.exp(-0.5 * to_edge**2) - np.exp(-0.5 * from_edge**2)
     return within - sigma_mm / (r * np.sqrt(2 * np.pi)) * shells

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
@@ -116,7 +116,7 @@ def _along_rays(
     low = [max(0, int(i.min()) - 8) for i in index]
     high = [min(n, int(i.max()) + 9) for i, n in zip(index, grid.shape, strict=True)]
     box = volume[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float64)
-    return map_coordinates(box, index - np.array(low)[:, None, None], order=3, mode="nearest")
+    return scipy.ndimage.map_coordinates(box, index - np.array(low)[:, None, None], order=3, mode="nearest")
 
 
 def _section(radii_mm: Array) -> Section:

@@ -12,6 +12,7 @@ from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.metrics.psnr import psnr
 from phyradgs_cl.metrics.ssim import ssim
+from phyradgs_cl.text import plain_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +48,8 @@ def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None,
     figure = Figure(
         figsize=((1 if truth is None else 3) * _INCH * 1.25, 3 * _INCH + 0.6), layout="constrained"
     )
-    figure.suptitle(title if truth is None else f"{title}\n{_numbers(volume, truth)}")
+    heading = plain_text(title if truth is None else f"{title}\n{_numbers(volume, truth)}")
+    figure.suptitle(heading, parse_math=False)  # a dollar in a file's name is one
     _fill(figure, volume, truth)
     try:
         figure.savefig(path, dpi=_DPI, format="png")

@@ -8,8 +8,8 @@ of radiative Gaussian splatting are made.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import correlate1d
 
 from phyradgs_cl.checks import shape
 from phyradgs_cl.errors import InputError
@@ -81,5 +81,5 @@ def _blur(images: Array) -> Array:
     offsets = np.arange(WINDOW) - WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     weights /= weights.sum()
-    rows = correlate1d(images, weights, axis=-2, mode="constant")
-    return correlate1d(rows, weights, axis=-1, mode="constant")
+    rows = scipy.ndimage.correlate1d(images, weights, axis=-2, mode="constant")
+    return scipy.ndimage.correlate1d(rows, weights, axis=-1, mode="constant")

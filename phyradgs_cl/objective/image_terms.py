@@ -9,7 +9,7 @@ Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import correlate1d
+import scipy
 
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
@@ -35,6 +35,8 @@ class ImageLoss:
         self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
         self.ssim_weight, self.l1_weight, self.poisson_weight = ssim_weight, l1_weight, poisson_weight
         image = GUARD + lines * pitch
+        kernels = ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient")
+        self._kernels = {name: rt.kernel("loss", name, IMAGE_GUARD=GUARD) for name in kernels}
         self._moments = rt.zeros(5 * image + GUARD)
         self._partials = rt.zeros(3 * image + GUARD)
         self._spread = rt.zeros(3 * image + GUARD)
@@ -61,13 +63,10 @@ class ImageLoss:
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
 
-        def kernel(name: str) -> object:
-            return rt.kernel("loss", name, IMAGE_GUARD=GUARD)
-
         images = (rendered, measured, mask, self._window)
-        rt.launch(kernel("ssim_moments"), (vectors, self.lines), *images, *size, self._moments, group=group)
+        rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
-            kernel("ssim_map"),
+            self._kernels["ssim_map"],
             self.lines,
             self._moments,
             *images,
@@ -81,7 +80,7 @@ class ImageLoss:
             group=group,
         )
         rt.launch(
-            kernel("ssim_spread"),
+            self._kernels["ssim_spread"],
             (vectors, self.lines),
             self._partials,
             self._window,
@@ -90,7 +89,7 @@ class ImageLoss:
             group=group,
         )
         rt.launch(
-            kernel("image_gradient"),
+            self._kernels["image_gradient"],
             self.lines,
             self._spread,
             *images,
@@ -138,5 +137,5 @@ def image_loss(
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
-    rows = correlate1d(image, WINDOW, axis=1, mode="constant")
-    return correlate1d(rows, WINDOW, axis=0, mode="constant")
+    rows = scipy.ndimage.correlate1d(image, WINDOW, axis=1, mode="constant")
+    return scipy.ndimage.correlate1d(rows, WINDOW, axis=0, mode="constant")

@@ -19,6 +19,7 @@ class TotalVariation:
         nz, ny, nx = shape
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._weight4 = np.array([*_axis_weights(shape)[::-1], 0], np.float32)
+        self._kernel = rt.kernel("total_variation", "total_variation", IMAGE_GUARD=GUARD)
         self._row_sums = rt.zeros(nz * ny)
         self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
@@ -26,7 +27,7 @@ class TotalVariation:
         """dTV/dvolume, until the next call."""
         nz, ny, _ = self.shape
         self.rt.launch(
-            self.rt.kernel("total_variation", "total_variation", IMAGE_GUARD=GUARD),
+            self._kernel,
             (ny, nz),
             volume,
             self._shape4,

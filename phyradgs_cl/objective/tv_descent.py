@@ -19,6 +19,7 @@ class TvDescent:
         self.rt, self.shape = rt, shape
         nz, ny, nx = shape
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
+        self._kernel = rt.kernel("tv_descent", "tv_gradient")
         self._volume, self._gradient = rt.empty(shape), rt.empty(shape)
 
     def gradient(self, volume: np.ndarray) -> np.ndarray:
@@ -26,7 +27,7 @@ class TvDescent:
         nz, ny, nx = self.shape
         self.rt.write(self._volume, volume)
         self.rt.launch(
-            self.rt.kernel("tv_descent", "tv_gradient"),
+            self._kernel,
             (nx, ny, nz),
             self._volume,
             self._shape4,

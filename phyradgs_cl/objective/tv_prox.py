@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import Kernel, Runtime
 
 
 class TvProx:
@@ -25,6 +25,7 @@ class TvProx:
         nz, ny, nx = shape
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._weights4 = np.array([*axis_weights[::-1], 0], np.float32)
+        self._primal_step, self._dual_step = rt.kernel("tv_prox", "tv_primal"), rt.kernel("tv_prox", "tv_dual")
         self._dual = rt.zeros((3, *shape))
         self._moved = rt.zeros((3, *shape))
         self._volume = rt.empty(shape)
@@ -53,7 +54,7 @@ class TvProx:
             self._primal(weight, nonnegative)
             t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
             self._launch(
-                "tv_dual", self._volume, self._shape4, self._weights4, step, np.float32((t - 1) / t_next),
+                self._dual_step, self._volume, self._shape4, self._weights4, step, np.float32((t - 1) / t_next),
                 self._dual, self._moved,
             )  # fmt: skip
             t = t_next
@@ -63,15 +64,13 @@ class TvProx:
 
     def _primal(self, weight: float, nonnegative: bool) -> None:
         self._launch(
-            "tv_primal", self._observed, self._moved, self._shape4, self._weights4, np.float32(weight),
+            self._primal_step, self._observed, self._moved, self._shape4, self._weights4, np.float32(weight),
             np.int32(nonnegative), self._volume,
         )  # fmt: skip
 
-    def _launch(self, name: str, *arguments: object) -> None:
+    def _launch(self, kernel: Kernel, *arguments: object) -> None:
         nz, ny, nx = self.shape
-        self.rt.launch(
-            self.rt.kernel("tv_prox", name), (nx, ny, nz), *arguments, group=self.rt.group(on_cpu=16)
-        )
+        self.rt.launch(kernel, (nx, ny, nz), *arguments, group=self.rt.group(on_cpu=16))
 
 
 def tv_prox(

@@ -26,6 +26,10 @@ class TileLists:
         self.starts = rt.zeros(self.total + 1, np.int32)
         self.entries = rt.empty(1, np.int32)
         self._counts: DeviceArray = rt.empty(1, np.int32)
+        self._count = rt.kernel("binning", "bin_count")
+        self._within = rt.kernel("binning", "bin_within")
+        self._starts = rt.kernel("binning", "bin_starts")
+        self._fill = rt.kernel("binning", "bin_fill")
 
     def build(self, extents: DeviceArray, count: int, stride: int) -> None:
         """Fills ``starts`` (tiles + 1,) and ``entries`` from extents (6, stride).
@@ -46,9 +50,9 @@ class TileLists:
             self.tiles,
         )
         group = rt.group()
-        rt.launch(rt.kernel("binning", "bin_count"), chunks, extents, *domain, self._counts, group=group)
+        rt.launch(self._count, chunks, extents, *domain, self._counts, group=group)
         rt.launch(
-            rt.kernel("binning", "bin_within"),
+            self._within,
             self.total,
             np.int32(self.total),
             np.int32(chunks),
@@ -56,7 +60,7 @@ class TileLists:
             self.starts,
             group=group,
         )
-        rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(self.total), self.starts)
+        rt.launch(self._starts, 1, np.int32(self.total), self.starts)
         needed = self._total_entries()
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
@@ -66,7 +70,7 @@ class TileLists:
             self.entries = rt.empty(1, np.int32)
             self.entries = rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
         rt.launch(
-            rt.kernel("binning", "bin_fill"),
+            self._fill,
             chunks,
             extents,
             *domain,

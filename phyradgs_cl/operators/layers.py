@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from phyradgs_cl.operators.layout import DeviceCells
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 
@@ -19,6 +19,8 @@ class Layers:
     def __init__(self, rt: Runtime, lines: int, width: int, unit: float) -> None:
         self.rt, self.lines, self.width, self.unit = rt, lines, width, unit
         self._count = 0
+        self._merge = rt.kernel("intensity", "intensity_merge", IMAGE_GUARD=GUARD)
+        self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
         """Memory for the layers of ``cells``: images of GUARD floats and (lines, pitch)."""
@@ -33,7 +35,7 @@ class Layers:
     def merge(self, cells: DeviceCells, merged: DeviceArray) -> None:
         """Writes −ln Σ w exp(−p) of the layers that were drawn last into ``merged``."""
         self._launch(
-            "intensity_merge",
+            self._merge,
             (self._drawn, cells.layer_weights),
             cells,
             (np.float32(self.unit), self._shares, merged),
@@ -41,13 +43,12 @@ class Layers:
 
     def split(self, cells: DeviceCells, by_merged: DeviceArray) -> DeviceArray:
         """dL/dlayers of the last ``merge`` from dL/dmerged; valid until the next call."""
-        self._launch("intensity_split", (by_merged, self._shares), cells, (self._by_layers,))
+        self._launch(self._split, (by_merged, self._shares), cells, (self._by_layers,))
         return self._by_layers
 
     def _launch(
-        self, name: str, inputs: tuple[object, ...], cells: DeviceCells, rest: tuple[object, ...]
+        self, kernel: Kernel, inputs: tuple[object, ...], cells: DeviceCells, rest: tuple[object, ...]
     ) -> None:
         rt = self.rt
         sizes = (np.int32(n) for n in (cells.layers, self.lines, self.width, pitch_of(self.width)))
-        kernel = rt.kernel("intensity", name, IMAGE_GUARD=GUARD)
         rt.launch(kernel, (-(-self.width // rt.lanes), self.lines), *inputs, *sizes, *rest, group=rt.group())

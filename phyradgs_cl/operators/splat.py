@@ -9,19 +9,22 @@ needs the cells of a line one by one: they are drawn into a few layers then, whi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from phyradgs_cl.operators.binning import TileLists
 from phyradgs_cl.operators.layers import Layers
 from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.splat_count import UNSEEN, Work, moving_work, still_work
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
 SUM_FLOATS = 16
 DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
 DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
+PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
 _BAND_LINES = 8
 _TILE = 16
 _BACKWARD_GROUP = 32
@@ -37,6 +40,29 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
     return one, two, max(three, 0.7)
+
+
+@dataclass(frozen=True)
+class _Kernels:
+    """The four passes; cells without motion get code without it."""
+
+    prepare: Kernel
+    forward: Kernel
+    backward: Kernel
+    chain: Kernel
+
+    @classmethod
+    def declare(cls, rt: Runtime, **options: bool) -> _Kernels:
+        by_pixel = rt.pixel_items
+        defines = {"IMAGE_GUARD": GUARD, **options}
+        forward = "splat_forward_pixels" if by_pixel else "splat_forward_rows"
+        backward = "splat_backward_group" if by_pixel else "splat_backward_rows"
+        return cls(
+            prepare=rt.kernel("splat_prepare", "splat_prepare", **defines),
+            forward=rt.kernel("splat_forward", forward, BLOCK_PIXEL=by_pixel, **defines),
+            backward=rt.kernel("splat_backward", backward, GROUP=_BACKWARD_GROUP if by_pixel else 1, **defines),
+            chain=rt.kernel("splat_chain", "splat_chain", **defines),
+        )
 
 
 class SplatProjector:
@@ -69,13 +95,14 @@ class SplatProjector:
         self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
-        self._affine, self._footprint = int(affine), int(pixel_footprint)
         self.image = padded_zeros(rt, lines, width)
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
         self._seen = rt.empty(1, np.uint8)
         self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
+        options = {"AFFINE": affine, "FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
+        self._kernels = {moving: _Kernels.declare(rt, MOVING=moving, **options) for moving in (False, True)}
 
     # --- device to device: the reconstruction's loop --------------------------------------------------
 
@@ -89,13 +116,10 @@ class SplatProjector:
         self.prepare(gaussians, cells)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         rt = self.rt
-        kernel = rt.kernel(
-            "splat_forward", "splat_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines(cells)
-        )
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.pitch, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
-            kernel,
+            self._kernels[cells.moving].forward,
             items,
             self._records,
             self._seen,
@@ -136,9 +160,9 @@ class SplatProjector:
         rt = self.rt
         group = _BACKWARD_GROUP if self.by_pixel else 1
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
-        kernel = rt.kernel("splat_backward", "splat_backward", GROUP=group, **self._defines(cells))
+        kernels = self._kernels[cells.moving]
         rt.launch(
-            kernel,
+            kernels.backward,
             gaussians.count * group,
             self._records,
             self._seen,
@@ -156,7 +180,7 @@ class SplatProjector:
             group=group if group > 1 else 16,
         )
         rt.launch(
-            rt.kernel("splat_chain", "splat_chain", **self._defines(cells)),
+            kernels.chain,
             gaussians.stride // rt.lanes,
             gaussians.rows,
             cells.cells,
@@ -192,16 +216,6 @@ class SplatProjector:
         times = self.rt.download(cells.line_times)
         return moving_work(records, times, self.path_limits, self.rt.lanes, bool(self.cutoff2 > 0))
 
-    def _defines(self, cells: DeviceCells) -> dict[str, int]:
-        """What the kernels are built with; cells without motion get code without it."""
-        return {
-            "AFFINE": self._affine,
-            "FOOTPRINT": self._footprint,
-            "IMAGE_GUARD": GUARD,
-            "LAYERED": int(self._layers is not None),
-            "MOVING": int(cells.moving),
-        }
-
     def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
         """Sees every Gaussian from every pose: what ``draw`` begins with, and ``backward`` needs."""
         rt = self.rt
@@ -218,7 +232,7 @@ class SplatProjector:
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
         rt.launch(
-            rt.kernel("splat_prepare", "splat_prepare", **self._defines(cells)),
+            self._kernels[cells.moving].prepare,
             gaussians.stride // rt.lanes,
             gaussians.rows,
             cells.cells,

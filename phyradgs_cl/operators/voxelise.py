@@ -36,7 +36,10 @@ class Voxeliser:
         self._records = rt.empty(1)
         self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
-        self._defines = {"IMAGE_GUARD": GUARD}
+        self._prepare = rt.kernel("voxel_prepare", "voxel_prepare", IMAGE_GUARD=GUARD)
+        self._forward = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=self.by_pixel, IMAGE_GUARD=GUARD)
+        self._backward = rt.kernel("voxel_backward", "voxel_backward", IMAGE_GUARD=GUARD)
+        self._chain = rt.kernel("voxel_backward", "voxel_chain", IMAGE_GUARD=GUARD)
 
     def forward(
         self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
@@ -48,10 +51,9 @@ class Voxeliser:
         rt = self.rt
         self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
-        kernel = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=int(self.by_pixel), **self._defines)
         nz, ny, _ = self.shape
         rt.launch(
-            kernel,
+            self._forward,
             (self.pitch, ny, nz) if self.by_pixel else self.lists.total,
             self._records,
             self.lists.starts,
@@ -81,7 +83,7 @@ class Voxeliser:
         if self._sums.size < gaussians.stride * SUM_FLOATS:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
         rt.launch(
-            rt.kernel("voxel_backward", "voxel_backward", **self._defines),
+            self._backward,
             gaussians.count,
             self._records,
             by_volume,
@@ -93,7 +95,7 @@ class Voxeliser:
             group=rt.group(on_cpu=16),
         )
         rt.launch(
-            rt.kernel("voxel_backward", "voxel_chain", **self._defines),
+            self._chain,
             gaussians.stride // rt.lanes,
             gaussians.rows,
             self._sums,
@@ -112,7 +114,7 @@ class Voxeliser:
             self._records = rt.empty(stride * RECORD_FLOATS)
             self._extents = rt.empty(6 * stride, np.int32)
         rt.launch(
-            rt.kernel("voxel_prepare", "voxel_prepare", **self._defines),
+            self._prepare,
             stride // rt.lanes,
             gaussians.rows,
             split_coefficients(rt, index_matrix(grid)),

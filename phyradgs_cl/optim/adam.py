@@ -35,11 +35,14 @@ class DeviceAdam:
     def __init__(self, rt: Runtime, activation: Activation) -> None:
         self.rt, self.activation = rt, activation
         self._rates = rt.zeros(11)
+        self._activate = rt.kernel("adam", "activate")
+        self._chain = rt.kernel("adam", "chain_activations")
+        self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
         """Parameter rows from raw rows."""
         self.rt.launch(
-            self.rt.kernel("adam", "activate"),
+            self._activate,
             stride // self.rt.lanes,
             raw,
             np.int32(count),
@@ -67,7 +70,7 @@ class DeviceAdam:
         """dL/dparameters to dL/draw in place, with the parameter terms (means) added and the statistics gathered."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
-            self.rt.kernel("adam", "chain_activations"),
+            self._chain,
             stride // self.rt.lanes,
             raw,
             parameters,
@@ -96,7 +99,7 @@ class DeviceAdam:
         """One step of Adam; ``rates`` (11,), ``step`` counts from 1."""
         self.rt.write(self._rates, folded_rates(rates, step))
         self.rt.launch(
-            self.rt.kernel("adam", "adam_step"),
+            self._step,
             (stride // self.rt.lanes, 11),
             raw,
             gradients,

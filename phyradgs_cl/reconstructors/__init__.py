@@ -1,19 +1,15 @@
-"""Methods: one file each, one signature for all, ``(scan, options, rt, seed, report) → Reconstruction``."""
+"""Methods: one file each, one signature for all, ``(scan, options, rt, seed, report) → Reconstruction``.
 
-from phyradgs_cl.reconstructors.prepared import InputOptions
-from phyradgs_cl.reconstructors.registry import METHODS, Method, input_options, method_options, reconstruct
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress
+They are imported when they are used: a command that only holds its signals does not wait for them.
+"""
 
-__all__ = [
-    "METHODS",
-    "InputOptions",
-    "Method",
-    "Progress",
-    "ProgressReport",
-    "Reconstruction",
-    "State",
-    "ignore_progress",
-    "input_options",
-    "method_options",
-    "reconstruct",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "prepared": ["InputOptions"],
+        "registry": ["METHODS", "Method", "input_options", "method_name", "method_options", "reconstruct"],
+        "result": ["Progress", "ProgressReport", "Reconstruction", "State", "ignore_progress"],
+    },
+)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+import scipy
 
 _WORKERS = -1  # all cores
 
@@ -30,7 +30,7 @@ def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
     kernel[0] = 0.25
-    spectrum = rfft(kernel).real
+    spectrum = scipy.fft.rfft(kernel).real
     return spectrum * WINDOWS[window](np.arange(spectrum.size) / (length / 2))
 
 
@@ -40,8 +40,8 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
     Returns the same shape in float32 and units of ``rows`` per mm. Float32 rows stay float32 throughout.
     """
     width = rows.shape[-1]
-    length = next_fast_len(2 * width, real=True)
-    spectrum = rfft(rows, length, axis=-1, workers=_WORKERS)
+    length = scipy.fft.next_fast_len(2 * width, real=True)
+    spectrum = scipy.fft.rfft(rows, length, axis=-1, workers=_WORKERS)
     spectrum *= (ramp_spectrum(length, window) / spacing_mm).astype(spectrum.real.dtype)
-    filtered = irfft(spectrum, length, axis=-1, overwrite_x=True, workers=_WORKERS)
+    filtered = scipy.fft.irfft(spectrum, length, axis=-1, overwrite_x=True, workers=_WORKERS)
     return filtered[..., :width].astype(np.float32, copy=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from phyradgs_cl.fields import Gaussians, Grid
 
@@ -54,5 +54,5 @@ def _neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
     neighbours = min(4, len(points))
     if neighbours < 2:
         return np.full(len(points), fallback)
-    distance, _ = cKDTree(points).query(points, k=neighbours)
+    distance, _ = scipy.spatial.cKDTree(points).query(points, k=neighbours)
     return np.sqrt((distance[:, 1:] ** 2).mean(axis=1))

@@ -1,33 +1,42 @@
-"""What happens to a scan's frames before any method sees them: lag undone, and a median filter where it is asked for."""
+"""What happens to a scan before any method sees it: another grid, lag undone, a median filter."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import without_lag
+from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.reconstructors.fdk import unmasked_frames
 
 MEDIAN_EDGES = (0, 3, 5)
 
 
 @dataclass(frozen=True)
-class InputOptions:
-    """ignore_lag: leave the panel's lag in the frames. median_filter: edge of its window in pixels, 0 for none."""
+class InputOptions(GridChoice):
+    """size, voxel_mm, roi_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
+    median_filter: edge of its window in pixels, 0 for none.
+    """
 
     ignore_lag: bool = False
     median_filter: int = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
+
+    def facts(self) -> dict[str, object]:
+        """What is chosen, by name."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def prepared(scan: Scan, options: InputOptions) -> Scan:
     """The scan as a method gets it; the scan itself where nothing is to be done."""
+    scan = scan.with_grid(options)
     if not options.ignore_lag:
         scan = without_lag(scan)
     if options.median_filter > 0:
@@ -41,4 +50,5 @@ def median_frames(scan: Scan, edge: int) -> np.ndarray:
     Masked pixels are filled in from their row first, so that what they hold does not reach their neighbours.
     """
     frames = unmasked_frames(scan)
-    return np.stack([median_filter(frame, size=edge, mode="nearest") for frame in frames]).astype(np.float32)
+    smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]
+    return np.stack(smooth).astype(np.float32)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from difflib import get_close_matches
 from typing import Any
 
 from phyradgs_cl import checks
@@ -26,6 +25,7 @@ from phyradgs_cl.reconstructors.sax_nerf import SAX_PRESETS, sax_nerf
 from phyradgs_cl.reconstructors.sirt import SirtOptions, sirt
 from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import near_miss
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
@@ -61,6 +61,14 @@ METHODS = {
 }
 
 
+def method_name(method: object) -> str:
+    """The name of a method in METHODS, however its letters are cased. Raises InputError for what is none."""
+    name = method.lower() if isinstance(method, str) else ""
+    if name not in METHODS:
+        raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
+    return name
+
+
 def method_options(method: str, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
 
@@ -68,8 +76,7 @@ def method_options(method: str, preset: str | None = None, changes: Mapping[str,
     may be a model of one's own.
     Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
     """
-    if not isinstance(method, str) or method not in METHODS:
-        raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
+    method = method_name(method)
     presets = METHODS[method].presets
     name = next(iter(presets)) if preset is None else preset
     if not isinstance(name, str) or name not in presets:
@@ -97,6 +104,7 @@ def reconstruct(
 
     ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing.
     """
+    method = method_name(method)
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method, rt)
@@ -182,15 +190,16 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
     for key, value in changes.items():
         if key not in known:
             names = [*known, *_motion_options(options)]
-            close = get_close_matches(key, names, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else "leave it out"
+            remedy = near_miss(key, names, "leave it out")
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
         values[key] = _converted(known[key], value, f"{culprit}: option {key}")
     return replace(options, **values)
 
 
 def _converted(current: Any, value: Any, culprit: str) -> Any:
-    """``value`` as the type of the present value: numbers, words, tuples, nested tables."""
+    """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
+    if current is None:  # the options check it themselves
+        return value
     if is_dataclass(current):
         if not isinstance(value, Mapping):
             raise InputError(culprit, checks.shown(value), "a table")

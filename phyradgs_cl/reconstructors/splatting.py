@@ -12,6 +12,7 @@ import time
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, Scan
+from phyradgs_cl.operators.splat import PAIR_KERNELS
 from phyradgs_cl.operators.splat_count import Work
 from phyradgs_cl.optim import Population
 from phyradgs_cl.reconstructors.fdk import static_fdk
@@ -97,7 +98,7 @@ def time_facts(run: SplatRun) -> dict[str, object]:
 def evaluated_pairs(run: SplatRun) -> dict[str, int]:
     """Gaussian–pixel pairs that a launch evaluates, of the last cloud in the first frame, by kernel."""
     evaluated = _first_frame_work(run).evaluated
-    return {"splat_forward": evaluated, "splat_backward": evaluated}
+    return dict.fromkeys(PAIR_KERNELS, evaluated)
 
 
 def _first_frame_work(run: SplatRun) -> Work:

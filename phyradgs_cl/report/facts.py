@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # finer than anything a scanner knows
 _WORDS = {"psnr": "PSNR", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400
 
@@ -35,15 +36,20 @@ def unit(key: str) -> str:
 
 def shown(value: object, unit_name: str = "") -> str:
     """A value with its unit, short enough to be read."""
-    text = _text(value)
+    text = _text(value, _RESOLUTION.get(unit_name, 0.0))
     if len(text) > _LONGEST:
         text = text[:_LONGEST] + "…"
     space = "" if unit_name in ("", "°") else "\N{NARROW NO-BREAK SPACE}"
     return f"{text}{space}{unit_name}"
 
 
-def number(value: float) -> str:
-    """Four digits are more than a report's numbers deserve; powers of ten only where they save zeros."""
+def number(value: float, resolution: float = 0.0) -> str:
+    """Four digits are more than a report's numbers deserve; powers of ten only where they save zeros.
+
+    What is a millionth of ``resolution`` or less is what rounding left of 0.
+    """
+    if abs(value) <= 1e-6 * resolution:
+        value = 0.0
     if not math.isfinite(value):
         return "∞" if value > 0 else "−∞" if value < 0 else "not a number"
     text = f"{value:.4g}"
@@ -57,7 +63,7 @@ def _superscript(exponent: int) -> str:
     return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def _text(value: object) -> str:
+def _text(value: object, resolution: float) -> str:
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -65,7 +71,7 @@ def _text(value: object) -> str:
     if isinstance(value, int):
         return f"{value}" if abs(value) < 100_000 else f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
     if isinstance(value, float):
-        return number(value)
+        return number(value, resolution)
     if isinstance(value, list | tuple):
-        return ", ".join(_text(part) for part in value) if len(value) <= 12 else f"{len(value)} values"
+        return ", ".join(_text(part, resolution) for part in value) if len(value) <= 12 else f"{len(value)} values"
     return str(value)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 import json
 
+from phyradgs_cl.text import plain_text
+
 
 class Markup(str):
     """Text that is HTML already; every other text is escaped where it is put into an element."""
@@ -57,4 +59,4 @@ def _escaped(child: object) -> str:
 
 def _plain(value: object) -> str:
     """Numbers of drawings need no more than hundredths."""
-    return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+    return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else plain_text(str(value))

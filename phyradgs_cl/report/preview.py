@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.io import check_writable, partial_path, written_beside
 from phyradgs_cl.reconstructors import Progress, ProgressReport
 from phyradgs_cl.report.png import bytes_of, png_bytes, upright
 
@@ -46,7 +47,7 @@ def check_preview(path: Path, *others: Path) -> None:
     """Raises InputError or OutputError now if the picture could not be written, or would replace one of ``others``."""
     if path.suffix.lower() != ".png":
         raise InputError("--preview", str(path), "a file name that ends in .png")
-    if any(path.resolve() == other.resolve() for other in others):
+    if {one.resolve() for one in (path, partial_path(path))} & {other.resolve() for other in others}:
         raise InputError("--preview", f"{path}, which the run needs", "another file to write")
     check_writable(path)
 
@@ -54,11 +55,12 @@ def check_preview(path: Path, *others: Path) -> None:
 class Preview:
     """A report of a running method that keeps a picture of the present volume, at most one every ``every_s`` seconds.
 
-    A picture that cannot be written ends no run: it is a warning, once.
+    It lies at ``io.partial_path`` of ``path`` until the run has come to its end. A picture that cannot be written ends no
+    run: it is a warning, once.
     """
 
     def __init__(self, path: Path, report: ProgressReport, every_s: float = 5.0) -> None:
-        self.path, self.report, self.every_s = path, report, every_s
+        self.path, self.partial, self.report, self.every_s = path, partial_path(path), report, every_s
         self._last_s = -math.inf
         self._failed = False
 
@@ -66,13 +68,22 @@ class Preview:
         self.report(progress)
         if progress.volume is None or time.monotonic() - self._last_s < self.every_s:
             return
+        self._write(*progress.volume(), self.partial)
+        self._last_s = time.monotonic()
+
+    def finish(self, volume: NDArray[np.floating], grid: Grid) -> None:
+        """The picture of the result, under its own name."""
+        self._write(volume, grid, self.path)
+        with suppress(OSError):
+            self.partial.unlink()
+
+    def _write(self, volume: NDArray[np.floating], grid: Grid, path: Path) -> None:
         try:
-            write_preview(*progress.volume(), self.path)
+            write_preview(volume, grid, path)
         except PhyradgsError as error:
             if not self._failed:
                 log.warning("no preview: %s", error)
             self._failed = True
-        self._last_s = time.monotonic()
 
 
 def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, input_options
@@ -26,8 +26,8 @@ log = logging.getLogger(__name__)
 class Run:
     """A reconstruction with what is known about it.
 
-    scan, scan_path, scan_facts: where the scan was found. reference (nz, ny, nx) 1/mm: the truth on the volume's grid.
-    metrics: numbers by name. notes: what a reader should know about the page itself, a sentence each.
+    scan, scan_path, scan_facts: where the scan was found; it has the volume's grid. reference (nz, ny, nx) 1/mm: the truth
+    on that. metrics: numbers by name. notes: what a reader should know about the page itself, a sentence each.
     """
 
     path: Path
@@ -65,13 +65,8 @@ class Run:
     @property
     def record(self) -> list[dict[str, float]]:
         """The convergence record: finite numbers only."""
-        lines = self.stored.provenance.get("record")
-        lines = lines if isinstance(lines, list) else []
-        return [
-            {k: float(v) for k, v in line.items() if _is_number(v)}
-            for line in lines
-            if isinstance(line, dict)
-        ]
+        lines: Any = self.stored.provenance.get("record") or []
+        return [{k: float(v) for k, v in line.items() if _is_number(v)} for line in lines]
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
@@ -97,14 +92,17 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
         return Run(path, stored, metrics=stored.metrics or {}, notes=tuple(notes))
     if scan_path is not None and (kind := file_kind(scan_path)) != "scan":
         raise InputError(f"--scan {scan_path}", f"a {kind}", "a scan")
-    facts = scan_summary(found)
     known = stored.provenance.get("scan_sha256")
+    facts = scan_summary(found, str(known) if scan_path is None else None)
     if known is not None and facts["sha256"] != known:
         notes.append(
             "The scan shown here is not the file that this volume was reconstructed from: its hash differs."
         )
-    scan = read_scan(found, counts_to_attenuation)
-    reference = _reference_of(scan, stored, notes)
+    whole = read_scan(found, counts_to_attenuation)
+    scan = whole.on_grid(stored.grid)
+    if whole.reference is not None and scan.reference is None:
+        notes.append("The scan's reference is on another grid than the volume and is not shown.")
+    reference = scan.reference if scan.reference is not None and float(scan.reference.max()) > 0 else None
     metrics = dict(stored.metrics or (compare(stored.volume, reference) if reference is not None else {}))
     return Run(path, stored, scan, found, facts, reference, metrics, tuple(notes))
 
@@ -112,30 +110,16 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
     """The file that the provenance names, from here or from beside the volume, if it has the hash that is kept."""
     named = provenance.get("scan")
-    if not isinstance(named, str) or not named or "\0" in named:
+    if not isinstance(named, str) or not named:
         notes.append("The volume file names no scan.")
         return None
     known = provenance.get("scan_sha256")
     for place in (Path(named), path.parent / named, path.parent / Path(named).name):
-        if place.is_file() and sha256_of(place) == known:
-            return place
+        with suppress(InputError):  # whatever else there is: it may be any file of this machine
+            if file_kind(place) == "scan" and sha256_of(place) == known:
+                return place
     notes.append(f"The scan {named} was not found, or has changed since; --scan names it.")
     return None
-
-
-def _reference_of(scan: Scan, stored: StoredVolume, notes: list[str]) -> np.ndarray | None:
-    if scan.reference is None or not float(scan.reference.max()) > 0:
-        return None
-    if not _same_grid(scan.grid, stored.grid):
-        notes.append("The scan's reference is on another grid than the volume and is not shown.")
-        return None
-    return scan.reference
-
-
-def _same_grid(a: Grid, b: Grid) -> bool:
-    near_mm = 1e-5 * max(a.size_mm)
-    close = np.allclose(a.voxel_size_mm, b.voxel_size_mm, rtol=1e-5)
-    return a.shape == b.shape and close and np.allclose(a.offset_mm, b.offset_mm, atol=near_mm)
 
 
 def _is_number(value: Any) -> bool:

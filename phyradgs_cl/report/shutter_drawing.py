@@ -136,6 +136,6 @@ def _angles(axes: Axes, scan: Scan) -> Markup | None:
         return text(axes.at(scan.shutter.middle_s, axes.y[1])[0], TOP - 16, "gantry stands", class_="small")
     times_s = np.unique([0.0, scan.shutter.span_s / 2, scan.shutter.span_s])
     angles = np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))
-    words = [f"{'gantry ' if k == 0 else ''}{number(float(a))}°" for k, a in enumerate(angles)]
+    words = [f"{'gantry ' if k == 0 else ''}{number(float(a), 1e-4)}°" for k, a in enumerate(angles)]
     places = [axes.at(float(t), axes.y[1])[0] for t in times_s]
     return element("g", *(text(x, TOP - 16, w, class_="small") for x, w in zip(places, words, strict=True)))

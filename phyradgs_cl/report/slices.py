@@ -3,27 +3,52 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.report.png import bytes_of, diverging, png_bytes, upright
+from phyradgs_cl.report.png import bytes_of, png_bytes, upright
 from phyradgs_cl.report.preview import grey_range
 
 LONGEST_EDGE = 192  # pixels of a slice in the page
 BUDGET_PIXELS = 16_000_000  # of all slices together: some 20 MB of page at worst, of pure noise
 # Plane, axis of the array that is cut, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
+_ROOM = 0.25  # of the window, on either side of it
 Volume = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Window:
+    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps of a page's slices span.
+
+    All in 1/mm. ``beyond``: whether there are smaller, and larger values than those.
+    """
+
+    low: float
+    high: float
+    least: float
+    most: float
+    beyond: tuple[bool, bool]
+
+    @classmethod
+    def of(cls, low: float, high: float, *volumes: Volume) -> Window:
+        """Room on both sides for streaks and overshoots, as far as there are any."""
+        room = _ROOM * (high - low)
+        lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
+        least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))
+        return cls(low, high, least, most, (lowest < least, highest > most))
 
 
 @dataclass(frozen=True)
 class Plane:
     """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one an index.
 
-    size_mm: (width, height) of a slice.
+    first_mm, step_mm: centre of slice 0 and the way to the next. size_mm: (width, height) of a slice. still: the result's
+    middle slice as it is seen without a script, a PNG.
     """
 
     name: str
@@ -32,46 +57,46 @@ class Plane:
     up: str
     count: int
     indices: list[int]
-    positions_mm: list[float]
+    first_mm: float
+    step_mm: float
     size_mm: tuple[float, float]
     layers: dict[str, list[str]]
+    still: bytes
+
+    def position_mm(self, k: int) -> float:
+        """Where the ``k``-th of the slices in the page is."""
+        return self.first_mm + self.indices[k] * self.step_mm
 
 
-@dataclass(frozen=True)
-class Windows:
-    """What black and white stand for, in 1/mm, and the ends ± of the colours of a difference."""
-
-    low: float
-    high: float
-    difference: float | None
-
-
-def windows_of(volume: Volume, reference: Volume | None) -> Windows:
-    """The truth's range serves both where there is one, so that a wrong gain shows."""
+def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
+    """A window a layer; the truth's range serves both where there is one, so that a wrong gain shows."""
     if reference is None or not float(reference.max()) > 0:
-        return Windows(*grey_range(volume), None)
-    low, high = min(0.0, float(reference.min())), float(reference.max())
-    limit = float(np.percentile(np.abs(volume - reference), 99.9)) or high
-    return Windows(low, high, limit)
+        return {"result": Window.of(*grey_range(volume), volume)}
+    grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
+    size = np.abs(volume - reference)
+    limit = float(np.percentile(size, 99.9)) or grey.high
+    return {"result": grey, "truth": grey, "difference": Window.of(-limit, limit, size, -size)}
 
 
-def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Windows) -> list[Plane]:
-    """The three orientations of a volume (nz, ny, nx), with the truth and the difference where there is a truth."""
+def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window]) -> list[Plane]:
+    """The three orientations of a volume (nz, ny, nx), a layer for each of the windows."""
     layers: dict[str, Volume] = {"result": volume}
-    if reference is not None and windows.difference is not None:
+    if reference is not None and "truth" in windows:
         layers |= {"truth": reference, "difference": volume - reference}
     kept = _kept_slices(volume.shape, len(layers))
     planes = []
     for (name, axis, letter, right, up), count in zip(PLANES, kept, strict=True):
         indices = np.unique(np.linspace(0, volume.shape[axis] - 1, count).round().astype(int)).tolist()
-        centres_mm = grid.axes_mm()[axis]
+        place = grid.first_centre_mm[axis], grid.voxel_size_mm[axis]
         height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
-        pictures = {key: [_picture(key, v, axis, i, windows) for i in indices] for key, v in layers.items()}
-        positions_mm = [float(centres_mm[i]) for i in indices]
-        size_mm = (width_mm, height_mm)
-        planes.append(
-            Plane(name, letter, right, up, volume.shape[axis], indices, positions_mm, size_mm, pictures)
-        )
+        pictures = {
+            key: [_base64(_picture(v, axis, i, windows[key].least, windows[key].most)) for i in indices]
+            for key, v in layers.items()
+        }
+        first = windows["result"]
+        still = _picture(volume, axis, indices[len(indices) // 2], first.low, first.high)
+        size_mm, slices = (width_mm, height_mm), volume.shape[axis]
+        planes.append(Plane(name, letter, right, up, slices, indices, *place, size_mm, pictures, still))
     return planes
 
 
@@ -83,12 +108,12 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
     return [min(n, most) for n in shape]
 
 
-def _picture(layer: str, volume: Volume, axis: int, index: int, windows: Windows) -> str:
-    image = _reduced(np.take(volume, index, axis=axis))
-    if layer == "difference" and windows.difference is not None:
-        png = png_bytes(upright(bytes_of(image, -windows.difference, windows.difference)), diverging())
-    else:
-        png = png_bytes(upright(bytes_of(image, windows.low, windows.high)))
+def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
+    """A slice as a grey PNG, black ``low`` and white ``high``."""
+    return png_bytes(upright(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
+
+
+def _base64(png: bytes) -> str:
     return base64.b64encode(png).decode("ascii")
 
 

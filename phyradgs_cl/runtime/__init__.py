@@ -2,6 +2,7 @@
 
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.device import DEVICE_VARIABLE, DeviceInfo, choose_device, list_devices
+from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import (
     MEMORY_VARIABLE,
     DeviceArray,
@@ -17,6 +18,7 @@ __all__ = [
     "MEMORY_VARIABLE",
     "DeviceArray",
     "DeviceInfo",
+    "Kernel",
     "KernelUse",
     "MemoryShortage",
     "Rates",

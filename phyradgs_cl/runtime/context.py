@@ -9,13 +9,14 @@ import weakref
 from collections.abc import Sequence
 
 import numpy as np
-import pyopencl as cl
 
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
+from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, memory_limit
+from phyradgs_cl.runtime.opencl import cl
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 from phyradgs_cl.runtime.source import kernel_source
 
@@ -25,7 +26,7 @@ LANE_CHOICES = (1, 4, 8, 16)
 
 
 class Runtime:
-    """Owns everything OpenCL. Declare (``kernel``), allocate (``empty``, ``upload``), call (``launch``).
+    """Owns everything OpenCL. Declare (``kernel``), allocate (``empty``, ``upload``), call (``launch``, which builds).
 
     ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
     the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
@@ -66,19 +67,23 @@ class Runtime:
         self.profile = profile
         self._profile = Profile()
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
-        self._kernels: dict[tuple[str, str, tuple[str, ...]], cl.Kernel] = {}
+        self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
     # --- programs -----------------------------------------------------------------------------------
 
-    def kernel(self, program: str, name: str, **defines: int | float | bool) -> cl.Kernel:
-        """The kernel ``name`` of ``cl/<program>.cl``; programs are built once and kept, kernels too."""
-        options = self._options(defines)
-        key = (program, name, options)
-        if key not in self._kernels:
-            if (program, options) not in self._programs:
-                self._programs[program, options] = self._build(program, options)
-            self._kernels[key] = cl.Kernel(self._programs[program, options], name)
-        return self._kernels[key]
+    def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
+        """Declares the kernel ``name`` of ``cl/<program>.cl``; its first launch builds it, once for all its declarations."""
+        key = (program, name, self._options(defines))
+        return self._kernels.setdefault(key, Kernel(*key))
+
+    def compile(self, kernel: Kernel) -> cl.Kernel:
+        """What OpenCL launches; a program is built once for all its kernels."""
+        if kernel.built is None:
+            key = (kernel.program, kernel.options)
+            if key not in self._programs:
+                self._programs[key] = self._build(*key)
+            kernel.built = cl.Kernel(self._programs[key], kernel.function_name)
+        return kernel.built
 
     def _options(self, defines: dict[str, int | float | bool]) -> tuple[str, ...]:
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
@@ -180,7 +185,7 @@ class Runtime:
     # --- launches -----------------------------------------------------------------------------------
 
     @naming_failures()
-    def launch(self, kernel: cl.Kernel, items: int | tuple[int, ...], *args: object, group: int = 1) -> None:
+    def launch(self, kernel: Kernel, items: int | tuple[int, ...], *args: object, group: int = 1) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
@@ -188,8 +193,9 @@ class Runtime:
         rounded = (-(-int(shape[0]) // group) * group, *(int(n) for n in shape[1:]))
         local = (group, *([1] * (len(rounded) - 1)))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
-        kernel.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
-        event = cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, local)
+        built = self.compile(kernel)
+        built.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
+        event = cl.enqueue_nd_range_kernel(self.queue, built, rounded, local)
         self._record(kernel.function_name, event, sum(a.nbytes for a in arrays) if self.profile else 0)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
@@ -217,7 +223,7 @@ class Runtime:
 
     def best_rates(self) -> Rates:
         """What the device copies and computes at best, measured now (a second); needs ``profile=True``."""
-        kernel = self.kernel("rates", "multiply_add")
+        kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 
 

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 from phyradgs_cl.errors import DeviceError, NoSuchDeviceError
 from phyradgs_cl.runtime import pocl
-
-pocl.prepare_environment()
-
-import pyopencl as cl  # noqa: E402  (PoCL reads its cache folder from the environment when it loads)
+from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")

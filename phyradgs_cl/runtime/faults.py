@@ -10,10 +10,9 @@ from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
-import pyopencl as cl
-
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime.memory import MemoryLedger
+from phyradgs_cl.runtime.opencl import cl
 
 P = ParamSpec("P")
 R = TypeVar("R")

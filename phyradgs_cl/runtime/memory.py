@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-import pyopencl as cl
 
 from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.runtime.device import DeviceInfo
+from phyradgs_cl.runtime.opencl import cl
 
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
 _SMALLER = 0.25

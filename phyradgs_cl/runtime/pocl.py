@@ -22,6 +22,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.parallel import Launch, launched
 from phyradgs_cl.runtime.host_cpu import cpu_facts
 
@@ -36,20 +38,28 @@ _USER_SPACE = 1 << 47
 CACHE_VARIABLE = "POCL_CACHE_DIR"
 AVX512_TARGET = "skylake-avx512"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
+_MOST_THREADS = 1024
+_NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
 _unwritable: Path | None = None
 _kept_alive: list[ctypes.Array] = []
 
 
 def prepare_environment() -> None:
-    """Gives PoCL a kernel cache of its own for this processor, unless the user has chosen one.
+    """Gives PoCL a kernel cache of its own for this processor, unless the user has chosen one. Before pyopencl loads.
 
     PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a cache that
-    can be written it has no device at all: then there is one in the temporary folder.
+    can be written it has no device at all: then there is one in the temporary folder. pyopencl's own goes then.
+
+    Raises:
+        InputError: a number of threads that PoCL would crash on, or take for none without a word.
     """
     global _unwritable
     if platform.system() != "Linux":
         return
     _share_cores(launched())
+    _check_threads(os.environ.get(THREADS_VARIABLE))
+    if not _can_write(_caches() / "pyopencl"):
+        os.environ.setdefault(_NO_CACHE_VARIABLE, "1")
     wish = os.environ.get(CACHE_VARIABLE)
     folder = Path(wish) if wish else _own_cache()
     if not _can_write(folder):
@@ -67,6 +77,12 @@ def _share_cores(launch: Launch) -> None:
     is_bound = len(os.sched_getaffinity(0)) < cores
     if launch.local_size > 1 and not is_bound:
         os.environ.setdefault(THREADS_VARIABLE, str(max(1, cores // launch.local_size)))
+
+
+def _check_threads(wish: str | None) -> None:
+    if wish and not (wish.isdecimal() and 1 <= int(wish[:9]) <= _MOST_THREADS):
+        expected = f"a whole number from 1 to {_MOST_THREADS}"
+        raise InputError(THREADS_VARIABLE, checks.shown(wish), expected, f"unset {THREADS_VARIABLE}")
 
 
 def unwritable_cache() -> Path | None:
@@ -88,11 +104,14 @@ def tell_of_cache() -> None:
 
 
 def _own_cache() -> Path:
+    return _caches() / "phyradgs-cl" / f"pocl-{equivalent_target() or platform.machine()}"
+
+
+def _caches() -> Path:
     try:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:  # a user without a home
-        home = Path("/nonexistent")
-    return home / "phyradgs-cl" / f"pocl-{equivalent_target() or platform.machine()}"
+        return Path("/nonexistent")
 
 
 def _can_write(folder: Path) -> bool:

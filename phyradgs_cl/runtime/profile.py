@@ -10,7 +10,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
+
+from phyradgs_cl.runtime.opencl import cl
 
 _FOLD_AT = 20_000  # events that are kept at most; folding waits for the queue
 _COPY_BYTES = 1 << 26

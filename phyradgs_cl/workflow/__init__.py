@@ -1,29 +1,18 @@
-"""From file to file: what the commands do, without a word to the user."""
+"""From file to file: what the commands do, without a word to the user. Its parts are imported when they are used."""
 
-from phyradgs_cl.workflow.evaluate import run_evaluation
-from phyradgs_cl.workflow.files import load_reference, load_scan, summary
-from phyradgs_cl.workflow.reconstruct import ReconstructionJob, profile_report, run_reconstruction
-from phyradgs_cl.workflow.simulate import (
-    SimulationJob,
-    load_scanner_for,
-    make_scan_protocol,
-    refuse_jitter,
-    refuse_noise_options,
-    run_simulation,
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "evaluate": ["run_evaluation"],
+        "files": ["load_reference", "load_scan", "summary"],
+        "reconstruct": ["ReconstructionJob", "profile_report", "run_reconstruction"],
+        "simulate": [
+            "SimulationJob",
+            "refuse_jitter",
+            "refuse_noise_options",
+            "run_simulation",
+        ],
+    },
 )
-
-__all__ = [
-    "ReconstructionJob",
-    "SimulationJob",
-    "load_reference",
-    "load_scan",
-    "load_scanner_for",
-    "make_scan_protocol",
-    "profile_report",
-    "refuse_jitter",
-    "refuse_noise_options",
-    "run_evaluation",
-    "run_reconstruction",
-    "run_simulation",
-    "summary",
-]

@@ -2,54 +2,64 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import (
-    check_writable,
-    read_volume,
-    written_beside,
-)
-from phyradgs_cl.metrics import compare, slices_png
+from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.io.volume_file import interruption
+from phyradgs_cl.metrics import compare, resampled, slices_png
 from phyradgs_cl.reconstructors.interrupt import (
     finish_despite_interrupt,
 )
-from phyradgs_cl.workflow.files import expecting, load_reference, refuse_overwriting
+from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
+
+log = logging.getLogger(__name__)
 
 
 @np.errstate(all="ignore")
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
-    """Compares a volume with a scan's reference or another volume and writes the picture of slices."""
+    """Compares a volume with a scan's reference or another volume and writes the picture of slices.
+
+    On another grid it is resampled onto the reference's; values without a grid are compared voxel by voxel.
+    """
     refuse_overwriting("--picture", picture, volume_path, reference_path)
     if picture.suffix.lower() != ".png":
         raise InputError("--picture", str(picture), "a file name that ends in .png")
     check_writable(picture)
-    with expecting(volume_path, "volume"):
-        stored = read_volume(volume_path)
-    reference, grid = load_reference(reference_path)
-    if grid is not None and not _same_grid(grid, stored.grid):
-        raise InputError(str(reference_path), f"the grid {grid}", f"that of {volume_path}: {stored.grid}")
-    if reference.shape != stored.volume.shape:
-        raise InputError(
-            str(reference_path), f"shape {reference.shape}", f"shape {stored.volume.shape} of {volume_path}"
-        )
-    metrics = compare(stored.volume, reference)
-    title = f"{stored.provenance.get('method', 'volume')}: {volume_path.name}"
+    volume, grid, provenance = load_result(volume_path)
+    reference, wanted = load_reference(reference_path)
+    told: dict[str, object] = {}
+    if grid is not None and wanted is not None and not grid.is_close(wanted):
+        volume, share = resampled(volume, grid, wanted)
+        if share == 0:
+            found = f"{_place(grid)}, which has no voxel of the reference, {_place(wanted)}"
+            raise InputError(str(volume_path), found, "volumes in one place")
+        where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
+        rest = "" if share == 1 else f"; {100 * share:.3g} % of those lie in the volume, the rest counts as 0"
+        log.warning("%s: resampled (linear) %s%s", volume_path, where, rest)
+        told = {"resampled": where, "share_of_reference_covered": share}
+    if reference.shape != volume.shape:
+        raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
+    metrics = compare(volume, reference)
+    title = f"{provenance.get('method', 'volume')}: {volume_path.name}"
     with finish_despite_interrupt():
-        _write_picture(picture, stored.volume, reference, title)
-    known = {
-        key: stored.provenance[key] for key in ("method", "seconds", "gaussians") if key in stored.provenance
-    }
-    return {
-        **metrics,
-        **known,
-        "volume": str(volume_path),
-        "reference": str(reference_path),
-        "picture": str(picture),
-    }
+        _write_picture(picture, volume, reference, title)
+    known = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
+    files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
+    return {**metrics, **known, **interruption(provenance), **told, **files}
+
+
+def _place(grid: Grid) -> str:
+    """A grid in a few words, x y z as everywhere where people read."""
+    counts, sizes, offsets = (v[::-1] for v in (grid.shape, grid.voxel_size_mm, grid.offset_mm))
+    digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
+    words = f"{'×'.join(map(str, counts))} voxels of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
+    return f"{words} about ({', '.join(f'{round(o, digits) + 0.0:g}' for o in offsets)}) mm"
 
 
 def _write_picture(picture: Path, volume: np.ndarray, reference: np.ndarray, title: str) -> None:
@@ -59,8 +69,3 @@ def _write_picture(picture: Path, volume: np.ndarray, reference: np.ndarray, tit
             slices_png(temporary, volume, reference, title)
         except OutputError as error:  # names the temporary file; what the disk says is behind it
             raise error.__cause__ or error from None
-
-
-def _same_grid(a: Grid, b: Grid) -> bool:
-    close = np.allclose(a.voxel_size_mm, b.voxel_size_mm, rtol=1e-5)
-    return a.shape == b.shape and close and np.allclose(a.offset_mm, b.offset_mm, atol=1e-5 * max(a.size_mm))

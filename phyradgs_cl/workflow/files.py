@@ -12,14 +12,15 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers import foreign_volume, load_volume, recognise
 from phyradgs_cl.io import (
     file_kind,
-    load_volume,
     read_scan,
     read_volume,
     scan_summary,
     volume_summary,
 )
+from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.held_warnings import held_warnings
 
 _KINDS = {
@@ -37,18 +38,33 @@ def load_scan(path: str | Path) -> Scan:
 
 @contextmanager
 def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
-    """An InputError of the body about a file of another kind than ``kinds`` says just that."""
+    """An InputError of the body about a file of another kind than ``kinds`` says so; about a foreign scan, what reads it."""
     try:
         yield
     except InputError as error:
         found = None
         with suppress(InputError):
             found = file_kind(path)
-        if found is None or found in kinds:
-            raise
-        expected = " or ".join(_KINDS[kind] for kind in kinds)
-        remedy = "see 'phyradgs info' for what a file holds"
-        raise InputError(str(path), _KINDS[found], expected, remedy) from error
+        if found is not None and found not in kinds:
+            expected = " or ".join(_KINDS[kind] for kind in kinds)
+            remedy = "see 'phyradgs info' for what a file holds"
+            raise InputError(str(path), _KINDS[found], expected, remedy) from error
+        if "scan" in kinds and _is_foreign_scan(Path(path)):
+            remedy = f"a scan of another program is read by 'phyradgs import {path} -o scan.h5'"
+            raise InputError(error.culprit, error.found, error.expected, remedy) from error
+        raise
+
+
+def _is_foreign_scan(path: Path) -> bool:
+    """Whether ``import`` knows the format; an NXtomo file is ours if it says what its frames are."""
+    try:
+        if recognise(path) != "nxtomo":
+            return True
+        with open_hdf5(path) as source:
+            data = [source.find(f"{entry}/instrument/detector/data") for entry in source.root_groups()]
+            return any(frames is not None and "quantity" not in frames.attrs for frames in data)
+    except (InputError, OSError):
+        return False
 
 
 def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
@@ -58,41 +74,49 @@ def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
             raise InputError(option, f"the input file {path} itself", "another file to write")
 
 
+def load_result(path: Path) -> tuple[np.ndarray, Grid | None, dict[str, object]]:
+    """A volume file of any format: values (z, y, x), its grid if it has one, and our own files' provenance."""
+    with expecting(path, "volume", "plain-volume"):
+        if foreign_volume(path) is None and file_kind(path) == "volume":
+            stored = read_volume(path)
+            return stored.volume, stored.grid, stored.provenance
+        return *load_volume(path), {}
+
+
 def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
-    """The reference in a scan, a volume file, or a bare /volume dataset (which has no grid)."""
-    kind = file_kind(path)
-    if kind == "scan":
+    """The reference in a scan, or a volume file of any format; bare values have no grid."""
+    if foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
             raise InputError(
                 f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth"
             )
         return scan.reference, scan.grid
-    if kind == "volume":
-        stored = read_volume(path)
-        return stored.volume, stored.grid
-    from_file = _bare_volume(path)
-    return from_file, None
+    volume, grid, _ = load_result(path)
+    return volume, grid
 
 
 def summary(path: Path) -> dict[str, object]:
     """Facts about a scan or volume file for people."""
-    kind = file_kind(path)
-    if kind == "scan":
-        return {"kind": "scan", **scan_summary(path)}
+    if (form := foreign_volume(path)) is not None:
+        return {"kind": f"volume ({form})", **_voxel_facts(path)}
+    with expecting(path, "scan", "volume", "plain-volume"):
+        kind = file_kind(path)
+        if kind == "scan":
+            return {"kind": "scan", **scan_summary(path)}
     if kind == "volume":
         facts = volume_summary(path)
         provenance = dict(facts.pop("provenance", {}) or {})
         provenance.pop("record", None)
         options = provenance.pop("options", None)
         return {"kind": "volume", **facts, **_asked_for(options), **provenance}
-    volume = _bare_volume(path)
-    return {
-        "kind": "bare volume",
-        "shape": volume.shape,
-        "minimum": float(volume.min()),
-        "maximum": float(volume.max()),
-    }
+    return {"kind": "bare volume", **_voxel_facts(path)}
+
+
+def _voxel_facts(path: Path) -> dict[str, object]:
+    volume, grid = load_volume(path)
+    where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
+    return {"shape": volume.shape, **where, "minimum": float(volume.min()), "maximum": float(volume.max())}
 
 
 def _asked_for(options: object) -> dict[str, object]:
@@ -110,7 +134,3 @@ def _asked_for(options: object) -> dict[str, object]:
     if "iterations" in options:
         told["iterations_asked"] = options["iterations"]
     return told
-
-
-def _bare_volume(path: Path) -> np.ndarray:
-    return load_volume(path).volume

@@ -9,21 +9,24 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__, checks
+from phyradgs_cl import __version__, checks, signals
 from phyradgs_cl.acquisition import MicroViews, Scan
+from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
     check_writable,
     checkpoint_path,
+    former_checkpoint_path,
+    hashing,
     only_run,
+    partial_path,
     read_checkpoint,
-    sha256_of,
     write_checkpoint,
     write_volume,
 )
@@ -40,7 +43,6 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.interrupt import (
-    InterruptedAfterwards,
     finish_despite_interrupt,
     keep_finished_work,
 )
@@ -53,7 +55,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ReconstructionJob:
-    """Which scan to reconstruct by which method into which file."""
+    """Which scan to reconstruct by which method, a name of METHODS, into which file."""
 
     scan: Path
     output: Path
@@ -122,15 +124,17 @@ def run_reconstruction(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
 
-    An interrupted run writes the volume as far as it got, and a checkpoint beside it that ``resume`` continues; a run
-    that is killed leaves its last checkpoint. Raises OutputError while another run is at work on the same output.
+    An interrupted run leaves what is at ``output`` alone: it writes the volume as far as it got to ``io.partial_path``, and
+    a checkpoint that ``resume`` continues; both go when a run has come to its end. A run that is killed leaves its last
+    checkpoint. Raises OutputError while another run is at work on the same output.
     Of ``ranks``, which the runtime must have too, rank 0 alone writes; the others have no metrics.
     """
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)
     if leads:
         check_writable(job.output)
-    refuse_overwriting("-o", job.output, job.scan, *([job.config] if job.config else []))
+    for path in (job.output, partial_path(job.output)):
+        refuse_overwriting("-o", path, job.scan, *([job.config] if job.config else []))
     with only_run(job.output) if leads else nullcontext():
         return _reconstructed(job, options, make_runtime, report)
 
@@ -138,18 +142,18 @@ def run_reconstruction(
 def _reconstructed(
     job: ReconstructionJob, options: Any, make_runtime: Callable[[], Runtime], report: ProgressReport
 ) -> tuple[Reconstruction, dict[str, float]]:
-    scan = load_scan(job.scan)
-    scan.check_timing()
+    with hashing(job.scan) as scan_hash_of:
+        scan = load_scan(job.scan)
+        scan_hash = scan_hash_of()
     _warn_of_doubts(job, scan, options)
     rt = make_runtime()
-    scan_hash = sha256_of(job.scan)
     fingerprint = _fingerprint(scan_hash, job, options)
     extra: dict[str, Any] = {"before": job.before}
     leads = rt.ranks.rank == 0
     if job.resume:
         extra["resume"] = rt.ranks.tell(_resumed(job, fingerprint) if leads else None)
     elif leads:
-        _set_aside(checkpoint_path(job.output))
+        _set_aside(job.output)
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
     result: Reconstruction | None = None
     metrics: dict[str, float] = {}
@@ -159,14 +163,21 @@ def _reconstructed(
             if not leads:
                 return result, metrics
             with finish_despite_interrupt():
-                if scan.reference is not None:
-                    metrics = compare(result.volume, scan.reference)
+                metrics = _metrics(scan, result)
                 _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
                 _keep_checkpoint(job, result, fingerprint)
-    except InterruptedAfterwards:
+    except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
     return result, metrics  # type: ignore[return-value]
+
+
+def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
+    """Against the scan's reference, where the volume is on its grid or a part of that."""
+    reference = scan.on_grid(result.grid).reference
+    if scan.reference is not None and reference is None:
+        log.warning("no PSNR: the scan's reference is on another grid")
+    return {} if reference is None else compare(result.volume, reference)
 
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
@@ -182,6 +193,10 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
         found = "%d strips are more than the %d lines of %s: a strip a line is the most there is"
         log.warning(found, motion.strips, scan.lines, job.scan)
+    grid = scan.with_grid(job.before).grid
+    if grid != scan.grid and hasattr(options, "iterations") and cuts(grid, scan.grid, scan.geometry):
+        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; fdk does not"
+        log.warning(found, job.scan, job.method)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:
         found = (
@@ -209,12 +224,8 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
 def _write_result(
     job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
 ) -> None:
-    cloud = result.gaussians
-    arrays = None
-    if cloud is not None:
-        names = ("mean", "scale", "quaternion", "density")
-        arrays = {name: np.asarray(getattr(cloud, name), np.float32) for name in names}
-    write_volume(job.output, result.volume, result.grid, provenance, arrays, metrics or None)
+    path = job.output if result.state is None else partial_path(job.output)
+    write_volume(path, result.volume, result.grid, provenance, result.gaussians, metrics or None)
 
 
 def _provenance(
@@ -227,7 +238,7 @@ def _provenance(
         "device": rt.device.name,
         "device_version": rt.device.version,
         "seed": job.seed,
-        "input": asdict(job.before),
+        "input": job.before.facts(),
         "scan": str(job.scan),
         "scan_sha256": scan_hash,
         "record": result.record,
@@ -236,7 +247,7 @@ def _provenance(
 
 def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
     """What a run that goes on must have in common with the one that it continues, as JSON."""
-    run = {"method": job.method, "seed": job.seed, "input": asdict(job.before), **option_facts(options)}
+    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **option_facts(options)}
     return json.dumps({"scan": scan_hash[:16], **run}, sort_keys=True, default=repr)
 
 
@@ -249,10 +260,11 @@ def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
     return read_checkpoint(checkpoint_path(job.output), fingerprint)
 
 
-def _set_aside(checkpoint: Path) -> None:
+def _set_aside(output: Path) -> None:
     """Whoever repeats a command without --resume may have meant it: the hours in a checkpoint are not thrown away."""
+    checkpoint = checkpoint_path(output)
     if checkpoint.is_file():
-        kept = checkpoint.with_name(f"{checkpoint.name}.bak")
+        kept = former_checkpoint_path(output)
         os.replace(checkpoint, kept)
         remedy = "to go on from it, stop, rename it back and add --resume"
         log.warning("%s is of an earlier run and is kept as %s: %s", checkpoint, kept.name, remedy)
@@ -261,7 +273,8 @@ def _set_aside(checkpoint: Path) -> None:
 def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
     path = checkpoint_path(job.output)
     if result.state is None:
-        with suppress(OSError):  # the volume is there, whatever lies in the checkpoint's place
-            path.unlink()
+        for outdated in (path, partial_path(job.output)):
+            with suppress(OSError):  # the volume is there, whatever lies in their place
+                outdated.unlink()
     else:
         write_checkpoint(path, dict(result.state), fingerprint)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl import api
+from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.errors import InputError
 
 
@@ -45,11 +46,30 @@ def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
     assert nested.facts["options"]["control"]["every"] == 7
 
 
+def test_a_grid_is_given_or_described(rt, scan) -> None:
+    grid = api.Grid((4, 6, 8), (0.1, 0.1, 0.1), (0.0, 0.1, 0.2))
+    given = api.reconstruct(scan, "FDK", grid=grid, device=rt)
+    assert given.grid == grid and given.volume.shape == grid.shape
+    described = api.reconstruct(scan, "fdk", size=[4, 6, 8], voxel_mm=0.1, device=rt)
+    assert described.grid == api.Grid(grid.shape, grid.voxel_size_mm)
+    with pytest.raises(InputError, match="--roi-mm"):
+        api.reconstruct(scan, "fdk", roi_mm=(0, 1), device=rt)
+
+
 def test_a_simulation_takes_the_options_of_the_command(rt, scan) -> None:
     assert scan.projections.shape == (6, 20, 20) and scan.grid.shape == (12, 12, 12)
     noisy = api.simulate("jaw", size=12, detector=20, noise="beer", dose=100.0, seed=3, views=2, device=rt)
     still = api.simulate("jaw", size=12, detector=20, protocol="static", views=3, device=rt)
     assert len(noisy.projections) == 2 and noisy.is_fly and not still.is_fly
+
+
+def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:
+    options = ["--phantom", "jaw", "--size", "8", "--detector", "10", "--views", "2", "--noise", "beer", "--seed", "4"]
+    assert load_cli().run(["simulate", *options, "--readout", "columns", "-o", str(tmp_path / "scan.h5")]) == 0
+    ours = api.simulate("jaw", size=8, detector=10, views=2, noise="beer", seed=4, readout_axis="columns", device=rt)
+    theirs = api.load_scan(tmp_path / "scan.h5")
+    assert np.array_equal(ours.projections, theirs.projections) and ours.shutter == theirs.shutter
+    assert ours.provenance == theirs.provenance and ours.provenance["simulated"] == "phantom jaw"
 
 
 def test_a_volume_file_can_be_scanned(rt, scan, tmp_path) -> None:

@@ -26,15 +26,15 @@ from phyradgs_cl.bench import (
 from phyradgs_cl.bench import rows as bench_rows
 from phyradgs_cl.bench.figures import read_slices, slices_path, write_slices
 from phyradgs_cl.bench.published import TABLE1, TABLE2
-from phyradgs_cl.bench.results import _COUNTS, _WORDS, KEY, Present, append_line, read_lines
+from phyradgs_cl.bench.results import _MEASURED, KEY, Present, append_line, read_lines
 from phyradgs_cl.bench.summary import summarise
 from phyradgs_cl.bench.volumes import find_volumes
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.reconstructors import METHODS
 
 FACTS = {
-    **dict.fromkeys((*KEY, *_COUNTS), 1),
-    **dict.fromkeys(_WORDS, "a"),
+    **dict.fromkeys(KEY, 1),
+    **{name: "a" if kind.fits("a") else 1 for name, kind in _MEASURED.items()},
     "options": {"motion": {"name": "static"}, "iterations": 5},
     "metrics": {},
 }

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, EncoderTable
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, Saturation
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.angles import check_angles
 from phyradgs_cl.check.coverage import check_coverage
@@ -131,6 +131,13 @@ def test_counts_at_the_ceiling_are_seen_on_reading(clean) -> None:
     noise = np.random.default_rng(0).poisson(data * 0.1)
     counts(noise.astype(np.uint16), key, "counts")
     assert check_saturation(clean, counts).verdict == OK
+
+
+def test_what_an_import_saw_in_the_counts_is_believed(clean) -> None:
+    """The pixels themselves are masked by then, and line integrals show nothing."""
+    finding = check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.25)))
+    assert finding.verdict == SUSPICIOUS and "25 % of the pixels lie together at 40000 counts" in finding.text
+    assert check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.0))).verdict == OK
 
 
 @pytest.mark.parametrize("value", [0.0, 0.4, 9.9])

@@ -75,6 +75,10 @@ DAMAGE = {
         "reference/volume: found no voxel above 0",
     ),
     "wrong axis": (lambda p: _replace(p, "entry/phyradgs/readout_axis", "diagonal"), "readout_axis"),
+    "exposure of nothing": (
+        lambda p: _replace(p, f"{DETECTOR}/count_time", 5e-324),
+        "detector/count_time: found 4.94066e-324 s",
+    ),
 }
 
 
@@ -174,6 +178,17 @@ OPTIONS = {
     "strips of fdk": (["reconstruct", "{scan}", "--method", "fdk", "--strips", "4"], "--strips"),
     "exact line times of splats": (["reconstruct", "{scan}", "--motion", "per-row"], "--motion"),
     "seed that is no number": (["reconstruct", "{scan}", "--seed", "1.5"], "--seed"),
+    "grid of three words": (["reconstruct", "{scan}", "--size", "a,b,c"], "--size: found 'a,b,c'"),
+    "grid of nothing": (["reconstruct", "{scan}", "--size", "0"], "--size: found 0"),
+    "voxels of no size": (["reconstruct", "{scan}", "--voxel-mm", "-1"], "--voxel-mm: found -1.0"),
+    "far too many voxels": (["reconstruct", "{scan}", "--voxel-mm", "1e-8"], "--voxel-mm: found a grid of"),
+    "box that ends first": (["reconstruct", "{scan}", "--roi", "1,-1,-1,1,-1,1"], "--roi-mm"),
+    "box beyond the view": (["reconstruct", "{scan}", "--roi", "90,91,-1,1,-1,1"], "the field of view"),
+    "grid said three times": (
+        ["reconstruct", "{scan}", "--size", "4", "--voxel-mm", "1", "--roi", "-1,1,-1,1,-1,1"],
+        "--size: found all three",
+    ),
+    "import of a grid of nothing": (["import", "{scan}", "--size", "0"], "--size: found 0"),
     "scanner that is a configuration": (["simulate", "--scanner", "demo"], "scanner"),
 }
 ABSURD_VALUES = {
@@ -247,6 +262,9 @@ CONFIGS = {
     "key that lacks a letter": ("strip = 3", "did you mean 'strips'?"),
     "digits without end": (f"iterations = {'9' * 5000}", "config"),
     "hexadecimal digits without end": (f"iterations = 0x{'f' * 5000}", "iterations"),
+    "sizes of a grid in words": ("size = '4,4,4'", "size: found '4,4,4'"),
+    "voxels of two sides": ("voxel_mm = [1, 2]", "voxel_mm: found"),
+    "endless box": ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: found"),
     "tables without end": ("a = " + "[" * 20_000, "config"),
 }
 

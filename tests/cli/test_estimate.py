@@ -212,7 +212,7 @@ def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
         == 0
     )
     text = capsys.readouterr().out
-    assert re.search(r"^splat_forward +5 ", text, re.M) and re.search(r"^splat_backward +5 ", text, re.M)
+    assert re.search(r"^splat_forward_rows +5 ", text, re.M) and re.search(r"^splat_backward_rows +5 ", text, re.M)
     assert "Gpairs/s" in text and "Gflop/s" in text
     assert cli.run(["reconstruct", str(scan), "-o", output, "--iterations", "5"]) == 0
     assert "Gpairs/s" not in capsys.readouterr().out

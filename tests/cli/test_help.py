@@ -40,6 +40,20 @@ def test_every_command_has_an_example_and_names_its_arguments_as_the_documentati
             assert getattr(parameter, "help", None), f"{name}: {parameter.name} says nothing"
 
 
+def test_a_short_form_everywhere_and_the_options_of_ranks_at_the_end(capsys, commands) -> None:
+    for words in ([], *([name] for name in commands)):
+        helps = []
+        for option in ("-h", "--help"):
+            assert load_cli().run([*words, option]) == 0
+            helps.append(capsys.readouterr().out)
+        assert helps[0] == helps[1] and "-h, --help" in helps[0]
+    for name, ranks in (("reconstruct", 3), ("estimate", 4)):
+        assert load_cli().run([name, "-h"]) == 0
+        usual, at_the_end = capsys.readouterr().out.split("Under mpiexec (docs: cluster.md):\n")
+        assert sum(line.startswith("  --") for line in at_the_end.splitlines()) == ranks
+        assert "--batch" in at_the_end and "--batch" not in usual and "--help" in usual
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

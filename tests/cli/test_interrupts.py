@@ -1,5 +1,6 @@
 """Ctrl-C at every stage: one line, status 130, and outputs that are whole or as they were."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -9,9 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl import signals
+from phyradgs_cl import signals, simulation
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.reconstructors import interrupt
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import evaluate, reconstruct, simulate
@@ -49,9 +49,9 @@ COMMANDS = {
     "fdk": ["reconstruct", "{scan}", "--method", "fdk"],
 }
 STAGES = [
-    ("simulate", simulate, "load_scanner"),
+    ("simulate", simulation, "load_scanner"),
     ("simulate", simulate, "check_writable"),
-    ("simulate", simulate, "simulate"),
+    ("simulate", simulate, "simulated_scan"),
     ("simulate", Runtime, "kernel"),
     ("reconstruct", reconstruct, "load_scan"),
     ("reconstruct", reconstruct, "sha256_of"),
@@ -193,26 +193,65 @@ AT_A_REPORT = """
 
 @pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 @pytest.mark.parametrize("method", ["sart", "phyradgs"])
-def test_a_loop_is_saved_and_goes_on(cli, scan, tmp_path, name, status, method):
+def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, capsys, name, status, method):
     output, whole = tmp_path / "volume.h5", tmp_path / "whole.h5"
+    output.write_bytes(b"an older result")
     iterations = "8" if method == "sart" else "150"
     command = ["reconstruct", str(scan), "--method", method, "--iterations", iterations, "-o"]
     body = AT_A_REPORT.format(name=name, at=2)
-    done = run_process([*command, str(output)], body)
+    done = run_process([*command, str(output), "--preview", str(tmp_path / "now.png")], body)
     at = 2 if method == "sart" else 50  # splats report every 50 iterations
-    expected = f"phyradgs: interrupted after iteration {at}: repeat the command with --resume to go on\n"
-    assert (done.returncode, done.stderr) == (status, expected)
-    assert output.exists() and (tmp_path / "volume.h5.checkpoint.npz").exists()
-    assert cli.run([*command, str(output), "--resume"]) == 0
+    expected = f"interrupted at iteration {at} of {iterations}"
+    assert done.returncode == status
+    assert done.stderr == f"phyradgs: {expected}: repeat the command with --resume to go on\n"
+    partial = tmp_path / "volume.partial.h5"
+    assert done.stdout.startswith(f"{partial}: {method}") and output.read_bytes() == b"an older result"
+    left = {"volume.h5", "volume.h5.checkpoint.npz", "volume.partial.h5"}
+    assert {path.name for path in tmp_path.iterdir()} - {"now.partial.png"} == left
+    assert cli.run(["evaluate", str(partial), "--reference", str(scan), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["interrupted_at"], facts["iterations_asked"]) == (at, int(iterations))
+    (tmp_path / "volume.partial.png").unlink()
+    assert cli.run([*command, str(output), "--resume", "--preview", str(tmp_path / "now.png")]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"volume.h5", "now.png"}
     assert cli.run([*command, str(whole)]) == 0
     with h5py.File(output) as a, h5py.File(whole) as b:
         name = "entry/reconstruction/volume"
         np.testing.assert_array_equal(a[name][()], b[name][()])
 
 
+def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(scan, tmp_path):
+    body = """
+        import phyradgs_cl.reconstructors.iterative as i
+        from phyradgs_cl.errors import DeviceError
+        def iterate(loop):
+            signal.raise_signal(signal.SIGINT)
+            raise DeviceError("kernel rays.cl", "linker command failed", "a program that builds")
+        i._Loop._iterate = iterate
+    """
+    output = tmp_path / "volume.h5"
+    done = run_process(["reconstruct", str(scan), "--method", "sirt", "-o", str(output)], body)
+    assert (done.returncode, done.stderr) == (130, NOTHING)
+    done = run_process(
+        ["reconstruct", str(scan), "--method", "sirt", "-o", str(output)],
+        body.replace("signal.raise_signal(signal.SIGINT)", "pass"),
+    )
+    assert done.returncode == 5 and "linker command failed" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_after_the_last_line_changes_nothing(scan, name):
+    body = f"""
+        import atexit
+        atexit.register(signal.raise_signal, signal.{name})
+    """
+    done = run_process(["info", str(scan)], body)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("kind")
+
+
 def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(interrupt.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(signals.time, "monotonic", lambda: now[0])
     with pytest.raises(KeyboardInterrupt), stop_on_interrupt() as request:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
@@ -223,6 +262,7 @@ def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
 
 
 def test_a_signal_that_is_ignored_stays_ignored():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with stop_on_interrupt() as request, finish_despite_interrupt():
         signal.raise_signal(signal.SIGINT)
@@ -230,6 +270,8 @@ def test_a_signal_that_is_ignored_stays_ignored():
     signals.take_over()
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     signals.let_go()
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("method", ["sart", "phyradgs"])

@@ -53,7 +53,7 @@ def test_a_run_with_pictures_is_the_same_run(cli, scan, tmp_path, name) -> None:
     for output, more in ((seen, ["--preview", str(picture)]), (plain, [])):
         assert cli.run(["reconstruct", str(scan), "-o", str(output), *RUNS[name], *more]) == 0
     np.testing.assert_array_equal(read_volume(seen).volume, read_volume(plain).volume)
-    assert imread(picture).max() > 0
+    assert imread(picture).max() > 0 and not (tmp_path / "now.partial.png").exists()
 
 
 def test_the_picture_is_of_the_present_volume(tmp_path) -> None:
@@ -64,8 +64,10 @@ def test_the_picture_is_of_the_present_volume(tmp_path) -> None:
         volume = np.zeros(grid.shape, np.float32)
         volume[2, 2, 2] = value
         preview(Progress(1, 9, 0.5, 0, 1.0, volume=lambda v=volume: (v, grid)))
-        pictures.append(imread(tmp_path / "now.png"))
+        pictures.append(imread(tmp_path / "now.partial.png"))
     assert pictures[0].max() == 0 and pictures[1].max() == 255
+    preview.finish(volume, grid)
+    assert [path.name for path in tmp_path.iterdir()] == ["now.png"]
     assert len(told) == 2
 
 

@@ -34,6 +34,18 @@ def test_rate_and_time_left_count_from_the_first_report(capsys, now):
     assert capsys.readouterr().err == "frame 10/100\nframe 30/100  1.0/s  ETA 1:10\n"
 
 
+def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with Ticker("frame") as ticker:
+        ticker.stage("reading scan.h5")
+        assert capsys.readouterr().err == "\r\x1b[Kreading scan.h5"
+        ticker.show(1, 1)
+    assert capsys.readouterr().err == "\r\x1b[Kframe 1/1\n"
+    with Ticker("frame") as ticker:
+        ticker.stage("reading")
+    assert capsys.readouterr().err == "\r\x1b[Kreading\r\x1b[K"  # a result, or an error, has the line
+
+
 def test_a_file_gets_a_line_every_ten_seconds_and_the_last(capsys, now):
     ticker = Ticker("frame")
     for second in range(31):

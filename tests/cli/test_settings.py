@@ -79,6 +79,14 @@ def test_a_wrong_option_of_the_command_line_is_not_the_files(config: Path) -> No
         run_settings(None, {"method": "fdk"}, ["iterations=5"])
 
 
+def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
+    config.write_text("method = 'FISTA-TV'\nsize = [8, 9, 10]\n")
+    found = run_settings(config, {"size": None, "voxel_mm": (0.5, 0.5, 0.5)})
+    assert (found.method, found.before.size, found.before.voxel_mm) == ("fista-tv", (8, 9, 10), (0.5,) * 3)
+    assert run_settings(config, {"size": 7.0, "method": "Sirt"}).before.size == 7
+    assert run_settings(config, {"size": 7.0, "method": "Sirt"}).method == "sirt"
+
+
 def test_a_method_offers_only_what_it_has() -> None:
     with pytest.raises(InputError) as caught:
         method_options("fdk", None, {"length": 1})

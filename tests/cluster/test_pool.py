@@ -124,8 +124,8 @@ def test_workers_without_the_resource_are_waited_for(sweep_folder, start, tmp_pa
 
 
 def test_local_workers_that_are_all_gone_are_started_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As when a worker is killed while it starts: its nanny gives up."""
-    monkeypatch.setattr(pool_module, "_REVIVE_S", 1.0)
+    """As when workers are killed while they start: their nannies give up."""
+    monkeypatch.setattr(pool_module, "_WITHOUT_WORKERS_S", 1.0)
     with Pool(Workers(count=1, device="cpu")) as pool:
         found = pool.results(device_of, {f"run-{n}": n for n in range(3)})
         first = next(found)[1]

@@ -89,8 +89,8 @@ def test_workers_killed_at_random_and_the_sweep_itself_once(sweep_folder, start,
     check_all(sweep_folder, tmp_path)
 
 
-def test_a_schedulers_restart_is_survived(sweep_folder, start, tmp_path) -> None:
-    """A scheduler and workers of their own: the sweep waits for the scheduler and goes on with what is missing."""
+def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> None:
+    """The scheduler goes away: the sweep says so in one line, and its command repeated makes what is missing."""
     rng, log, port = np.random.default_rng(1), tmp_path / "log.txt", free_port()
     address = f"tcp://127.0.0.1:{port}"
 
@@ -115,10 +115,10 @@ def test_a_schedulers_restart_is_survived(sweep_folder, start, tmp_path) -> None
     wait_until(lambda: len(lines_of(sweep_folder)) > 15, 600, said)
     stop(first)
     stop(crew)
-    time.sleep(2)
-    assert sweep.poll() is None, said()
+    wait_until(lambda: sweep.poll() is not None, 60, said)
+    assert sweep.returncode == 2 and "gone" in said() and "repeat the command" in said()
     scheduler(), workers()
-    wait_until(lambda: sweep.poll() is not None, 900, said)
-    assert sweep.returncode == 0, said()
-    assert "is gone: waiting for it" in said() and "is back: going on" in said()
+    again = start(*command(sweep_folder, "--scheduler", address), log=log)
+    wait_until(lambda: again.poll() is not None, 900, said)
+    assert again.returncode == 0, said()
     check_all(sweep_folder, tmp_path)

@@ -13,7 +13,6 @@ from corpus.imports import FORMS
 from phyradgs_cl.importers import ImportOptions, import_scan
 from phyradgs_cl.io import checkpoint_path, load_scanner, load_volume, read_checkpoint, read_volume
 from phyradgs_cl.io.json_lines import read_lines
-from phyradgs_cl.io.npz import read_npz
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.files import load_scan, summary
 from phyradgs_cl.workflow.sweep import read_grid
@@ -64,7 +63,6 @@ READERS: dict[str, Reader] = {
     "configuration": Reader("run.toml", read_config),
     "sweep": Reader("sweep", _sweep, "grid.toml"),
     "checkpoint": Reader("phyradgs.checkpoint.npz", _checkpoint),
-    "slices": Reader("slices.npz", lambda path: read_npz(path, "file of slices", "", most_bytes=1 << 28)),
     "results": Reader("results.jsonl", read_lines),
     "import of r2, JSON": Reader("r2", _import("r2"), "meta_data.json"),
     "import of r2, npy": Reader("r2", _import("r2"), "proj_train/0000.npy"),

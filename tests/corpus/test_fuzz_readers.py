@@ -14,7 +14,6 @@ import shutil
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from corpus.good import write_good
 from corpus.readers import READERS, SLOW, changed_copy
@@ -90,7 +89,6 @@ def good(tmp_path_factory) -> Path:
     (folder / "sweep/grid.toml").write_text(SWEEP)
     lines = [json.dumps({"run": name, "options": {"a": [1, 2.5]}}) for name in ("one", "two", "three")]
     (folder / "results.jsonl").write_text("\n".join(lines) + "\n")
-    np.savez_compressed(folder / "slices.npz", *np.linspace(0, 1, 60, dtype=np.float32).reshape(3, 4, 5))
     return folder
 
 

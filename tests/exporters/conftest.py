@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.io import write_volume
 
 GRID = Grid((5, 6, 7), (2.0, 1.5, 1.25), (10.0, -4.0, 3.0))
@@ -31,5 +31,5 @@ def volume_file(tmp_path) -> Path:
         "density": rng.uniform(0.01, 0.02, 9).astype(np.float32),
     }
     path = tmp_path / "volume.h5"
-    write_volume(path, marked(), GRID, {"method": "phyradgs"}, cloud)
+    write_volume(path, marked(), GRID, {"method": "phyradgs"}, Gaussians(**cloud))
     return path

@@ -35,6 +35,18 @@ def test_hounsfield_units_and_a_name(run, volume_file, tmp_path) -> None:
     assert done.exit_code == 0 and "HU" in done.output and (tmp_path / "hu.nii.gz").exists()
 
 
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.TIF", "a.mha", "a.ply"])
+def test_the_output_s_suffix_says_the_format(run, volume_file, tmp_path, name) -> None:
+    done = run(volume_file, "-o", tmp_path / name)
+    assert done.exit_code == 0 and (tmp_path / name).exists(), done.exception
+
+
+@pytest.mark.parametrize("output", [("-o", "a.stl"), ("-o", "folder"), ()])
+def test_an_unknown_suffix_lists_the_known_ones(run, volume_file, output) -> None:
+    error = run(volume_file, *output).exception
+    assert isinstance(error, InputError) and ".nii, .nii.gz, .mha, .nrrd, .tif, .tiff, .npy, .ply, .npz" in str(error)
+
+
 def test_wrong_input_is_our_error(run, tmp_path) -> None:
     done = run(tmp_path / "none.h5", "--to", "nii")
     assert isinstance(done.exception, InputError)

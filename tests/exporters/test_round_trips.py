@@ -149,7 +149,7 @@ def test_the_range_of_metal_fits_into_dicom(volume_file, stored) -> None:
 
 def test_gaussians_as_npz_and_ply(volume_file, stored) -> None:
     with np.load(export_volume(volume_file, "npz"), allow_pickle=False) as arrays:
-        for name, values in stored.gaussians.items():
+        for name, values in vars(stored.gaussians).items():
             np.testing.assert_array_equal(arrays[name], values)
     head, _, body = export_volume(volume_file, "ply").read_bytes().partition(b"end_header\n")
     lines = head.decode("ascii").splitlines()
@@ -157,10 +157,10 @@ def test_gaussians_as_npz_and_ply(volume_file, stored) -> None:
     names = [line.split()[-1] for line in lines if line.startswith("property float")]
     rows = np.frombuffer(body, "<f4").reshape(9, len(names))
     columns = dict(zip(names, rows.T, strict=True))
-    np.testing.assert_array_equal(columns["z"], stored.gaussians["mean"][:, 2])
-    np.testing.assert_array_equal(columns["scale_1"], stored.gaussians["scale"][:, 1])
-    np.testing.assert_array_equal(columns["rot_0"], stored.gaussians["quaternion"][:, 0])
-    np.testing.assert_array_equal(columns["density"], stored.gaussians["density"])
+    np.testing.assert_array_equal(columns["z"], stored.gaussians.mean[:, 2])
+    np.testing.assert_array_equal(columns["scale_1"], stored.gaussians.scale[:, 1])
+    np.testing.assert_array_equal(columns["rot_0"], stored.gaussians.quaternion[:, 0])
+    np.testing.assert_array_equal(columns["density"], stored.gaussians.density)
 
 
 # --- what goes wrong --------------------------------------------------------------------------------------------

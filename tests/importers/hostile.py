@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -153,6 +154,12 @@ def huge_array_pickle(path: Path) -> None:
     )
 
 
+def colliding_keys(path: Path, before: bytes = b"}(", after: bytes = b"u.") -> None:
+    """80,000 integers whose hash is 0: a dict of them takes minutes."""
+    keys = (b"\x8a\x0c" + (i * sys.hash_info.modulus).to_bytes(12, "little") + b"K\x00" for i in range(80_000))
+    path.write_bytes(b"\x80\x04" + before + b"".join(keys) + after)
+
+
 def encode_bomb(path: Path) -> None:
     """One text of 64 KiB turned into bytes 100,000 times: 6 GB out of a file of some 600 kB."""
     text = b"X" + struct.pack("<I", 1 << 16) + b"a" * (1 << 16)
@@ -247,10 +254,10 @@ NAF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a call by GLOBAL": (filled("", b"cos\nsystem\n(S'touch canary'\ntR."), ("os.system",)),
     "eval": (filled("", b"c__builtin__\neval\n(S'1'\ntR."), ("eval",)),
     "an extension": (filled("", b"\x80\x02\x82\x01."), ("EXT1",)),
-    "a persistent object": (filled("", b"P3\n."), ("PERSID",)),
+    "a persistent object": (filled("", b"P3\n."), ("a persistent object",)),
     "an object by NEWOBJ": (pickled(lambda d, _: d.update(DSD=Path("x"))), ("pathlib",)),
     "numpy.load": (filled("", b"cnumpy\nload\n(S'x'\ntR."), ("numpy.load",)),
-    "an array of objects": (pickled(object_array), ("posix.system",)),
+    "an array of objects": (pickled(object_array), ("'O8'",)),
     "an array of nothing": (pickled(lambda d, _: d.update(image=np.array([None]))), ("damaged pickle",)),
     "a structured array": (pickled(lambda d, _: d.update(image=np.zeros(3, "f4,f4"))), ("damaged pickle",)),
     "an array of text": (pickled(lambda d, _: d.update(image=np.array(["a"]))), ("damaged pickle",)),
@@ -260,6 +267,10 @@ NAF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "tuples of tuples as a value": (tuple_bomb_value, ("DSO", "a tuple of 2")),
     "tuples of tuples as a key": (tuple_bomb_key, ("a key",)),
     "one text as bytes again and again": (encode_bomb, ("more bytes",)),
+    "keys of one hash": (colliding_keys, ("a key that is neither text nor a small integer",)),
+    "keys of one hash in an old dict": (lambda path: colliding_keys(path, b"(", b"d."), ("a key",)),
+    "a set": (filled("", b"\x80\x04\x8f(K\x01\x90."), ("EMPTY_SET",)),
+    "bytes declared huge": (filled("", b"\x80\x05\x96" + struct.pack("<Q", 1 << 60) + b"a."), ("damaged pickle",)),
     "an endless list": (filled("", b"\x80\x04](" + b"K\x01" * 3_500_000 + b"e."), ("opcodes",)),
     "a list that holds itself": (filled("", b"\x80\x04}\x8c\x03DSO]\x94h\x00as."), ("DSO",)),
     "an array never filled": (filled("", b"\x80\x04}\x8c\x03DSOcnumpy.core.multiarray\n_reconstruct\n)Rs."), ("DSO",)),
@@ -269,6 +280,7 @@ NAF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "too few angles": (pickled(lambda d, _: d["train"].update(angles=np.zeros(2))), ("train.angles", "2 values")),
     "an angle that is NaN": (pickled(lambda d, _: d["train"].update(angles=np.full(4, np.nan))), ("train.angles",)),
     "a truth of another size": (pickled(lambda d, _: d.update(image=np.zeros((2, 2, 2)))), ("image",)),
+    "a truth beyond float32": (pickled(lambda d, _: d.update(image=np.full((8, 9, 7), 1e300))), ("image", "float32")),
 }  # fmt: skip
 
 ENTITIES = """<!DOCTYPE RTKGEOMETRY [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>"""
@@ -364,6 +376,44 @@ NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
 }  # fmt: skip
 
 TOML = "scan.toml"
+
+
+def angles_in(text: str | None) -> Damage:
+    """A file of angles in place of the list."""
+
+    def damage(path: Path) -> None:
+        in_text(TOML, "values_deg", "file = 'angles.txt' #")(path)
+        if text is not None:
+            (path / "angles.txt").write_text(text)
+
+    return damage
+
+
+def timed(text: str) -> Damage:
+    return in_text(TOML, "[frames]", f"[timing]\n{text}\n[frames]")
+
+
+def stepped(damage: Damage) -> Damage:
+    """Angles by a step, so that only the numbering of the files says which frame is which."""
+
+    def both(path: Path) -> None:
+        in_text(TOML, "values_deg", "step_deg = 25 #")(path)
+        damage(path)
+
+    return both
+
+
+def same_name(path: Path) -> None:
+    """proj_2.tif and proj_2.tiff, both of them projections."""
+    (path / "proj_3.tif").rename(path / "proj_2.tiff")
+    in_text(TOML, "proj_*.tif", "proj_*")(path)
+
+
+def behind_the_directory(path: Path) -> None:
+    """What ImageJ writes beyond 4 GB: one entry in the directory, and the number of images in its description."""
+    tifffile.imwrite(path / "proj_1.tif", np.zeros((10, 14)), description="ImageJ=1.54\nimages=100\n")
+
+
 TURNED = [(274, 3, 1, 6, True)]
 STANDING = "[timing]\nexposure_s = 1\nstart_s = [0, 0, 0, 0, 0, 0]\n[frames]"
 TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
@@ -385,6 +435,21 @@ TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a colour frame": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 14, 3), np.uint8)), ("shape",)),
     "a turned frame": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 14)), extratags=TURNED), ("Orientation",)),
     "a frame of another size": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 13))), ("(10, 13)",)),
+    "a hole in the numbering": (stepped(removed("proj_3.tif")), ("proj_4.tif after proj_2.tif: a hole", "values_deg")),
+    "one number twice": (stepped(lambda p: (p / "proj_3.tif").rename(p / "proj_02.tif")), ("one number",)),
+    "one name twice": (stepped(same_name), ("one number",)),
+    "two kinds of angles": (in_text(TOML, "[angles]", "[angles]\nstep_deg = 2"), ("step_deg and values_deg",)),
+    "a unit of nothing": (in_text(TOML, "[angles]", "[angles]\nunit = 'rad'"), ("[angles] unit",)),
+    "no file of angles": (angles_in(None), ("no file", "angles.txt")),
+    "angles elsewhere": (in_text(TOML, "values_deg", "file = '../angles.txt' #"), ("inside",)),
+    "too few lines of angles": (angles_in("0\n# none\n\n2\n"), ("angles.txt", "2 angles", "6, one for each frame")),
+    "a line that is no angle": (angles_in("0\n1\n2 deg\n3\n4\n5"), ("angles.txt line 3", "'2 deg'")),
+    "a line that is no number": (angles_in("0\n1\n2\nnan\n4\n5"), ("angles.txt line 4",)),
+    "a unit that is none": (in_text(TOML, "values_deg", "unit = 'gon'\nfile = 'a' #"), ("gon",)),
+    "images behind the directory": (behind_the_directory, ("100 images and 1 of them",)),
+    "an exposure without a frame time": (timed("exposure_s = 1"), ("[timing] exposure_s", "--frame-time-s")),
+    "a readout without a frame time": (timed("readout_s = 1"), ("[timing] readout_s", "--frame-time-s")),
+    "the middle of no exposure": (in_text(TOML, "[angles]", "[angles]\nat = 'middle'"), ("[angles] at", "--frame-time-s")),
     "exposure without end": (in_text(TOML, "[frames]", "[timing]\nexposure_s = -1\n[frames]"), ("exposure_s",)),
     "motion without exposure": (in_text(TOML, "[frames]", "[timing]\nframe_time_s = 1\n[frames]"), ("--exposure-s",)),
     "times that stand still": (in_text(TOML, "[frames]", STANDING), ("start times",)),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -38,6 +40,26 @@ def test_a_folder_becomes_a_scan(run, tmp_path, make_truth) -> None:
     scan = read_scan(out, counts_to_attenuation)
     assert scan.geometry.source_to_axis_mm == pytest.approx(1000)
     assert scan.provenance["imported_from"] == str(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "options", "shape", "has_reference"),
+    [
+        (w.write_rtk, ["--size", "6,7,8"], (6, 7, 8), False),
+        (w.write_r2, ["--size", "9", "--voxel-mm", "0.5"], None, False),
+        (w.write_r2, [], None, True),
+    ],
+)
+def test_the_grid_by_options(run, tmp_path, make_truth, write, options, shape, has_reference) -> None:
+    """A truth that does not fit the grid is left out, and that is said."""
+    path, out = write(tmp_path / "source", make_truth()), tmp_path / "scan.h5"
+    done = run(path, "-o", out, *options)
+    assert done.exit_code == 0, done.exception
+    assert ("is on another grid and is left out" in done.output) == (write is w.write_r2 and bool(options))
+    scan = read_scan(out, counts_to_attenuation)
+    assert (scan.reference is not None) == has_reference
+    assert shape is None or scan.grid.shape == shape
+    assert not options or shape or scan.grid.voxel_size_mm == (0.5, 0.5, 0.5)
 
 
 def test_timing_by_options(run, tmp_path, make_truth) -> None:
@@ -134,3 +156,17 @@ def test_a_volume_is_told_from_a_scan(run, tmp_path, member) -> None:
     done = run(tmp_path / "volume.h5", "-o", tmp_path / "scan.h5")
     assert isinstance(done.exception, InputError) and "found a volume" in str(done.exception)
     assert f"volume.h5:{member}" in str(done.exception) and "phyradgs export" in str(done.exception)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
+def test_a_title_with_a_nul_and_a_folder_whose_name_is_no_text(run, tmp_path, make_truth) -> None:
+    folder, out = w.write_tiff(tmp_path / os.fsdecode(b"bad\xff"), make_truth()), tmp_path / "scan.h5"
+    description = folder / "scan.toml"
+    text = description.read_text()
+    for title in (r'title = "a\u0000b\u001b"', ""):
+        description.write_text(text.replace('title = "tiff"', title))
+        done = run(folder, "-o", out)
+        assert done.exit_code == 0, (done.output, done.exception)
+        scan = read_scan(out, counts_to_attenuation)
+        assert scan.title == ("a\ufffdb\ufffd" if title else "bad\ufffd")
+        assert scan.provenance["imported_from"] == str(folder)

@@ -95,6 +95,48 @@ def test_a_deflated_stack_is_unpacked_no_further_than_it_says(tmp_path, make_tru
         tracemalloc.stop()
 
 
+def test_a_deflated_image_larger_than_this_machine_s_share_is_refused(tmp_path, make_truth, monkeypatch) -> None:
+    """2 MB that inflate to 2 GB, in small: what the header promises counts, and nothing is unpacked."""
+    path = w.write_tiff(tmp_path / "tiff", make_truth())
+    hostile.tifffile.imwrite(path / "proj_all.tif", np.zeros((6, 1000, 1000), np.float32), compression="zlib")
+    hostile.in_text(hostile.TOML, "proj_*", "proj_all")(path)
+    monkeypatch.setattr("phyradgs_cl.importers.bounded.host_bytes", lambda: 50e6)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"proj_all.tif: found 0.0503 GiB to unpack; expected at most 0.0373 GiB"):
+            import_scan(path)
+        assert tracemalloc.get_traced_memory()[1] / 2**20 < 2
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(("dtype", "compression"), [(np.float32, None), (np.float32, "zlib"), (np.uint16, None)])
+def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth, dtype, compression) -> None:
+    """The frames as stored and their line integrals, a byte a pixel for the mask, and blocks."""
+    path = w.write_tiff(tmp_path / "tiff", make_truth(), angles="step_deg = 10")
+    frames = np.random.default_rng(0).integers(1000, 50000, (32, 400, 400)).astype(dtype)
+    for name, stack in (("proj", frames), ("flat", frames[:2]), ("dark", frames[:1] * 0)):
+        hostile.tifffile.imwrite(
+            path / f"{name}_all.tif", stack, compression=compression, photometric="minisblack"
+        )
+        hostile.in_text(hostile.TOML, f"{name}_*", f"{name}_all")(path)
+    tracemalloc.start()
+    try:
+        scan = import_scan(path)
+        assert tracemalloc.get_traced_memory()[1] < 2.5 * scan.projections.nbytes + 16e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_hole_among_the_frames_of_a_json_of_several_scans_is_refused(tmp_path, make_truth) -> None:
+    """Each frame takes the view of its place from the first one on."""
+    truth = make_truth(fly=True, geometry=centred("phyradgs-real", make_truth))
+    path = w.write_phyradgs_real(tmp_path / "real", truth)
+    (path / "projections" / "2.tif").unlink()
+    with pytest.raises(InputError, match=r"3.tif after 1.tif: a hole"):
+        import_scan(path, replace(REAL, first_view=0))
+
+
 UNKNOWN = {
     "nothing": lambda p: None,
     "an empty folder": lambda p: p.mkdir(),

@@ -142,6 +142,20 @@ def test_nxtomo(tmp_path, make_truth, assert_same, flips) -> None:
     assert scan.shutter.exposure_s == pytest.approx(0.4) and scan.title == "theirs"
 
 
+@pytest.mark.parametrize("flips", [(False, False), (True, True)])
+def test_nxtomo_with_row_0_on_top(tmp_path, make_truth, assert_same, caplog, flips) -> None:
+    """What the format does not say, the option does, after the flips that the file declares; a line says what is assumed."""
+    truth = make_truth(geometry=replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0)))
+    path = w.write_nxtomo(tmp_path / "theirs.nx", truth, flips)
+    with h5py.File(path, "r+") as file:
+        frames = file["entry0000/instrument/detector/data"]
+        frames[...] = frames[()][:, ::-1]
+    assert_same(import_scan(path, ImportOptions(row_0="top")), truth, grid=False, timing=False)
+    assert "row 0" not in caplog.text
+    import_scan(path)
+    assert "row 0 is taken as the lowest" in caplog.text and "--row-0 top" in caplog.text
+
+
 def test_nxtomo_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth(fly=True, axis="columns", direction=-1)
     path = w.write_nxtomo(tmp_path / "theirs.nx", truth)
@@ -160,6 +174,33 @@ def test_tiff(tmp_path, make_truth, assert_same, compression) -> None:
     assert scan.grid.shape == truth.scan.grid.shape
     np.testing.assert_allclose(scan.grid.offset_mm, truth.scan.grid.offset_mm)
     assert list(zip(*np.nonzero(scan.pixel_mask), strict=True)) == [(7, 3)]
+
+
+@pytest.mark.parametrize("way", ["plain", "imagej", "planar", "volumetric", "tiled", "big-endian", "deflated", "SimpleITK"])
+def test_tiff_of_many_pages(tmp_path, make_truth, assert_same, way) -> None:
+    """One file of projections, one of flats and one of darks; three flats are what tifffile takes for a colour image."""
+    truth = make_truth()
+    path = w.write_tiff(tmp_path / "tiff", truth)
+    for name in ("proj", "flat", "dark"):
+        files = sorted(path.glob(f"{name}_*.tif"))
+        stack = np.stack([w.tifffile.imread(file) for file in files]).astype(np.float32)
+        for file in files:
+            file.unlink()
+        w.write_pages(path / f"{name}_all.tif", stack, way)
+    assert_same(import_scan(path), replace(truth, scan=replace(truth.scan, reference=None)), grid=False, pixels=1e-5)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_tiff_with_a_file_of_angles(tmp_path, make_truth, assert_same, unit) -> None:
+    """Given one by one, angles may go with frames whose numbering has holes."""
+    truth = make_truth()
+    angles = f"file = 'angles.txt'\nunit = '{unit}'"
+    path = w.write_tiff(tmp_path / "tiff", truth, angles=angles)
+    values = truth.angle_rad if unit == "rad" else np.rad2deg(truth.angle_rad)
+    lines = [f"{value!r}  # frame {i}" for i, value in enumerate(values.tolist())]
+    (path / "angles.txt").write_text("# of the gantry\n\n" + "\n".join(lines) + "\n")
+    (path / "proj_5.tif").rename(path / "proj_11.tif")
+    assert_same(import_scan(path), truth, grid=False)
 
 
 TIMING = """[timing]

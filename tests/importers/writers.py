@@ -245,6 +245,23 @@ def write_nxtomo(path: Path, truth: Any, flips: tuple[bool, bool] = (False, Fals
 # --- TIFF -------------------------------------------------------------------------------------------------------
 
 
+def write_pages(path: Path, stack: np.ndarray, way: str) -> None:
+    """A stack (n, v, u) as one file, in one of the ways in which programs do it."""
+    if way == "SimpleITK":
+        sitk.WriteImage(sitk.GetImageFromArray(stack), str(path))
+        return
+    options: dict[str, dict[str, Any]] = {
+        "plain": {},
+        "imagej": {"imagej": True},
+        "planar": {"photometric": "minisblack", "planarconfig": "separate"},
+        "volumetric": {"photometric": "minisblack", "volumetric": True},
+        "tiled": {"photometric": "minisblack", "volumetric": True, "tile": (16, 16, 16)},
+        "big-endian": {"photometric": "minisblack", "byteorder": ">"},
+        "deflated": {"photometric": "minisblack", "compression": "zlib", "rowsperstrip": 3},
+    }
+    tifffile.imwrite(path, stack, **options[way])
+
+
 def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = None, **options: Any) -> Path:
     """A folder of float TIFFs, flats and darks by tifffile, and scan.toml."""
     folder.mkdir()

@@ -122,8 +122,21 @@ def test_a_killed_writer_leaves_the_old_file(tmp_path) -> None:
         [sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE, env=_environment()
     ) as process:
         assert process.stdout is not None and process.stdout.readline() == b"writing\n"
+        with written_beside(target):  # whose writer is alive stays
+            pass
+        assert len(names(tmp_path)) == 2
+        target.write_text("old")
         process.send_signal(signal.SIGKILL)
     assert target.read_text() == "old"
+    left = [name for name in names(tmp_path) if name.endswith(".part")]
+    assert len(left) == 1
+    check_writable(tmp_path / "other.txt")
+    assert left[0] in names(tmp_path)
+    machine = left[0].split(".")[-2].split("-")[0]
+    elsewhere = tmp_path / left[0].replace(machine, "00000000")
+    elsewhere.write_text("half")
+    check_writable(tmp_path / "out.h5")  # whatever the run writes: volume, checkpoint, picture
+    assert names(tmp_path) == sorted([elsewhere.name, "out.txt"])
 
 
 @pytest.mark.skipif(not POSIX, reason="file size limits of POSIX")

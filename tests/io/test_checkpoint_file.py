@@ -27,16 +27,16 @@ def members(path: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def rewrite(path: Path, changes: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> None:
+def rewrite(path: Path, changes: dict[str, bytes]) -> None:
     content = members(path) | changes
-    with zipfile.ZipFile(path, "w", compression) as archive:
+    with zipfile.ZipFile(path, "w") as archive:
         for name, data in content.items():
             archive.writestr(name, data)
 
 
-def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
+def npy(array: np.ndarray) -> bytes:
     stream = io.BytesIO()
-    np.lib.format.write_array(stream, array, version)
+    np.lib.format.write_array(stream, array)
     return stream.getvalue()
 
 
@@ -87,28 +87,30 @@ def test_what_another_run_had_otherwise_is_named(path) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"volume.npy": npy(ARRAYS["volume"], (2, 0))},
-        {"volume.npy": npy(np.zeros(3, complex))},
         {"volume.npy": npy(ARRAYS["volume"]).replace(b"(2, 3, 4)", b"(9, 9, 9)")},
         {"volume.npy": npy(ARRAYS["volume"])[:-8]},
         {"volume.npy": b"no array"},
         {"volume.txt": b"hello"},
-        {f"{number}.npy": npy(np.array(1)) for number in range(70)},
+        {"volume.npy": npy(np.array([None]))},
     ],
-    ids=["a later version", "complex", "too large", "cut off", "no array", "a text", "too many"],
+    ids=["too large", "cut off", "no array", "a text", "a pickle"],
 )
 def test_archives_that_no_run_writes(path, changes) -> None:
     rewrite(path, changes)
     refused(path, "a damaged checkpoint")
 
 
-def test_nothing_is_unfolded(path) -> None:
-    rewrite(path, {"volume.npy": npy(np.zeros(1 << 16))}, zipfile.ZIP_DEFLATED)
+@pytest.mark.parametrize("at", [0, 33, 66, 127, 300])
+def test_a_changed_byte_is_noticed(path, at) -> None:
+    """In the header of the archive's member, in that of the array, in its numbers: by the checksum if by nothing else."""
+    content = bytearray(path.read_bytes())
+    content[at] ^= 0x11
+    path.write_bytes(content)
     refused(path, "a damaged checkpoint")
 
 
 def test_one_that_cannot_be_opened_says_why(path, monkeypatch) -> None:
-    def closed(*_: object) -> None:
+    def closed(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(zipfile, "ZipFile", closed)

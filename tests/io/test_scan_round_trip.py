@@ -16,6 +16,7 @@ from phyradgs_cl.acquisition import (
     FrameSweeps,
     MicroViews,
     PoseTable,
+    Saturation,
     Shutter,
     SpeedRamp,
     Static,
@@ -43,9 +44,11 @@ def test_fields_come_back(tmp_path, make_scan) -> None:
     mask = np.zeros((3, 5), bool)
     mask[1, 2] = True
     reference = np.arange(24, dtype=np.float32).reshape(2, 3, 4) / 100
-    scan = make_scan(pixel_mask=mask, reference=reference, provenance={"seed": 3, "method": "made up"})
+    facts = {"provenance": {"seed": 3, "method": "made up"}, "saturation": Saturation(4095.0, 0.25)}
+    scan = make_scan(pixel_mask=mask, reference=reference, **facts)
     write_scan(tmp_path / "scan.h5", scan)
     again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
+    assert again.saturation == scan.saturation
     np.testing.assert_array_equal(again.projections, scan.projections)
     assert again.projections.dtype == np.float32
     np.testing.assert_array_equal(again.reference, reference)

@@ -9,7 +9,7 @@ import pytest
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import default_grid, load_scanner, with_detector_count, with_grid_count
+from phyradgs_cl.io import default_grid, load_scanner, with_detector_count
 
 DATA = Path(__file__).parents[2] / "data"
 GOOD = """
@@ -137,17 +137,12 @@ def test_unknown_names_and_paths(tmp_path) -> None:
         load_scanner(tmp_path / "none.toml", DATA)
 
 
-def test_another_count_keeps_panel_and_box() -> None:
+def test_another_count_keeps_the_panel() -> None:
     geometry = ConeGeometry(500.0, 1000.0, (40, 60), (2.0, 1.0), (1.0, 3.5))
     coarse = with_detector_count(geometry, 10, 15)
     # 4 × 4 pixels become one, centred among them
     fine_mm = pixel_centres(geometry.pose(0.3), geometry.detector_shape).reshape(10, 4, 15, 4, 3)
     coarse_mm = pixel_centres(coarse.pose(0.3), coarse.detector_shape)
     assert coarse_mm == pytest.approx(fine_mm.mean((1, 3)), abs=1e-9)
-    grid = with_grid_count(Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0)), 20)
-    assert grid.shape == (5, 10, 20)
-    assert grid.size_mm == pytest.approx((10, 20, 80)) and grid.offset_mm == (1, 2, 3)
     with pytest.raises(InputError):
         with_detector_count(geometry, 0, 5)
-    with pytest.raises(InputError):
-        with_grid_count(grid, 0)

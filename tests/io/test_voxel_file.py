@@ -93,11 +93,14 @@ def test_axes_must_exist_and_be_even(tmp_path: Path, axis: object) -> None:
         load_volume(path)
 
 
-def test_axes_must_be_in_mm(tmp_path: Path) -> None:
+def test_axes_have_units(tmp_path: Path) -> None:
     path = _write_result(tmp_path / "r.h5", Grid((4, 5, 6), (1.0, 1.0, 1.0)))
     with h5py.File(path, "r+") as file:
-        file["/entry/reconstruction/x"].attrs["units"] = "m"
-    with pytest.raises(InputError, match="units 'm'"):
+        file["/entry/reconstruction/x"].attrs["units"] = "cm"
+    assert load_volume(path).grid.voxel_size_mm == pytest.approx((1.0, 1.0, 10.0))
+    with h5py.File(path, "r+") as file:
+        file["/entry/reconstruction/x"].attrs["units"] = "inch"
+    with pytest.raises(InputError, match="'inch'"):
         load_volume(path)
 
 

@@ -178,5 +178,5 @@ def test_launches_do_not_grow_with_the_micro_views(rt, make_cloud, orbit, monkey
         projector.backward(gaussians, cells, rt.upload(pad_rows(np.ones(SHAPE))), gradients)
         counts.append(list(launched))
     assert counts[0] == counts[1]
-    for kernel in ("splat_prepare", "splat_forward", "splat_backward", "splat_chain"):
+    for kernel in ("splat_prepare", "splat_forward_rows", "splat_backward_rows", "splat_chain"):
         assert counts[1].count(kernel) == 1

@@ -153,4 +153,4 @@ def test_launches_do_not_grow_with_the_cells(rt, make_cloud, make_table, monkeyp
     monkeypatch.setattr(Runtime, "launch", counting)
     table = make_table("exact")
     projector(rt, table).project(make_cloud(4, 65), DeviceCells.upload(rt, table))
-    assert names.count("splat_forward") == 1 and names.count("intensity_merge") == 1
+    assert names.count("splat_forward_rows") == 1 and names.count("intensity_merge") == 1

@@ -16,7 +16,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
 KERNELS = Path(__file__).resolve().parents[2] / "cl"
-CPU_ONLY = {"backproject_upright", "turn_upright", "rays_upright"}
+CPU_ONLY = {"splat_forward_rows", "splat_backward_rows", "backproject_upright", "turn_upright", "rays_upright"}
 GEOMETRY, GRID = (
     ConeGeometry(5.0, 7.5, (13, 18), (0.3, 0.23), (0.1, 0.2)),
     Grid((11, 12, 14), (0.18, 0.17, 0.14)),

@@ -9,6 +9,7 @@ PHYRADGS_CHROMIUM names the browser's program if it is not on the path; PHYRADGS
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from phyradgs_cl.io import read_volume
 from phyradgs_cl.report import write_report
 
 WIDTHS = (1280, 390)
@@ -60,7 +62,20 @@ def place(page: Page, plane: str) -> str:
 
 
 def picture(page: Page, plane: str) -> str:
-    return page.locator(f"#plane-{plane} img").get_attribute("src") or ""
+    """What is seen of a plane, once its slice is decoded."""
+    page.wait_for_function("[...document.querySelectorAll('.sheet img')].every(image => image.complete)")
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => setTimeout(done)))")
+    return page.locator(f"#plane-{plane} canvas").evaluate("canvas => canvas.toDataURL()")
+
+
+def hover(page: Page, plane: str, right: float, up: float) -> None:
+    """Moves the pointer to a share of a picture's width and height."""
+    box = page.locator(f"#plane-{plane} .picture").bounding_box()
+    page.mouse.move(box["x"] + right * box["width"], box["y"] + (1 - up) * box["height"])
+
+
+def reading(page: Page) -> str:
+    return page.locator("#reading").inner_text()
 
 
 def test_nothing_is_wider_than_the_window(page) -> None:
@@ -118,12 +133,71 @@ def test_layers_change_all_pictures(page) -> None:
     assert picture(page, "axial") not in (before[0], after[0])
 
 
+def test_the_value_under_the_pointer_is_that_of_the_file(page, files) -> None:
+    volume = read_volume(files[1]).volume
+    picture(page, "coronal")
+    assert reading(page).startswith("Where the lines cross, x 0.08, y 0.08, z 0.08 mm: ")
+    page.locator("#plane-coronal").scroll_into_view_if_needed()
+    for right, up, column, row in ((0.375, 0.625, 4, 7), (0.54, 0.46, 6, 5)):
+        hover(page, "coronal", right, up)
+        told = re.fullmatch(r"Under the pointer, x (.*), y (.*), z (.*) mm: (.*) 1/mm", reading(page).replace("−", "-"))
+        x, _, z, value = (float(number) for number in told.groups())
+        assert (x, z) == pytest.approx(((column - 5.5) / 6, (row - 5.5) / 6), abs=6e-3)
+        assert value == pytest.approx(volume[row, 6, column], abs=0.006)
+    page.mouse.move(0, 0)
+    assert reading(page).startswith("Where the lines cross")
+
+
+def test_window_sliders_change_what_black_and_white_are(page) -> None:
+    before = picture(page, "axial")
+    page.locator("#white").focus()
+    for _ in range(40):
+        page.keyboard.press("ArrowLeft")
+    after = picture(page, "axial")
+    assert after != before and page.locator("#white").get_attribute("aria-valuetext").endswith("1/mm")
+    page.locator("#layer-difference").check()
+    assert page.locator("#black").is_disabled()
+    told = [page.locator(f"#{end}-told").inner_text().strip("≤≥ ") for end in ("black", "white")]
+    assert told[0] == f"−{told[1]}"
+    page.locator("#layer-result").check()
+    assert picture(page, "axial") == after
+    page.locator("#reset").click()
+    assert picture(page, "axial") == before
+
+
+def test_the_wheel_turns_slices_where_the_pointer_has_moved_and_zooms_with_ctrl(page) -> None:
+    page.locator("#plane-axial").scroll_into_view_if_needed()
+    hover(page, "axial", 0.5, 0.5)
+    hover(page, "axial", 0.2, 0.2)
+    page.mouse.wheel(0, -100)
+    page.wait_for_function("document.querySelector('#place-axial').textContent.includes('8 of 12')")
+    page.keyboard.down("Control")
+    page.mouse.wheel(0, -100)
+    page.keyboard.up("Control")
+    page.wait_for_function("document.querySelector('#zoom').value === '1.5'")
+    assert "8 of 12" in place(page, "axial")
+
+
+def test_zoom_keeps_the_crossing_in_sight_and_the_bar_true(page) -> None:
+    bar, box = page.locator("#plane-axial .bar"), page.locator("#plane-axial .picture")
+    page.locator("#zoom").focus()
+    page.keyboard.press("End")
+    length_mm = float(bar.inner_text().split()[0])
+    share = bar.bounding_box()["width"] / box.bounding_box()["width"]
+    assert share == pytest.approx(8 * length_mm / 2.0, rel=0.02)
+    page.locator("#slider-sagittal").focus()
+    page.keyboard.press("Home")
+    line, seen = page.locator("#plane-axial .upwards").bounding_box(), box.bounding_box()
+    assert seen["x"] <= line["x"] <= seen["x"] + seen["width"]
+
+
 def test_tab_reaches_every_control(page) -> None:
     reached = []
     for _ in range(30):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id || document.activeElement.tagName"))
-    assert {"slider-axial", "slider-coronal", "slider-sagittal", "layer-result", "SUMMARY"} <= set(reached)
+    sliders = {"slider-axial", "slider-coronal", "slider-sagittal", "black", "white", "zoom"}
+    assert sliders | {"reset", "layer-result", "SUMMARY"} <= set(reached)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -139,7 +213,8 @@ def test_without_script_the_middle_slices_stay(browser, address) -> None:
     page = browser.new_context(java_script_enabled=False).new_page()
     page.goto(address)
     assert page.locator("#plane-axial img").is_visible()
-    assert not page.locator("#slider-axial").is_visible() and not page.locator(".choice").is_visible()
+    assert not page.locator("#slider-axial").is_visible() and not page.locator(".tools").is_visible()
+    assert page.locator("#plane-axial .bar").is_visible() and "Black is 0, white" in reading(page)
     page.close()
 
 

@@ -21,8 +21,9 @@ from phyradgs_cl.commands.report import report_command
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
 from phyradgs_cl.report import Run, load_run, report_page, write_report
-from phyradgs_cl.report.facts import number
+from phyradgs_cl.report.facts import number, shown
 from phyradgs_cl.report.projections import chosen_frames, computed_views
+from phyradgs_cl.report.slices import Window
 from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
 
 ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
@@ -115,18 +116,46 @@ def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse
     assert f"Loss: from {number(record[0]['loss'])} to {number(record[-1]['loss'])}" in page.words
 
 
-def test_pictures_decode_to_the_volume_slices(page, files) -> None:
+def test_pictures_decode_to_the_volume_slices(page, files, small_scan) -> None:
     stored = read_volume(files[1])
     data = json.loads(page.texts["script"][0])
-    truth_high = max(float(v) for v in re.findall(r"white ([\d.]+) 1/mm", page.words))
+    layers = {"result": stored.volume, "truth": small_scan.reference, "difference": stored.volume - small_scan.reference}
+    assert list(data["windows"]) == list(layers)
     for name, axis in (("axial", 0), ("coronal", 1), ("sagittal", 2)):
-        plane = data[name]
+        plane = data["planes"][name]
         assert plane["indices"] == list(range(12)) and len(plane["places"]) == plane["count"] == 12
-        assert set(plane["layers"]) == {"result", "truth", "difference"}
-        for k in (0, 5, 11):
-            image = decoded("data:image/png;base64," + plane["layers"]["result"][k])
-            expected = np.clip(stored.volume.take(k, axis=axis)[::-1] / truth_high, 0, 1) * 255
-            assert np.abs(image - expected).max() <= 1
+        assert set(plane["layers"]) == set(layers)
+        for layer, volume in layers.items():
+            window = data["windows"][layer]
+            step = (window["most"] - window["least"]) / 255
+            for k in (0, 5, 11):
+                image = decoded("data:image/png;base64," + plane["layers"][layer][k])
+                expected = np.clip(volume.take(k, axis=axis)[::-1], window["least"], window["most"])
+                assert np.abs(window["least"] + step * image - expected).max() <= 0.501 * step
+                assert 10 ** -window["decimals"] <= step < 10 ** (1 - window["decimals"])
+
+
+def test_without_a_script_the_middle_slices_have_the_stated_window(page, files) -> None:
+    high = float(re.search(r"white ([\d.]+) 1/mm", page.words)[1])
+    stills = [image for image in page.all("img") if "slice of the volume" in image["alt"]]
+    for axis, still in enumerate(stills):
+        expected = 255 * np.clip(read_volume(files[1]).volume.take(6, axis=axis)[::-1] / high, 0, 1)
+        assert np.abs(decoded(still["src"]) - expected).max() <= 1
+    marks = [text for text in page.texts["b"] if text[0] in "+−"]
+    assert marks == ["−x", "+x", "+y", "−y", "−x", "+x", "+z", "−z", "−y", "+y", "+z", "−z"]
+    assert page.texts["span"].count("0.5 mm") == 3  # a bar of the largest round length below 0.3 of 2 mm
+
+
+def test_a_window_has_room_for_overshoots_and_says_what_lies_beyond() -> None:
+    volume = np.array([-0.1, 0.0, 1.0, 9.0])
+    assert Window.of(0.0, 1.0, volume) == Window(0.0, 1.0, -0.1, 1.25, (False, True))
+    assert Window.of(0.0, 1.0, volume[1:3]) == Window(0.0, 1.0, 0.0, 1.0, (False, False))
+
+
+def test_what_rounding_left_of_zero_is_zero() -> None:
+    assert number(-3.495e-15, 0.1) == "0" and number(-3.495e-15) == "−3.495·10⁻¹⁵"
+    assert shown(-3.495e-15, "mm") == "0\N{NARROW NO-BREAK SPACE}mm" and shown([1e-14, 0.25], "°") == "0, 0.25°"
+    assert shown(1e-12, "1/mm").startswith("1·10⁻¹²")  # no resolution is known of it
 
 
 def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> None:

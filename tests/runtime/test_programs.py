@@ -19,7 +19,7 @@ def test_a_kernel_is_built_once(rt) -> None:
     first = rt.kernel("adam", "adam_step")
     assert rt.kernel("adam", "adam_step") is first
     assert rt.kernel("adam", "activate") is not first
-    assert rt.kernel("adam", "activate").program == first.program
+    assert rt.compile(rt.kernel("adam", "activate")).program == rt.compile(first).program
 
 
 def test_defines_are_told_apart(rt) -> None:
@@ -39,7 +39,9 @@ def test_programs_are_built_once_for_all_their_kernels(rt, monkeypatch) -> None:
     runtime = Runtime()
     for _ in range(3):
         for name in ("bin_count", "bin_within", "bin_starts", "bin_fill"):
-            runtime.kernel("binning", name)
+            kernel = runtime.kernel("binning", name)
+            assert kernel.built is None or built, "a declaration alone builds nothing"
+            runtime.compile(kernel)
     assert built == ["binning"]
 
 
@@ -90,7 +92,7 @@ def broken_folder(tmp_path, monkeypatch):
 )
 def test_a_build_error_names_file_and_line(rt, broken_folder, program, place) -> None:
     with pytest.raises(DeviceError) as raised:
-        rt.kernel(program, "nothing")
+        rt.launch(rt.kernel(program, "nothing"), 1, rt.zeros(1))
     text = str(raised.value)
     assert f"{program}.cl" in text and place in text and rt.device.name in text
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -26,6 +27,13 @@ def read(tmp_path: Path, tiny_scan: Path):
         return read_grid(read_config(path, "GRID"), path)
 
     return reading
+
+
+def test_grids_are_tried_like_other_options_and_methods_in_any_case(read) -> None:
+    grid = read(GRID + '[[grid]]\nmethod = ["FDK", "fdk"]\nsize = [8, [4, 5, 6]]\n')
+    assert [setting.label for setting in grid.settings] == ["fdk size=8", "fdk size=4,5,6"]
+    run = plan_sweep(grid, Path("results"))[-1]
+    assert run.job.before.size == (4, 5, 6) and run.facts["input"] == {"size": [4, 5, 6]}
 
 
 def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
@@ -73,7 +81,7 @@ def test_what_is_asked_for_twice_is_run_once_and_names_differ(read, tmp_path) ->
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('scnas = ["*.h5"]\n', "scnas: found no such key.*did you mean 'scans'"),
+        ('scnas = ["*.h5"]\n', "scnas: found a key that is not known.*did you mean 'scans'"),
         ("[[runs]]\n", "scans: found None; expected a list"),
         ('scans = "a.h5"\n[[runs]]\n', "scans: found 'a.h5'"),
         (GRID, r"neither \[\[grid\]\] nor \[\[runs\]\]"),
@@ -111,3 +119,20 @@ def test_a_product_beyond_all_measure_is_refused(read) -> None:
     values = ", ".join(map(str, range(1, 400)))
     with pytest.raises(InputError, match="combinations; expected at most"):
         read(GRID + f'[[grid]]\nmethod = "sirt"\niterations = [{values}]\nrelaxation = [{values}]\n')
+
+
+def test_patterns_are_bounded_and_meet_regular_files_only(read, tmp_path) -> None:
+    """All files of a machine have no end; a pipe is waited for."""
+    for pattern in ("/**/*", "/**/*.h5", "/*/*/*/*/*"):
+        with pytest.raises(InputError, match="covers too many files|found a file that|not HDF5|empty"):
+            read(f'scans = ["{pattern}"]\n[[runs]]\n')
+    (tmp_path / "below/deep").mkdir(parents=True)
+    (tmp_path / "below/loop").symlink_to(tmp_path)
+    shutil.copy(tmp_path / "a.h5", tmp_path / "below/deep/c.h5")
+    os.mkfifo(tmp_path / "below/pipe.h5")
+    found = read('scans = ["**/*.h5", "./b*/d?ep/[c].h5", "a.h5"]\n[[runs]]\n')
+    assert [path.name for path in found.scans] == ["a.h5", "b.h5", "c.h5"]
+    with pytest.raises(InputError, match="not a regular file"):
+        read('scans = ["below/pipe.h5"]\n[[runs]]\n')
+    with pytest.raises(InputError, match="no file for"):
+        read('scans = ["below/*.h5"]\n[[runs]]\n')

@@ -1,13 +1,13 @@
-"""Opens HDF5 files as their names come on standard input, and answers "done" or "large" for each that it survives.
+"""Looks at one HDF5 file within limits: python FOLDER FILE SMALL_BYTES MOST_OBJECTS MEMORY_BYTES CPU_SECONDS SECONDS.
 
-python FOLDER SMALL_BYTES MOST_OBJECTS MOST_MEMORY_BYTES CPU_SECONDS. Every object is opened, every attribute read and every
-dataset of at most SMALL_BYTES; limits of the system end the process that takes more memory, or longer with one file.
-Nothing of phyradgs_cl is imported, and nothing that takes long to start.
+Every object is opened, every attribute read and every dataset of at most SMALL_BYTES. The process ends with status 0, with
+LARGE where that took more memory than headers need, or by the signal of a limit or a crash. Nothing of phyradgs_cl is
+imported, and nothing that takes long to start.
 """
 
 from __future__ import annotations
 
-import json
+import signal
 import sys
 import time
 
@@ -18,18 +18,35 @@ try:
 except ImportError:  # not POSIX: nothing bounds this process but the clock of whoever started it
     resource = None  # type: ignore[assignment]
 
+LARGE = 100
 _DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError)
 """What h5py raises for damage that HDF5 survives; it is met again, and named, by the reading itself."""
-_LARGE = 1 / 32  # of the memory that may be had: more than headers ever need
+_SLACK = 32  # of headers' memory: what asks for too much must still get it, to be noticed
+_UNFOLDED_BYTES = 64 << 20  # for a small dataset, whatever its filters make of it
 
 
-class Look:
+def look(
+    path: str, small_bytes: int, most_objects: int, memory_bytes: int, cpu_seconds: int, seconds: float
+) -> int:
+    """The status to end with. Limits of the system end this process where it takes too long."""
+    limit("RLIMIT_CORE", 0)
+    limit("RLIMIT_CPU", int(time.process_time()) + 1 + cpu_seconds)
+    start_bytes = in_use_bytes("VmHWM:")
+    limit_memory(_SLACK * memory_bytes)
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+    _Walk(small_bytes, most_objects, _SLACK * memory_bytes).through(path)
+    return LARGE if in_use_bytes("VmHWM:") - start_bytes > memory_bytes else 0
+
+
+class _Walk:
     """A walk through one file that ends after so many objects."""
 
-    def __init__(self, small_bytes: int, most_objects: int) -> None:
-        self._small_bytes, self._left = small_bytes, most_objects
+    def __init__(self, small_bytes: int, most_objects: int, memory_bytes: int) -> None:
+        self._small_bytes, self._left, self._memory_bytes = small_bytes, most_objects, memory_bytes
 
-    def at_file(self, path: str) -> None:
+    def through(self, path: str) -> None:
         try:
             with h5py.File(path, "r") as file:
                 self._at(file)
@@ -45,6 +62,7 @@ class Look:
                 thing.attrs[name]
             if isinstance(thing, h5py.Dataset):
                 if self._is_small(thing):
+                    limit_memory(_UNFOLDED_BYTES)
                     thing[()]
                 return
             for name in thing:
@@ -52,6 +70,9 @@ class Look:
                     self._at(thing[name])
         except _DAMAGE:
             return
+        finally:
+            if isinstance(thing, h5py.Dataset):
+                limit_memory(self._memory_bytes)
 
     def _is_small(self, dataset: h5py.Dataset) -> bool:
         fixed = dataset.dtype.kind != "O" or dataset.size == 1
@@ -60,16 +81,20 @@ class Look:
         )
 
 
-def held_bytes() -> int:
-    """The most memory that this process has held; 0 where the system does not say."""
-    try:  # in Linux the system's call would also tell what the process held that started this one
+def in_use_bytes(what: str) -> int:
+    """Memory of this process as Linux counts it: VmHWM, the most that it has held, or VmSize; 0 elsewhere."""
+    try:
         with open("/proc/self/status") as status:
-            return 1024 * int(status.read().partition("VmHWM:")[2].split()[0])
+            return 1024 * int(status.read().partition(what)[2].split()[0])
     except (OSError, ValueError, IndexError):
-        pass
-    if resource is None:
         return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def limit_memory(more_bytes: int) -> None:
+    """Bounds what this process may take from now on, where Linux counts."""
+    in_use = in_use_bytes("VmSize:")
+    if in_use:
+        limit("RLIMIT_AS", in_use + more_bytes)
 
 
 def limit(what: str, to: int) -> None:
@@ -80,22 +105,6 @@ def limit(what: str, to: int) -> None:
         resource.setrlimit(kind, (to if most < 0 else min(to, most), most))
 
 
-def answer(word: str) -> None:
-    sys.stdout.write(word + "\n")
-    sys.stdout.flush()
-
-
-def main() -> None:
-    small_bytes, most_objects, most_memory_bytes, cpu_seconds = map(int, sys.argv[1:])
-    limit("RLIMIT_CORE", 0)
-    limit("RLIMIT_AS", most_memory_bytes)
-    start_bytes = held_bytes()
-    answer("ready")
-    for line in sys.stdin:
-        limit("RLIMIT_CPU", int(time.process_time()) + 1 + cpu_seconds)
-        Look(small_bytes, most_objects).at_file(json.loads(line))
-        answer("large" if held_bytes() - start_bytes > _LARGE * most_memory_bytes else "done")
-
-
 if __name__ == "__main__":
-    main()
+    file, *numbers, last = sys.argv[1:]
+    sys.exit(look(file, *map(int, numbers), float(last)))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import glob
 import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,12 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.scan_header import read_header
-from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_options
+from phyradgs_cl.io.tables import refuse_unknown
+from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_name, method_options
 from phyradgs_cl.runtime import MEMORY_VARIABLE
+from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
+from phyradgs_cl.workflow.sweep.patterns import Search
 
 MOST_RUNS = 100_000
 _LARGEST_SEED = 2**63
@@ -70,11 +71,7 @@ def read_grid(document: Table, path: Path) -> SweepGrid:
     Raises InputError for whatever a run would stumble over: unknown keys and options, values out of range, patterns
     that match nothing, files that are no scans.
     """
-    for key in document:
-        if key not in _KEYS:
-            close = get_close_matches(key, _KEYS, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else "leave it out"
-            raise InputError(f"{path}: {key}", "no such key", f"one of {', '.join(_KEYS)}", remedy)
+    refuse_unknown(f"{path}:", document, _KEYS)
     settings = _settings(document, path)
     seeds = _seeds(document.get("seeds", [0]), path)
     scans = _scans(document.get("scans"), path)
@@ -122,13 +119,13 @@ def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
         expected = 'a list of file names or patterns, as scans = ["scans/*.h5"]'
         raise InputError(f"{path}: scans", checks.shown(patterns), expected)
     found: dict[Path, None] = {}
+    search, start = Search(f"{path}: scans"), path.resolve().parent
     for pattern in patterns:
-        start = path.resolve().parent
-        names = sorted(glob.glob(pattern, root_dir=start, recursive=True))
+        names = search.files(plain_text(pattern), start)
         if not names:
             remedy = f"patterns start at the folder of the file, {start}"
             raise InputError(f"{path}: scans", f"no file for {pattern!r}", "at least one scan file", remedy)
-        found.update((Path(os.path.abspath(start / name)), None) for name in names)
+        found.update((Path(os.path.abspath(name)), None) for name in names)
     return tuple(found)
 
 
@@ -205,7 +202,7 @@ def _setting(values: dict[str, Any], where: str) -> Setting:
 
 def _checked(values: dict[str, Any]) -> Setting:
     changes = dict(values)
-    method, preset = changes.pop("method", _DEFAULT_METHOD), changes.pop("preset", None)
+    method, preset = method_name(changes.pop("method", _DEFAULT_METHOD)), changes.pop("preset", None)
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)

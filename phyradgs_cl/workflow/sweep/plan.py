@@ -9,15 +9,33 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from phyradgs_cl.io.facts import FINITE, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
 from phyradgs_cl.io.json_lines import Line
+from phyradgs_cl.io.names import shortened
 from phyradgs_cl.reconstructors import input_options
+from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob
 from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid
 
 VOLUMES = "volumes"
 # What makes a line of the results file that of a run: its name, and the scan file as it is now.
 KEY = ("run", "scan", "scan_bytes", "scan_mtime_ns")
-_LONGEST_STEM = 80
+_STEM_BYTES = 80
+# What tables read of a line, and more of one that is no error.
+_KINDS: Schema = {
+    **dict.fromkeys(("run", "scan", "method", "preset", "label", "error"), TEXT),
+    **dict.fromkeys(("scan_bytes", "scan_mtime_ns", "seed", "gaussians"), WHOLE),
+    **dict.fromkeys(("device", "host", "version", "volume"), TEXT),
+    **dict.fromkeys(("changes", "input", "options"), TABLE),
+    "metrics": FINITE,
+    "seconds": SECONDS,
+}
+_ALWAYS, _OF_RESULTS = (*KEY, "label", "changes", "input"), ("metrics", "seconds")
+
+
+def is_sound(line: Line) -> bool:
+    """Whether a line of the results file is of a run, and every field of its kind."""
+    return not damage(line, _KINDS, (*_ALWAYS, *(("error",) if "error" in line else _OF_RESULTS)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +76,7 @@ def _planned(grid: SweepGrid, folder: Path, checkpoint_every_s: float) -> Iterat
                 )
                 facts = {
                     "run": name,
-                    "scan": str(scan),
+                    "scan": plain_text(str(scan)),
                     "scan_bytes": stat.st_size,
                     "scan_mtime_ns": stat.st_mtime_ns,
                     "method": setting.method,
@@ -93,4 +111,4 @@ def _name(scan: Path, setting: Setting, seed: int) -> str:
     """Names of scan and method for people, a digest against equal names, the seed."""
     identity = [str(scan), setting.method, setting.preset, plain(setting.changes), plain(setting.before)]
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:10]
-    return f"{scan.stem[:_LONGEST_STEM]}_{setting.method}_{digest}_s{seed}"
+    return f"{shortened(plain_text(scan.stem), _STEM_BYTES)}_{setting.method}_{digest}_s{seed}"

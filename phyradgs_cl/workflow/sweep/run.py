@@ -15,7 +15,7 @@ from phyradgs_cl.io.json_lines import Line, append_line, read_lines, refuse_irre
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.workflow.sweep.grid import SweepGrid
-from phyradgs_cl.workflow.sweep.plan import VOLUMES, SweepRun, missing_runs, plan_sweep
+from phyradgs_cl.workflow.sweep.plan import VOLUMES, SweepRun, is_sound, missing_runs, plan_sweep
 from phyradgs_cl.workflow.sweep.tables import write_tables
 from phyradgs_cl.workflow.sweep.task import lost_line, make_run
 
@@ -66,7 +66,7 @@ def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[li
     """
     results = _results_file(job.folder)
     with only_run(results):
-        lines = read_lines(results)
+        lines = read_lines(results, is_sound)
         plan = plan_sweep(job.grid, job.folder, job.checkpoint_every_s)
         missing = missing_runs(plan, lines)
         batch = _Batch(job, results, lines, len(plan), len(plan) - len(missing), report)

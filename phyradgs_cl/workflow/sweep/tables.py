@@ -12,6 +12,7 @@ import numpy as np
 
 from phyradgs_cl.io import written_beside
 from phyradgs_cl.io.json_lines import Line
+from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.sweep.grid import flat
 from phyradgs_cl.workflow.sweep.plan import SweepRun, same_run
 
@@ -32,7 +33,7 @@ def write_tables(folder: Path, lines: Sequence[Line], plan: Sequence[SweepRun]) 
     }
     for path, text in written.items():
         with written_beside(path) as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="")
+            temporary.write_text(plain_text(text), encoding="utf-8", newline="")
     return list(written)
 
 

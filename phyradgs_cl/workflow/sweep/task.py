@@ -14,14 +14,15 @@ from phyradgs_cl import __version__
 from phyradgs_cl.cluster import forget_runtimes, runtime_of_process
 from phyradgs_cl.errors import DeviceError, OutputError, PhyradgsError
 from phyradgs_cl.io import written_beside
-from phyradgs_cl.io.json_lines import Line
+from phyradgs_cl.io.json_lines import Line, json_text
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.reconstructors import ProgressReport, ignore_progress
 from phyradgs_cl.runtime.environment import environment
 from phyradgs_cl.workflow.resumable import go_on, is_whole
-from phyradgs_cl.workflow.sweep.plan import SweepRun, same_run
+from phyradgs_cl.workflow.sweep.plan import SweepRun, is_sound, same_run
 
 _BUSY_S, _BUSY_EVERY_S = 600.0, 1.0
+_LONGEST_ERROR = 2000
 log = logging.getLogger(__name__)
 
 
@@ -79,7 +80,7 @@ def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) ->
             "host": platform.node(),
         }
     with written_beside(run.record) as temporary:
-        temporary.write_text(json.dumps(line, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+        temporary.write_text(json_text(line), encoding="utf-8")
     return line
 
 
@@ -91,14 +92,14 @@ def _kept(run: SweepRun) -> Line | None:
         line = json.loads(run.record.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # not there, not JSON, or JSON too deep
         return None
-    return line if isinstance(line, dict) and same_run(line, run.facts) else None
+    return line if isinstance(line, dict) and is_sound(line) and same_run(line, run.facts) else None
 
 
 def _failed(run: SweepRun, error: str) -> Line:
     finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
     return {
         **run.facts,
-        "error": error,
+        "error": error[:_LONGEST_ERROR],  # a compiler's may have many pages
         "version": __version__,
         "host": platform.node(),
         "finished": finished,

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phyradgs_cl.errors import OutputError
-from phyradgs_cl.io import checkpoint_path, written_beside
+from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, partial_path, written_beside
+from phyradgs_cl.io.names import beside
+from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.watch.arrivals import Arrival
 
 _WORK = ".work"
@@ -41,7 +43,7 @@ class Results:
         return self.folder / _WORK / f"{scan.stem}.h5"
 
     def error(self, scan: Path) -> Path:
-        return self.folder / f"{scan.stem}.error.txt"
+        return beside(self.folder / scan.stem, ".error.txt")
 
     def is_settled(self, arrival: Arrival) -> bool:
         """Whether there is a volume, or an error about the file as it is."""
@@ -66,21 +68,21 @@ class Results:
 
     def discard(self, scan: Path) -> None:
         """Nothing is left of a run."""
-        for path in (self.work(scan), *self._checkpoints(scan)):
+        for path in (self.work(scan), partial_path(self.work(scan)), *self._checkpoints(scan)):
             path.unlink(missing_ok=True)
 
     def set_aside(self, arrival: Arrival, message: str) -> None:
         """Writes why there is no volume, with the file's size and time: it is tried again when they change."""
         self.discard(arrival.path)
-        text = f"{message}\n\nThe scan is tried again when it changes, or when this file is removed.\n{_version(arrival)}"
-        work = self.work(arrival.path).with_suffix(".txt")
+        text = f"{plain_text(message)}\n\nThe scan is tried again when it changes, or when this file is removed.\n"
+        text += _version(arrival)
+        work = beside(self.work(arrival.path), ".txt")
         with written_beside(work) as temporary:
             temporary.write_text(text, encoding="utf-8")
         os.replace(work, self.error(arrival.path))
 
     def _checkpoints(self, scan: Path) -> list[Path]:
-        path = checkpoint_path(self.work(scan))
-        return [path, path.with_name(f"{path.name}.bak")]
+        return [checkpoint_path(self.work(scan)), former_checkpoint_path(self.work(scan))]
 
 
 def _version(arrival: Arrival) -> str:

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from phyradgs_cl import checks
+from phyradgs_cl import checks, signals
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError, PhyradgsError
 from phyradgs_cl.io import checkpoint_path, only_run
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, ignore_progress
-from phyradgs_cl.reconstructors.interrupt import InterruptedAfterwards, finish_despite_interrupt
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob
 from phyradgs_cl.workflow.resumable import go_on, is_whole
@@ -147,7 +147,7 @@ class _Watch:
         job = replace(self.job.template, scan=scan, output=self.results.start(scan))
         try:
             result, metrics = go_on(job, lambda: self.rt, self.report(scan))
-        except InterruptedAfterwards:  # the run had come to its end
+        except signals.InterruptedAfterwards:  # the run had come to its end
             if self.results.work(scan).exists() and not checkpoint_path(self.results.work(scan)).exists():
                 self._publish(arrival)
             raise

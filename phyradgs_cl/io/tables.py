@@ -2,29 +2,63 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.regular import read_regular
+from phyradgs_cl.text import near_miss
 
-_LARGEST = 1e12  # of any length, angle or time that makes sense; keeps sums finite
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+LARGEST = 1e12  # of any length, angle or time that makes sense; keeps sums finite
+_MOST_TOML_BYTES = 16 << 20
+_COUNTS = {2: "two", 3: "three"}
+
+
+def read_toml(path: Path, culprit: str = "") -> dict[str, Any]:
+    """The content of a TOML file. Raises InputError, about ``culprit`` or the path, where there is none or no TOML."""
+    culprit = culprit or str(path)
+    try:
+        return tomllib.loads(read_regular(path, culprit, _MOST_TOML_BYTES, "a TOML file").decode("utf-8"))
+    except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
+        raise InputError(culprit, f"text that is not TOML ({error})", "a TOML file") from error
+
+
+def refuse_unknown(culprit: str, found: Collection[str], known: Collection[str], what: str = "a key") -> None:
+    """InputError for the first name that is not known, with the one that it nearly is."""
+    for key in found:
+        if key not in known:
+            remedy = near_miss(key, known, "remove it")
+            raise InputError(f"{culprit} {key}", f"{what} that is not known", ", ".join(known), remedy)
 
 
 class Fields:
-    """A mapping and the name to blame: values are taken out one by one, each checked."""
+    """A mapping and the name to blame: values are taken out one by one, each checked.
 
-    def __init__(self, culprit: str, values: object) -> None:
+    ``known``: the only names that it may have; None for a table that may have more than is read of it.
+    """
+
+    def __init__(self, culprit: str, values: object, known: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
             raise InputError(culprit, described(values), "a table of names and values")
+        if known is not None:
+            refuse_unknown(culprit, values, known)
         self.culprit = culprit
         self.values = values
+        self._joint = " " if known is not None or culprit.endswith(":") else "."
 
     def name(self, key: str) -> str:
         """How messages name a value of the table."""
-        return f"{self.culprit} {key}" if self.culprit.endswith(":") else f"{self.culprit}.{key}"
+        return f"{self.culprit}{self._joint}{key}"
 
     def has(self, key: str) -> bool:
         """Whether there is a value other than None."""
@@ -40,11 +74,17 @@ class Fields:
         """A required table inside this one."""
         return Fields(self.name(key), self.get(key))
 
-    def number(self, key: str, default: float | None = None) -> float:
-        """A finite number."""
+    def number(
+        self, key: str, default: float | None = None, lowest: float = -LARGEST, highest: float = LARGEST
+    ) -> float:
+        """A finite number between two bounds, both included."""
         if default is not None and not self.has(key):
             return default
-        return self._finite(key, self.get(key))
+        value = self._finite(key, self.get(key))
+        if not lowest <= value <= highest:
+            least = f"at least {lowest:g} and " if lowest > -LARGEST else ""
+            raise InputError(self.name(key), f"{value:g}", f"a number, {least}at most {highest:g}")
+        return value
 
     def length(self, key: str) -> float:
         """A number above zero."""
@@ -53,17 +93,17 @@ class Fields:
             raise InputError(self.name(key), f"{value:g}", "a number above 0")
         return value
 
-    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
-        """A list, or an array, of finite numbers (count,) float64."""
+    def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:
+        """A list, or an array, of finite numbers (count,) float64, in size at most ``largest``."""
         found = self.get(key)
         if isinstance(found, np.ndarray):
             found = found.tolist() if found.ndim == 1 else None
-        wanted = f"{count} numbers" if count is not None else "a list of numbers"
+        wanted = f"{_COUNTS.get(count, count)} numbers" if count is not None else "a list of numbers"
         if not isinstance(found, Sequence) or isinstance(found, (str, bytes)):
             raise InputError(self.name(key), described(self.get(key)), wanted)
         if count is not None and len(found) != count:
             raise InputError(self.name(key), f"{len(found)} values", wanted)
-        return np.array([self._finite(key, value) for value in found], np.float64)
+        return np.array([self._finite(key, value, largest) for value in found], np.float64)
 
     def lengths(self, key: str, count: int) -> np.ndarray:
         """(count,) numbers above zero."""
@@ -71,6 +111,13 @@ class Fields:
         if values.min() <= 0:
             raise InputError(self.name(key), str(values.tolist()), "numbers above 0")
         return values
+
+    def count(self, key: str, most: int) -> int:
+        """A whole number from 1 to ``most``."""
+        value = self.number(key)
+        if not 1 <= value <= most or value != int(value):
+            raise InputError(self.name(key), f"{value:g}", f"a whole number from 1 to {most}")
+        return int(value)
 
     def counts(self, key: str, count: int) -> tuple[int, ...]:
         """``count`` whole numbers of at least 1."""
@@ -97,12 +144,12 @@ class Fields:
             raise InputError(self.name(key), described(found), "a list with at least one entry")
         return (Fields(f"{self.name(key)}[{index}]", value) for index, value in enumerate(found))
 
-    def _finite(self, key: str, value: object) -> float:
+    def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
         if isinstance(value, np.generic):
             value = value.item()
         good = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not good or not abs(value) <= _LARGEST or not math.isfinite(value):  # type: ignore[arg-type]
-            raise InputError(self.name(key), described(value), "a finite number")
+        if not good or not abs(value) <= largest:  # type: ignore[arg-type]
+            raise InputError(self.name(key), described(value), f"a finite number of at most {largest:g}")
         return float(value)  # type: ignore[arg-type]
 
 

@@ -1,0 +1,43 @@
+"""What a circular scan sees, and grids that see less."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.fields import Grid
+
+
+def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
+    """Half sides (z, y, x) of the box about the origin that the cones of a full turn fill.
+
+    Its radius is the distance from the axis to the cone's edge ray, DSO·sin(atan(half width/DSD)), and its height that of
+    the cone behind the axis at that radius. A panel that is shifted counts with its far edge.
+    """
+    half_height_mm, half_width_mm = (
+        count * pitch / 2 + abs(offset)
+        for count, pitch, offset in zip(
+            geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True
+        )
+    )
+    half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
+    radius_mm = geometry.source_to_axis_mm * math.sin(half_fan_rad)
+    behind_mm = geometry.source_to_axis_mm + radius_mm
+    return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
+
+
+def misses(grid: Grid, geometry: ConeGeometry) -> bool:
+    """Whether no voxel of ``grid`` is in the field of view."""
+    low_mm, high_mm = grid.box_mm.T
+    half_mm = np.array(field_of_view_mm(geometry))
+    return bool(np.any((low_mm >= half_mm) | (high_mm <= -half_mm)))
+
+
+def cuts(grid: Grid, whole: Grid, geometry: ConeGeometry) -> bool:
+    """Whether ``grid`` ends, by more than a voxel, inside of what is seen of the box of ``whole``."""
+    half_mm = np.array(field_of_view_mm(geometry))
+    low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
+    begin_mm, end_mm = grid.box_mm.T
+    return bool(np.any((begin_mm - low_mm > grid.voxel_size_mm) | (high_mm - end_mm > grid.voxel_size_mm)))

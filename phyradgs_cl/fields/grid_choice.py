@@ -1,0 +1,107 @@
+"""Which voxels a volume is made on, where a scan's own are not what is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import MOST_VOXELS, Grid
+
+_LARGEST_MM = 1e9
+_ROUNDING = 1e-6  # of a voxel: a box that ends at a voxel's face ends there, whatever its decimals
+
+
+@dataclass(frozen=True)
+class GridChoice:
+    """How a volume's grid is to differ from its scan's; None leaves it as it is there, or as the others imply.
+
+    size: voxels (z, y, x), or one count: along the longest side, the others in proportion. voxel_mm: sides of a voxel
+    (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame.
+
+    Raises:
+        InputError: what is no such numbers or out of range, a box that ends before it begins, or all three.
+    """
+
+    size: int | tuple[int, ...] | None = None
+    voxel_mm: float | tuple[float, ...] | None = None
+    roi_mm: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.size is not None:
+            counts = _numbers("--size", self.size, (1, 3), "64 or 48,64,64")
+            if any(n != int(n) or not 1 <= n <= MOST_VOXELS for n in counts):
+                raise InputError("--size", checks.shown(self.size), "whole numbers of voxels, at least 1")
+            whole = tuple(int(n) for n in counts)
+            object.__setattr__(self, "size", whole if len(whole) == 3 else whole[0])
+        if self.voxel_mm is not None:
+            sides_mm = _numbers("--voxel-mm", self.voxel_mm, (1, 3), "0.5 or 1,0.5,0.5")
+            for side_mm in sides_mm:
+                checks.within("--voxel-mm", side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
+            object.__setattr__(self, "voxel_mm", sides_mm if len(sides_mm) == 3 else sides_mm * 3)
+        if self.roi_mm is not None:
+            ends_mm = _numbers("--roi-mm", self.roi_mm, (6,), "-10,10,-20,20,-20,20 (Z0,Z1,Y0,Y1,X0,X1)")
+            for end_mm in ends_mm:
+                checks.within("--roi-mm", end_mm, -_LARGEST_MM, _LARGEST_MM)
+            if any(b - a < 1 / _LARGEST_MM for a, b in zip(ends_mm[::2], ends_mm[1::2], strict=True)):
+                raise InputError("--roi-mm", checks.shown(self.roi_mm), "Z0 below Z1, Y0 below Y1, X0 below X1")
+            object.__setattr__(self, "roi_mm", ends_mm)
+        if self.size is not None and self.voxel_mm is not None and self.roi_mm is not None:
+            expected = "at most two of --size, --voxel-mm and --roi-mm, which say the third"
+            raise InputError("--size", "all three", expected, "leave one out")
+
+    def of(self, grid: Grid) -> Grid:
+        """The grid that is chosen in place of ``grid``; ``grid`` itself where nothing is.
+
+        A box alone takes the voxels of ``grid`` that it meets, continued where it goes beyond, so that the volume is a part
+        of the one on ``grid``. A size alone keeps the box; so does a voxel, with its sides rounded up to whole voxels.
+
+        Raises InputError for more voxels than anybody means.
+        """
+        box_mm = grid.box_mm if self.roi_mm is None else np.reshape(self.roi_mm, (3, 2))
+        sides_mm = box_mm[:, 1] - box_mm[:, 0]
+        if self.size is not None:
+            shape = self._counts(sides_mm / grid.voxel_size_mm)
+        elif self.voxel_mm is not None:
+            shape = np.maximum(np.ceil(sides_mm / self.voxel_mm - _ROUNDING), 1)
+        elif self.roi_mm is not None:
+            return self._cut(grid, box_mm)
+        else:
+            return grid
+        voxel_mm = sides_mm / shape if self.voxel_mm is None else self.voxel_mm
+        return Grid(self._whole(shape), tuple(voxel_mm), tuple(box_mm.mean(1)))
+
+    def _counts(self, proportion: np.ndarray) -> np.ndarray:
+        if isinstance(self.size, tuple):
+            return np.array(self.size, np.float64)
+        return np.maximum(np.round(float(self.size or 1) * proportion / proportion.max()), 1)
+
+    def _cut(self, grid: Grid, box_mm: np.ndarray) -> Grid:
+        """The voxels of ``grid``, continued beyond it, that a box (3, 2) meets."""
+        low, high = (box_mm.T - grid.box_mm[:, 0]) / grid.voxel_size_mm
+        start = np.floor(low + _ROUNDING)
+        shape = self._whole(np.maximum(np.ceil(high - _ROUNDING) - start, 1))
+        return grid.part(tuple(int(n) for n in start), shape)
+
+    def _whole(self, shape: np.ndarray) -> tuple[int, int, int]:
+        if np.prod(shape) > MOST_VOXELS:
+            culprit = "--voxel-mm" if self.voxel_mm is not None else "--size" if self.size is not None else "--roi-mm"
+            found = " × ".join(f"{n:.6g}" for n in shape)
+            raise InputError(culprit, f"a grid of {found}", f"at most {MOST_VOXELS:.3g} voxels")
+        z, y, x = (int(n) for n in shape)
+        return z, y, x
+
+
+def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
+    """A number, or a sequence of numbers, as finite numbers of which there may be so many."""
+    parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    fits = len(parts) in counts and all(isinstance(n, int | float) and not isinstance(n, bool) for n in parts)
+    if not (fits and all(abs(n) < 1e300 for n in parts)):  # false for NaN too
+        many = " or ".join(str(count) for count in counts)
+        expected = f"{many} finite numbers" if counts != (1, 3) else "a finite number, or three (z, y, x)"
+        raise InputError(option, checks.shown(value), expected, f"write for example {example}")
+    return tuple(float(n) for n in parts)

@@ -1,0 +1,48 @@
+"""How much memory a reading may take: what the file's header promises, and what this machine has."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from phyradgs_cl.io.hdf5_look.__main__ import in_use_bytes
+
+try:
+    import resource
+except ImportError:  # not POSIX
+    resource = None  # type: ignore[assignment]
+
+HOST_SHARE = 0.8
+"""Of this machine's memory: what one array may take."""
+_FREE_BYTES = 256 << 20  # that libraries map for themselves, and a thread for its heap
+_lock = threading.Lock()
+
+
+def host_bytes() -> float:
+    """This machine's memory; infinite where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return float("inf")
+
+
+@contextmanager
+def at_most(more_bytes: int) -> Iterator[None]:
+    """Whoever asks the system for more than ``more_bytes`` (and some) in the body gets none, where Linux counts.
+
+    Libraries that unfold compressed data grow their buffers until there is no memory left; here they fail in order.
+    """
+    in_use = in_use_bytes("VmSize:")
+    if resource is None or not in_use:
+        yield
+        return
+    with _lock:
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        wanted = in_use + more_bytes + _FREE_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (wanted if soft < 0 else min(wanted, soft), hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

@@ -1,0 +1,30 @@
+"""A volume on another grid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import affine_transform
+
+from phyradgs_cl.fields import Grid
+
+
+def resampled(
+    volume: NDArray[np.floating], grid: Grid, onto: Grid
+) -> tuple[NDArray[np.float32], float]:
+    """A volume (nz, ny, nx) at the voxel centres of another grid, trilinear; and the share of them that lie in its box.
+
+    Outside of its box the volume is 0; between its outermost centres and its faces it is what it is at the centres.
+    """
+    step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
+    first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
+    values = affine_transform(
+        volume.astype(np.float32, copy=False), step, first, output_shape=onto.shape, order=1, mode="nearest"
+    )
+    share = 1.0
+    for axis, (at, ratio) in enumerate(zip(first, step, strict=True)):
+        place = at + ratio * np.arange(onto.shape[axis])
+        inside = (place >= -0.5) & (place <= grid.shape[axis] - 0.5)
+        share *= float(inside.mean())
+        values *= inside.reshape([-1 if a == axis else 1 for a in range(3)])
+    return values, share

@@ -1,0 +1,22 @@
+"""Text from strangers: made fit for terminals, pages and files, and compared with what is known."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+
+# Controls but tab and line feed, which would move a terminal's cursor or end a string; half a surrogate pair, by which
+# Python stands for a byte of a name that is not UTF-8, and which nothing encodes.
+_UNFIT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def plain_text(text: str) -> str:
+    """``text`` with a replacement character for everything that not every terminal, page or file takes."""
+    return _UNFIT.sub("\ufffd", text)
+
+
+def near_miss(name: object, known: Iterable[str], otherwise: str) -> str:
+    """What to do about a name that is not known: take the one that it nearly is, or ``otherwise``."""
+    close = difflib.get_close_matches(str(name)[:200], list(known), n=1)
+    return f"did you mean {close[0]!r}?" if close else otherwise

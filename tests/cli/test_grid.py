@@ -1,0 +1,102 @@
+"""The grid of a volume, chosen on the command line: what is in the file, said, scored and refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_volume
+from phyradgs_cl.report.run import load_run
+from phyradgs_cl.workflow import load_scan
+
+TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
+INSIDE = "-0.5,0.5,-0.5,0.75,-0.75,0.5"  # of a box of ±1 mm in voxels of 0.25 mm
+SIRT = ["--method", "sirt", "--iterations", "2"]
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+@pytest.fixture(scope="module")
+def scan(cli, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scan") / "scan.h5"
+    assert cli.run(["simulate", *TINY, "-o", str(path)]) == 0
+    return path
+
+
+def test_what_is_chosen_is_in_the_result_and_told(cli, scan, tmp_path, capsys, caplog) -> None:
+    output = tmp_path / "v.h5"
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "FDK", "--size", "10,11,12"]) == 0
+    stored = read_volume(output)
+    assert stored.grid == Grid((10, 11, 12), (0.2, 2 / 11, 2 / 12)) and stored.metrics is None
+    assert stored.provenance["input"]["size"] == [10, 11, 12] and stored.provenance["method"] == "fdk"
+    with h5py.File(output) as file:
+        assert file["entry/reconstruction/x"][()] == pytest.approx(stored.grid.axes_mm()[2])
+    assert [record.getMessage() for record in caplog.records] == ["no PSNR: the scan's reference is on another grid"]
+    assert cli.run(["info", str(output)]) == 0
+    assert "{'size': [10, 11, 12], " in capsys.readouterr().out
+    run = load_run(output, scan)
+    assert run.reference is None and "another grid" in run.notes[-1]
+
+
+def test_a_part_of_the_grid_has_the_same_voxels_and_a_score(cli, scan, tmp_path, caplog) -> None:
+    whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
+    command = ["reconstruct", str(scan), "--method", "fdk"]
+    assert cli.run([*command, "-o", str(whole)]) == 0
+    assert cli.run([*command, "-o", str(part), "--roi-mm", INSIDE]) == 0
+    assert caplog.records == []
+    found, same = read_volume(part), read_volume(whole).volume[2:6, 2:7, 1:6]
+    np.testing.assert_allclose(found.volume, same, atol=1e-5 * np.abs(same).max())
+    assert found.metrics["psnr_db"] > 0
+    np.testing.assert_array_equal(load_run(part, scan).reference, load_scan(scan).reference[2:6, 2:7, 1:6])
+
+
+def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_path, caplog) -> None:
+    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), *SIRT]
+    assert cli.run([*command, "--voxel-mm", "0.5"]) == 0
+    assert not any("field of view" in record.getMessage() for record in caplog.records)
+    assert cli.run([*command, "--roi", INSIDE]) == 0
+    (line,) = [r.getMessage() for r in caplog.records if "field of view" in r.getMessage()]
+    assert "--method sirt puts what lies beyond into it" in line
+
+
+def test_a_run_does_not_go_on_with_another_grid(cli, scan, tmp_path, capfd, monkeypatch) -> None:
+    output = tmp_path / "v.h5"
+    command = ["reconstruct", str(scan), "-o", str(output), *SIRT]
+    (tmp_path / "kept").mkdir()
+    kept = tmp_path / "kept" / "checkpoint"
+    monkeypatch.setattr("phyradgs_cl.workflow.reconstruct._Keeper.__call__", _keeping(kept))
+    assert cli.run([*command, "--size", "6"]) == 0
+    os.replace(kept, f"{output}.checkpoint.npz")
+    assert cli.run([*command, "--size", "7", "--resume"]) == 2
+    assert "a run with other input.size (6, now 7)" in capfd.readouterr().err
+    assert cli.run([*command, "--size", "6", "--resume"]) == 0
+
+
+def _keeping(path: Path):
+    """A keeper's report that leaves the checkpoint of the first iteration at ``path``."""
+
+    def keep(keeper, progress) -> None:
+        if progress.iteration == 1:
+            keeper._keep(dict(progress.state()), 1)
+            os.replace(keeper.path, path)
+
+    return keep
+
+
+def test_an_estimate_is_of_the_grid_that_is_chosen(cli, scan, capsys) -> None:
+    told = []
+    for size in ("8", "24"):
+        assert cli.run(["estimate", str(scan), *SIRT, "--size", size, "--ranks", "2"]) == 0
+        told.append(capsys.readouterr().out)
+    assert told[0] != told[1]
+    assert cli.run(["estimate", str(scan), *SIRT, "--roi", INSIDE]) == 0
+    assert "time " in capsys.readouterr().out

@@ -1,0 +1,122 @@
+"""Volumes and scans in other programs' formats at the commands that read them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.api import simulate
+from phyradgs_cl.exporters import export_volume
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_scan, write_scan, write_volume
+
+FORMATS = {"v.mha": "mha", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+@pytest.fixture
+def files(rt, tmp_path) -> tuple[Path, Path, np.ndarray, Grid]:
+    """A scan with its truth, and a volume that differs from it in a known way."""
+    scan = simulate("jaw", size=12, detector=12, views=4, device=rt)
+    volume = (scan.reference + 0.01).astype(np.float32)
+    write_scan(tmp_path / "scan.h5", scan)
+    write_volume(tmp_path / "v.h5", volume, scan.grid, {"method": "fdk", "seconds": 2.5})
+    return tmp_path / "scan.h5", tmp_path / "v.h5", volume, scan.grid
+
+
+def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -> None:
+    scan, volume, *_ = files
+    answers = {}
+    for path in (volume, *(export_volume(volume, to, tmp_path / name) for name, to in FORMATS.items())):
+        assert cli.run(["evaluate", str(path), "--reference", str(scan), "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert "resampled" not in facts
+        answers[path.name] = {key: facts[key] for key in ("psnr_db", "ssim", "method") if key in facts}
+        assert (tmp_path / "v.png").exists() and not (tmp_path / "v.nii.png").exists()
+    assert answers.pop("v.h5") == {**answers["v.mha"], "method": "fdk"}
+    assert all(answer == answers["v.mha"] for answer in answers.values())
+    assert cli.run(["evaluate", str(volume), "--reference", str(tmp_path / "v.mha"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ssim"] == 1
+
+
+def test_another_grid_is_resampled_and_said_in_one_line(cli, files, tmp_path, capsys, caplog) -> None:
+    scan, _, volume, grid = files
+    dz, dy, dx = grid.voxel_size_mm
+    fine = Grid((24, 24, 24), (dz / 2, dy / 2, dx / 2), grid.offset_mm)
+    write_volume(tmp_path / "fine.h5", np.kron(volume, np.ones((2, 2, 2))), fine, {})
+    assert cli.run(["evaluate", str(tmp_path / "fine.h5"), "--reference", str(scan), "--json"]) == 0
+    (line,) = caplog.messages
+    assert "24×24×24 voxels" in line and "12×12×12 voxels" in line and "about (0, 0, 0) mm" in line
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["share_of_reference_covered"] == 1 and "24×24×24" in facts["resampled"]
+    assert cli.run(["evaluate", str(files[1]), "--reference", str(scan), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["psnr_db"] == pytest.approx(facts["psnr_db"], abs=1e-3)
+
+    half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
+    write_volume(tmp_path / "half.h5", volume[:6], half, {})
+    assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan)]) == 0
+    assert "50 % of those lie in the volume" in caplog.messages[-1]
+
+    away = replace(grid, offset_mm=(0.0, 0.0, 1e3))
+    write_volume(tmp_path / "away.h5", volume, away, {})
+    assert cli.run(["evaluate", str(tmp_path / "away.h5"), "--reference", str(scan)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "no voxel of the reference" in told and "(1000, 0, 0)" in told
+    assert not (tmp_path / "away.png").exists()
+
+
+def test_hounsfield_units_are_refused(cli, files, tmp_path, capsys) -> None:
+    path = export_volume(files[1], "nii", tmp_path / "hu.nii", 0.02)
+    assert cli.run(["evaluate", str(path), "--reference", str(files[0])]) == 2
+    assert "Hounsfield" in capsys.readouterr().err
+
+
+def test_an_export_is_scanned_like_the_volume_itself(cli, files, tmp_path) -> None:
+    made = []
+    for number, path in enumerate((files[1], export_volume(files[1], "nrrd"))):
+        out = tmp_path / f"s{number}.h5"
+        options = ["--size", "6", "--detector", "8", "--views", "3", "-o", str(out)]
+        assert cli.run(["simulate", "--volume", str(path), *options]) == 0
+        made.append(read_scan(out, lambda data, *_: (data, None)))
+    np.testing.assert_array_equal(made[0].projections, made[1].projections)
+    np.testing.assert_array_equal(made[0].reference, made[1].reference)
+    assert "v.nrrd" in made[1].title and made[0].grid == made[1].grid
+
+
+def test_info_of_an_export(cli, files, capsys) -> None:
+    assert cli.run(["info", str(export_volume(files[1], "nii"))]) == 0
+    told = capsys.readouterr().out
+    assert "volume (NIfTI)" in told and "(12, 12, 12)" in told and "voxel size mm" in told
+
+
+def foreign(folder: Path, scan: Path) -> dict[str, Path]:
+    """Scans of other programs, as far as a first look goes."""
+    nxtomo = shutil.copy(scan, folder / "other.nxs")
+    with h5py.File(nxtomo, "r+") as file:
+        del file["entry/instrument/detector/data"].attrs["quantity"]
+    with h5py.File(folder / "aps.h5", "w") as file:
+        file["exchange/data"] = np.ones((3, 4, 5), np.uint16)
+    (folder / "geometry.xml").write_text("<?xml version='1.0'?><RTKThreeDCircularGeometry/>")
+    return {"nxtomo": Path(nxtomo), "data-exchange": folder / "aps.h5", "rtk": folder / "geometry.xml"}
+
+
+@pytest.mark.parametrize("command", ["info", "reconstruct"])
+def test_scans_of_other_programs_are_sent_to_import(cli, files, tmp_path, capsys, command) -> None:
+    output = ["-o", str(tmp_path / "new.h5")] if command == "reconstruct" else []
+    for form, path in foreign(tmp_path, files[0]).items():
+        assert cli.run([command, str(path), *output]) == 2, form
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1 and f"phyradgs import {path} -o scan.h5" in told, told
+    assert cli.run([command, str(tmp_path / "none.h5"), *output]) == 2
+    assert "phyradgs import" not in capsys.readouterr().err

@@ -1,0 +1,163 @@
+"""What `export` writes is read back as it was, and so is what other programs make of it."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+import re
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import tifffile
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters import export_volume
+from phyradgs_cl.importers import foreign_volume, load_attenuation, load_volume
+from phyradgs_cl.io import read_volume
+
+NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
+
+
+@pytest.fixture
+def stored(volume_file):
+    return read_volume(volume_file)
+
+
+@pytest.fixture
+def exported(volume_file, tmp_path):
+    return lambda name, **wish: export_volume(volume_file, NAMES[name], tmp_path / name, **wish)
+
+
+def assert_same(path, stored, atol: float = 0) -> None:
+    volume, grid = load_volume(path)
+    np.testing.assert_allclose(volume, stored.volume, rtol=0, atol=atol)
+    assert volume.dtype == np.float32 and grid.is_close(stored.grid), grid
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_export_comes_back_bit_for_bit_and_in_its_place(exported, stored, name) -> None:
+    assert_same(exported(name), stored)
+    assert foreign_volume(f"{name.upper()}") and load_attenuation(exported(name)).grid is not None
+
+
+def test_a_bigtiff_has_the_same_grid(exported, stored, monkeypatch) -> None:
+    monkeypatch.setattr("phyradgs_cl.exporters.tiff._MOST_BYTES", 100)
+    path = exported("v.tif")
+    assert path.read_bytes()[:4] == b"II\x2b\x00"
+    assert_same(path, stored)
+
+
+@pytest.mark.parametrize("order", ["RAS", "LPI", "PIR", "SAL", "ARS"])
+@pytest.mark.parametrize("name", ["t.mha", "t.mhd", "t.nii", "t.nii.gz", "t.nrrd"])
+def test_itk_s_other_orders_and_directions_are_turned_upright(exported, stored, tmp_path, name, order) -> None:
+    image = sitk.DICOMOrient(sitk.ReadImage(str(exported("v.mha"))), order)
+    sitk.WriteImage(image, str(tmp_path / name), useCompression=name != "t.nii")
+    assert_same(tmp_path / name, stored)
+
+
+@pytest.mark.parametrize("forms", ["sform", "qform"])
+def test_nibabel_s_frames_types_and_scales(exported, stored, tmp_path, forms) -> None:
+    first = nibabel.as_closest_canonical(nibabel.load(exported("v.nii")))
+    image = nibabel.Nifti1Image(first.get_fdata(), first.affine)
+    image.header.set_data_dtype(np.int16)  # scl_slope, scl_inter
+    image.header.set_xyzt_units("mm")
+    image.set_sform(first.affine, code=int(forms == "sform"))
+    image.set_qform(first.affine, code=int(forms == "qform"))
+    nibabel.save(image, tmp_path / "t.nii")
+    assert_same(tmp_path / "t.nii", stored, atol=0.09 / 32767)
+
+
+def test_bare_values_have_no_grid_and_integers_are_shares(tmp_path, stored) -> None:
+    counts = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+    np.save(tmp_path / "t.npy", counts)
+    tifffile.imwrite(tmp_path / "t.tif", counts, photometric="minisblack")
+    head = "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 3 2\nencoding: gzip\n\n"
+    (tmp_path / "t.nrrd").write_bytes(head.encode() + gzip.compress(counts.tobytes()))
+    for name in ("t.npy", "t.tif", "t.nrrd"):
+        volume, grid = load_volume(tmp_path / name)
+        assert grid is None
+        np.testing.assert_allclose(volume, counts / 255, rtol=1e-6)
+
+
+def replaced(old: str, new: str):
+    return lambda data: re.sub(old.encode("latin-1"), new.encode("latin-1"), data, count=1)
+
+
+def field(offset: int, kind: str, value: float):
+    """A NIfTI header with one number changed."""
+    word = np.array(value, kind).tobytes()
+    return lambda data: data[:offset] + word + data[offset + len(word) :]
+
+
+WRONG = {
+    "a cut file": ("v.mha", lambda data: data[:-1], "DimSize|bytes"),
+    "too many voxels": ("v.mha", replaced("DimSize = 7", "DimSize = 70000000"), "bytes of data"),
+    "an oblique image": (
+        "v.mha",
+        replaced("TransformMatrix = 1 0 0 0 1 0", "TransformMatrix = 0.8 0.6 0 -0.6 0.8 0"),
+        "along the world's",
+    ),
+    "no length of a voxel": ("v.mha", replaced("ElementSpacing = 1", "ElementSpacing = -1"), "ElementSpacing"),
+    "a place in another galaxy": ("v.mha", replaced("Offset = -?[0-9.]+", "Offset = 1e11"), "origin"),
+    "no NIfTI": ("v.nii", lambda data: b"\0" * 400, "NIfTI-1"),
+    "a cut NIfTI": ("v.nii", lambda data: data[:-4], "bytes"),
+    "a huge NIfTI": ("v.nii", field(42, "<i2", 32000), "bytes of data"),
+    "four axes": ("v.nii", lambda data: field(48, "<i2", 9)(field(40, "<i2", 4)(data)), "three axes"),
+    "colours": ("v.nii", field(70, "<i2", 128), "datatype"),
+    "voxels nowhere": ("v.nii", field(108, "<f4", np.nan), "vox_offset"),
+    "steps that are no numbers": ("v.nii", field(280, "<f4", np.nan), "v.nii"),
+    "a cut stream": ("v.nii.gz", lambda data: data[: len(data) // 2], "v.nii.gz"),
+    "another encoding": ("v.nrrd", replaced("encoding: raw", "encoding: bzip2"), "encoding"),
+    "data elsewhere": ("v.nrrd", replaced("endian: little", "data file: /etc/passwd"), "data file"),
+    "another space": ("v.nrrd", replaced("left-posterior-superior", "scanner-xyz"), "space"),
+    "a NRRD in furlongs": ("v.nrrd", replaced('"mm" "mm" "mm"', '"furlong"'), "space units"),
+    "a huge NRRD": ("v.nrrd", replaced("sizes: 7", "sizes: 7000000"), "bytes of data"),
+    "a NaN": ("v.nrrd", lambda data: data[:-4] + np.float32(np.nan).tobytes(), "NaN"),
+    "no array": ("v.npy", lambda data: b"\x80\x04K\x01.", r"\.npy"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_file_is_one_line(exported, case) -> None:
+    name, damage, words = WRONG[case]
+    path = exported(name)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(InputError, match=words) as caught:
+        load_volume(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_grid_beside_an_array_must_be_its_own(exported) -> None:
+    path = exported("v.npy")
+    good = json.loads(path.with_suffix(".json").read_text())
+    for key, value in (("shape", [1, 2, 3]), ("voxel_size_mm", [1, 2, "x"]), ("first_centre_mm", 5)):
+        path.with_suffix(".json").write_text(json.dumps({**good, key: value}))
+        with pytest.raises(InputError, match=rf"json.*{'shape' if key == 'shape' else key}"):
+            load_volume(path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hounsfield_units_are_not_taken_for_attenuation(exported, name) -> None:
+    with pytest.raises(InputError, match="Hounsfield.*--mu-water-per-mm"):
+        load_volume(exported(name, mu_water_per_mm=0.02))
+
+
+@pytest.mark.filterwarnings("ignore")  # of NumPy about casts of absurd numbers
+@pytest.mark.parametrize("name", NAMES)
+def test_random_damage_is_a_volume_or_one_line(exported, name) -> None:
+    path, rng = exported(name), random.Random(len(name))
+    good, refused = path.read_bytes(), 0
+    for _ in range(60):
+        data = bytearray(good)
+        for _ in range(rng.choice((1, 2, 8))):
+            data[rng.randrange(min(len(data), 600))] = rng.randrange(256)
+        path.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
+        try:
+            load_volume(path)
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 20

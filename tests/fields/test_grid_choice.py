@@ -1,0 +1,75 @@
+"""Grids that are chosen: what size, voxel and box mean alone and together, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid, GridChoice
+
+GRID = Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0))  # z −4 to 6, y −8 to 12, x −37 to 43
+BOX = (-2.0, 2.0, -4.0, 4.0, 0.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("choice", "shape", "voxel_mm", "offset_mm"),
+    [
+        ({}, (10, 20, 40), (1, 1, 2), (1, 2, 3)),
+        ({"size": 20}, (5, 10, 20), (2, 2, 4), (1, 2, 3)),  # along the longest side, in proportion
+        ({"size": [20]}, (5, 10, 20), (2, 2, 4), (1, 2, 3)),
+        ({"size": (5, 20, 80.0)}, (5, 20, 80), (2, 1, 1), (1, 2, 3)),
+        ({"size": 1}, (1, 1, 1), (10, 20, 80), (1, 2, 3)),
+        ({"voxel_mm": 3}, (4, 7, 27), (3, 3, 3), (1, 2, 3)),  # whole voxels, about the same centre
+        ({"voxel_mm": [0.1, 0.5, 100]}, (100, 40, 1), (0.1, 0.5, 100), (1, 2, 3)),
+        ({"size": (3, 4, 5), "voxel_mm": 0.7}, (3, 4, 5), (0.7, 0.7, 0.7), (1, 2, 3)),
+        ({"size": 20, "voxel_mm": 1}, (5, 10, 20), (1, 1, 1), (1, 2, 3)),
+        ({"roi_mm": (-2, 2, -3.5, 4, 0, 4)}, (4, 8, 3), (1, 1, 2), (0, 0, 2)),  # the grid's own voxels: x −1 to 5
+        ({"roi_mm": (-6, 2, -4, 4, 0.5, 0.6)}, (8, 8, 1), (1, 1, 2), (-2, 0, 0)),  # and beyond it
+        ({"roi_mm": BOX, "voxel_mm": 1.5}, (3, 6, 3), (1.5, 1.5, 1.5), (0, 0, 2)),
+        ({"roi_mm": BOX, "size": 4}, (2, 4, 1), (2, 2, 4), (0, 0, 2)),
+        ({"roi_mm": BOX, "size": (8, 8, 8)}, (8, 8, 8), (0.5, 1, 0.5), (0, 0, 2)),
+    ],
+)
+def test_what_is_chosen(choice, shape, voxel_mm, offset_mm) -> None:
+    found = GridChoice(**choice).of(GRID)
+    assert found.shape == shape
+    assert found.voxel_size_mm == pytest.approx(voxel_mm) and found.offset_mm == pytest.approx(offset_mm)
+    again = GridChoice(**choice).of(found)
+    assert again.shape == shape and again.offset_mm == pytest.approx(found.offset_mm, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("choice", "error"),
+    [
+        ({"size": 0}, "--size: found 0"),
+        ({"size": -4}, "--size"),
+        ({"size": 2.5}, "--size: found 2.5"),
+        ({"size": True}, "--size: found True"),
+        ({"size": (4, 5)}, "--size: found .*three"),
+        ({"size": "large"}, "--size: found 'large'"),
+        ({"size": 10**400}, "--size"),
+        ({"size": 1e6}, "--size: found a grid of"),
+        ({"size": float("nan")}, "--size: found nan"),
+        ({"voxel_mm": 0}, "--voxel-mm: found 0.0"),
+        ({"voxel_mm": (1, -1, 1)}, "--voxel-mm: found -1.0"),
+        ({"voxel_mm": float("inf")}, "--voxel-mm: found inf"),
+        ({"voxel_mm": 1e-8}, "--voxel-mm: found a grid of"),
+        ({"roi_mm": BOX[:5]}, "--roi-mm: found .*6 finite numbers"),
+        ({"roi_mm": 3}, "--roi-mm"),
+        ({"roi_mm": (2, -2, -4, 4, 0, 4)}, "--roi-mm: found .*Z0 below Z1"),
+        ({"roi_mm": (0, 0, -4, 4, 0, 4)}, "--roi-mm"),
+        ({"roi_mm": (-1e12, 2, -4, 4, 0, 4)}, "--roi-mm: found -1000000000000.0"),
+        ({"roi_mm": (-1e6, 1e6, -1e6, 1e6, 0, 4)}, "--roi-mm: found a grid of"),
+        ({"roi_mm": BOX, "size": 4, "voxel_mm": 1}, "--size: found all three"),
+    ],
+)
+def test_what_is_refused(choice, error) -> None:
+    with pytest.raises(InputError, match=error):
+        GridChoice(**choice).of(GRID)
+
+
+def test_a_part_of_a_grid_knows_its_place() -> None:
+    part = GRID.part((1, 2, 3), (4, 5, 6))
+    assert part.start_in(GRID) == (1, 2, 3) and GRID.start_in(GRID) == (0, 0, 0)
+    for other in (GRID, GRID.scaled(1.1), Grid(part.shape, part.voxel_size_mm, (1.2, 2.0, 3.0))):
+        assert other.start_in(part) is None

@@ -1,0 +1,97 @@
+"""Names that no program's author thought of: bytes that are no UTF-8, as long as a file system allows, a NUL in a title."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import checkpoint_path, read_volume, write_scan
+from phyradgs_cl.io.names import beside, shortened
+from phyradgs_cl.text import plain_text
+from phyradgs_cl.workflow.files import load_scan
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
+BAD = os.fsdecode(b"bad\xff")
+FAST = ["--method", "sirt", "--iterations", "2"]
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+def test_text_is_made_fit_to_be_shown() -> None:
+    assert plain_text("µ\tm\n\x1b[2J\0\udcff\x85") == "µ\tm\n\ufffd[2J\ufffd\ufffd\ufffd"
+    assert str(InputError(f"{BAD}.h5", "a\x1b")) == "bad\ufffd.h5: found a\ufffd"
+
+
+def test_names_beside_a_name_fit_a_file_system() -> None:
+    for stem in ("v", "v" * 240, "v" * 255, "ü" * 120, BAD + "ü" * 100, "v" * 254 + "w"):
+        names = {beside(f"folder/{stem}", ending).name for ending in (".checkpoint.npz", ".lock", ".error.txt")}
+        assert len(names) == 3 and all(len(os.fsencode(name)) <= 255 for name in names)
+    assert beside("a/v.h5", ".lock", ".") == Path("a/.v.h5.lock") and checkpoint_path("v.h5").name == "v.h5.checkpoint.npz"
+    assert shortened("v" * 300, 80) != shortened("v" * 299 + "w", 80)
+
+
+@pytest.mark.parametrize("stem", [BAD, "v" * 240, "v" * 252, "ä" * 126], ids=["bytes", "243", "255", "umlauts"])
+def test_a_scan_and_a_volume_of_that_name(tiny_scan, tmp_path, cli, stem, capfd) -> None:
+    scan, output = tmp_path / f"{stem}.h5", tmp_path / "out" / f"{stem}.h5"
+    output.parent.mkdir()
+    shutil.copy(tiny_scan, scan)
+    config, picture = (tmp_path / f"{stem[:100]}{suffix}" for suffix in (".toml", ".png"))
+    config.write_text("iterations = 1\n")
+    words = ["reconstruct", str(scan), *FAST, "--config", str(config), "-o", str(output)]
+    assert cli.run([*words, "--preview", str(picture), "--checkpoint-every", "0.000001"]) == 0
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert cli.run(["info", str(output)]) == 0
+    assert cli.run(["report", str(output), "-o", str(tmp_path / "page.html"), "--views", "0"]) == 0
+    assert read_volume(output).provenance["scan"] == str(scan)
+    assert sorted(output.parent.iterdir()) == [output]
+    assert "was not found" not in (tmp_path / "page.html").read_text()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_watch_makes_volumes_of_all_and_sets_aside_what_fails(tiny_scan, tmp_path, cli, capfd) -> None:
+    incoming, out = tmp_path / "in", tmp_path / "out"
+    incoming.mkdir()
+    for stem in (BAD, "v" * 252):
+        shutil.copy(tiny_scan, incoming / f"{stem}.h5")
+    for stem in (f"broken{BAD}", "w" * 252):
+        (incoming / f"{stem}.h5").write_bytes(b"no scan")
+    words = ["watch", str(incoming), "-o", str(out), "--once", "--settle-s", "0", "--poll-s", "0.05", *FAST]
+    assert cli.run(words) == 0
+    volumes, errors = sorted(out.glob("*.h5")), sorted(out.glob("*.error.txt"))
+    assert [path.stem for path in volumes] == [BAD, "v" * 252] and len(errors) == 2
+    assert all("not HDF5" in path.read_text(encoding="utf-8") for path in errors)
+    assert cli.run(words) == 0  # all is settled
+    assert capfd.readouterr().err.count("set aside") == 2
+
+
+def test_a_sweep_over_such_scans_is_made_once(tiny_scan, tmp_path, cli, capfd) -> None:
+    for stem in (BAD, os.fsdecode(b"bad\xfe"), "v" * 252, "ä" * 100):
+        shutil.copy(tiny_scan, tmp_path / f"{stem}.h5")
+    (tmp_path / "grid.toml").write_text('scans = ["*.h5"]\n[[runs]]\nmethod = "sirt"\niterations = 1\n')
+    words = ["sweep", str(tmp_path / "grid.toml"), "-o", str(tmp_path / "out"), "--device", "cpu"]
+    for _ in range(2):
+        assert cli.run(words) == 0
+        lines = [json.loads(line) for line in (tmp_path / "out/results.jsonl").read_text().splitlines()]
+        assert len(lines) == 4 and not any("error" in line for line in lines)
+    assert "\ufffd" in (tmp_path / "out/results.csv").read_text(encoding="utf-8")
+
+
+def test_a_title_with_a_nul_is_written_and_comes_back(tiny_scan, tmp_path) -> None:
+    from dataclasses import replace
+
+    scan = replace(load_scan(tiny_scan), title="a\0b\udcff", provenance={"imported_from": BAD})
+    write_scan(tmp_path / "scan.h5", scan)
+    again = load_scan(tmp_path / "scan.h5")
+    assert again.title == "a\ufffdb\ufffd" and again.provenance["imported_from"] == BAD
+    assert np.array_equal(again.projections, scan.projections)

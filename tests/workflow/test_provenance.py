@@ -1,0 +1,145 @@
+"""Provenance and results lines are edited, damaged or made up: what is not of its kind is left out, in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.__main__ import load_cli
+from phyradgs_cl.bench import results as bench_results
+from phyradgs_cl.io import read_volume, write_volume
+from phyradgs_cl.io.facts import PROVENANCE, read_facts
+from phyradgs_cl.io.json_lines import read_lines
+from phyradgs_cl.settings import read_config
+from phyradgs_cl.workflow.files import load_scan
+from phyradgs_cl.workflow.sweep import RESULTS, plan_sweep, read_grid
+from phyradgs_cl.workflow.sweep.plan import is_sound
+from phyradgs_cl.workflow.sweep.tables import write_tables
+
+DEEP = json.loads("[" * 400 + "]" * 400)
+ABSURD = {
+    "half a surrogate pair": "x\udcff\ud800",
+    "a control": "x\x1b[2J\0",
+    "a list": ["x", 1],
+    "a table": {"a": {"b": 1}},
+    "a truth value": True,
+    "400 digits": 10**399,
+    "beyond floats": 1e308,
+    "NaN": float("nan"),
+    "negative": -1,
+    "deep": DEEP,
+    "long": "x" * 3_000_000,
+    "nothing": None,
+}
+FIELDS = ("method", "scan", "scan_sha256", "seconds", "gaussians", "record", "options", "input", "segments")
+FIELDS += ("program", "interrupted_at", "unheard_of")
+
+
+@pytest.fixture(scope="module")
+def files(tiny_scan: Path) -> tuple[Path, Path]:
+    """A scan and a volume of it."""
+    scan, volume = load_scan(tiny_scan), tiny_scan.with_name("volume.h5")
+    write_volume(volume, 0.9 * scan.reference, scan.grid, {"method": "fdk"}, metrics={"ssim": 0.5})
+    return tiny_scan, volume
+
+
+@pytest.fixture(scope="module")
+def cli():
+    return load_cli()
+
+
+def written(path: Path, target: Path, provenance: str, metrics: str = "{}") -> Path:
+    """The volume with other facts, as text."""
+    shutil.copy(path, target)
+    with h5py.File(target, "r+") as file:
+        for name, text in (("provenance", provenance), ("metrics", metrics)):
+            group = file.require_group(f"entry/{name}")
+            group.pop("json", None)
+            group["json"] = text
+    return target
+
+
+@pytest.mark.parametrize("case", ABSURD)
+def test_every_field_may_be_absurd(files, tmp_path, cli, case, capsys, caplog) -> None:
+    """In all fields at once, for report, info and evaluate: they end well, or in one line."""
+    scan, volume = files
+    facts = dict.fromkeys(FIELDS, ABSURD[case])
+    facts["options"] = {"motion": {"name": ABSURD[case], "strips": ABSURD[case]}} if case != "deep" else DEEP
+    text = json.dumps(facts)
+    bad = written(volume, tmp_path / "v.h5", text, json.dumps({"psnr_db": ABSURD[case], "ssim": 1.0}))
+    for command in (
+        ["info", str(bad)],
+        ["report", str(bad), "-o", str(tmp_path / "page.html"), "--views", "0", "--scan", str(scan)],
+        ["evaluate", str(bad), "--reference", str(scan)],
+    ):
+        assert cli.run(command) == 0, f"{case}: {command}"
+    out = capsys.readouterr().out
+    assert len(out) < 50_000 and "\x1b" not in out and "\0" not in out
+    assert "\x1b" not in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_damage_costs_a_field_and_is_told(files, tmp_path, caplog) -> None:
+    facts = {"method": ["fdk"], "seconds": "many", "gaussians": 10**400, "seed": 3, "loss": float("inf")}
+    stored = read_volume(written(files[1], tmp_path / "v.h5", json.dumps(facts), '{"psnr_db": "x", "ssim": 0.5}'))
+    assert stored.provenance == {"seed": 3, "loss": float("inf")} and stored.metrics == {"ssim": 0.5}
+    for name in ("method", "seconds", "gaussians", "psnr_db"):
+        assert any(name in record.getMessage() for record in caplog.records)
+
+
+def test_text_that_is_no_table_is_refused() -> None:
+    for text in ("[1]", "{", "[" * 100_000, "1" * 5000, '{"a": ' + "[" * 2000 + "]" * 2000 + "}"):
+        with pytest.raises(Exception, match="JSON") as caught:
+            read_facts("a file", text, PROVENANCE)
+        assert type(caught.value).__name__ == "InputError"
+
+
+# --- lines of results -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plan(files, tmp_path):
+    shutil.copy(files[0], tmp_path / "a.h5")
+    path = tmp_path / "grid.toml"
+    path.write_text('scans = ["a.h5"]\nseeds = [0, 1]\n[[runs]]\nmethod = "fdk"\n')
+    return plan_sweep(read_grid(read_config(path, "GRID"), path), tmp_path / "out")
+
+
+def test_a_sweep_s_lines_of_another_type_are_left_out(plan, tmp_path, caplog) -> None:
+    good = {**plan[1].facts, "metrics": {"psnr_db": 30.0, "ssim": None}, "seconds": 1.5}
+    for name in ("run", "scan", "label", "metrics", "seconds", "input", "changes", "error", "device", "volume"):
+        for case, value in ABSURD.items():
+            bad = {**plan[0].facts, "metrics": {"psnr_db": 20.0}, "seconds": 1.0, name: value}
+            (tmp_path / RESULTS).write_text(f"{json.dumps(bad)}\n{json.dumps(good)}\n")
+            lines = read_lines(tmp_path / RESULTS, is_sound)
+            assert good in lines, (name, case)
+            write_tables(tmp_path, lines, plan)
+
+
+def test_a_benchmark_s_lines_of_another_type_are_left_out(tmp_path) -> None:
+    words = ("study", "volume", "run", "acquisition", "protocol", "axis", "device", "platform")
+    good = dict.fromkeys((*words, "version", "python", "numpy"), "a")
+    good |= dict.fromkeys(("voxels", "pixels", "seed", "views"), 3) | {"metrics": {"psnr_db": 1.0}}
+    for name in (*good, "seconds", "source", "options"):
+        for case in ("a list", "400 digits", "deep", "long", "a truth value", "NaN"):
+            (tmp_path / RESULTS).write_text(f"{json.dumps({**good, name: ABSURD[case]})}\n{json.dumps(good)}\n")
+            lines = bench_results.read_lines(tmp_path / RESULTS)
+            assert lines[-1] == good
+            if name != "source" or case not in ("a truth value", "NaN"):
+                assert len(lines) == 1, (name, case)
+
+
+def test_a_scan_that_provenance_names_may_be_any_file(tmp_path, cli, files) -> None:
+    """The kernel's log never ends, and /proc/kcore is as large as all memory that there could be."""
+    stored = read_volume(files[1])
+    empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    for named in ("/proc/kmsg", "/proc/kcore", "/dev/zero", "/", "\0", "x" * 5000, "\ud800"):
+        facts = {"method": "fdk", "scan": named, "scan_sha256": empty}
+        write_volume(tmp_path / "v.h5", stored.volume, stored.grid, {"method": "fdk"})
+        written(tmp_path / "v.h5", tmp_path / "w.h5", json.dumps(facts))
+        assert cli.run(["report", str(tmp_path / "w.h5"), "-o", str(tmp_path / "page.html")]) == 0
+    assert np.all(read_volume(tmp_path / "w.h5").volume == stored.volume)
