@@ -37,11 +37,11 @@ from phyradgs_cl.operators import (
     backproject_lines,
     voxelise,
 )
-from phyradgs_cl.operators.layout import pad_rows, pitch_of, unpad_rows
 from phyradgs_cl.operators.voxelise import Voxeliser
 from phyradgs_cl.optim import DeviceAdam
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
 SHAPE = (61, 70)
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 61, 4.1 / 70), (0.1, 0.2))

@@ -15,14 +15,14 @@ import numpy as np
 from measuring import Facts, finish, median, parser_of, where
 from splat_speed import fly_scan
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Scan, Static
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splat_run import SplatRun
 from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 
-MOTIONS = {"static": Motion("static"), "8x5": Motion("micro-views", 8, 5), "exact": Motion("exact")}
+MOTIONS = {"static": Static(), "8x5": MicroViews(8, 5), "exact": Exact()}
 STAGES = {
     "prepare": ("splat_prepare",),
     "binning": ("bin_count", "bin_within", "bin_starts", "bin_fill"),  # the sub-volume of TV is binned too
@@ -63,7 +63,7 @@ def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
 def control_ms(run: SplatRun) -> float:
     """One round of density control, which leaves the run with another cloud."""
     started = time.perf_counter()
-    run._control_density()
+    run.control_density()
     run.rt.finish()
     return 1e3 * (time.perf_counter() - started)
 

@@ -23,12 +23,11 @@ from pathlib import Path
 import numpy as np
 from scans import append, files_of, make_scan, read_lines
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splatting import SplatRun, first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -157,9 +156,7 @@ def foot_scan(rt: Runtime, size: int) -> Scan:
 
 def fresh_run(rt: Runtime, scan: Scan, name: str) -> SplatRun:
     """A reconstruction after its first 200 iterations, from where its cost hardly changes."""
-    told = motion_of(name)
-    motion = Motion(str(told.pop("motion")), **told)  # type: ignore[arg-type]
-    options = SplatOptions(motion=motion)
+    options = method_options("phyradgs", None, motion_of(name))
     fdk = static_fdk(rt, scan)
     scale = internal_scale(fdk, scan.grid)
     grid, rng = scan.grid.scaled(1 / scale.length_mm), np.random.default_rng(0)

@@ -36,7 +36,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.parallel import launched_ranks
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import splat_shared
+from phyradgs_cl.reconstructors import splat_ranks
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splat_run import SplatRun
@@ -123,13 +123,13 @@ class Clock:
 def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
     """(steps, parts) milliseconds of this rank, and bytes that it hands over in a step."""
     ranks, clock = run.rt.ranks, Clock(run.rt)
-    summing = clock.part(splat_shared.exact_sum, "summing")
+    summing = clock.part(splat_ranks.exact_sum, "summing")
 
     def together(*arguments: object) -> np.ndarray:
         clock.wait()
         return summing(*arguments)
 
-    splat_shared.exact_sum = together  # type: ignore[assignment]
+    splat_ranks.exact_sum = together  # type: ignore[assignment]
     for name in ("add", "largest"):
         setattr(ranks, name, clock.part(getattr(ranks, name), "sending"))
     rows = [clock.step(run) for _ in range(WARM)]
@@ -146,7 +146,7 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
     everyone = ranks.join(rows[None])
     if ranks.rank == 0:
         facts = {
-            "gaussians": run.count,
+            "gaussians": run.cloud.count,
             "batch": batch,
             "ranks": ranks.size,
             "bytes_a_step": nbytes,

@@ -20,8 +20,8 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, 
 from phyradgs_cl.acquisition.cells import static_cells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
 GAUSSIANS, PIXELS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 500_000), (128, 256, 512, 1024)
 FIXED_GAUSSIANS, FIXED_PIXELS, VOXELS = 50_000, 256, 128

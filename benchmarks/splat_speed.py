@@ -17,17 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, MicroViews, Scan, Static, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splatting import SplatRun, first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
-MOTIONS = {"static": Motion("static"), "micro-views 8x5": Motion("micro-views", 8, 5)}
+MOTIONS = {"static": Static(), "micro-views 8x5": MicroViews(8, 5)}
 
 
 def cloud(count: int, detector: int, rng: np.random.Generator) -> np.ndarray:

@@ -32,10 +32,10 @@ from phyradgs_cl.acquisition.cells import (
 )
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.operators.twins.splat import precision_matrices
 from phyradgs_cl.reconstructors.initial_cloud import initial_cloud
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 from phyradgs_cl.simulation import phantom_scene
 
 MICRO_VIEWS = ((8, 5), (16, 5), (16, 15))

@@ -12,7 +12,7 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, make_protocol, pixel_centres
-from phyradgs_cl.acquisition.cells import TimeCells, finer_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
 from phyradgs_cl.errors import InputError, NumericalError
@@ -253,7 +253,7 @@ class PixelAreaSource:
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
         n = self._samples
-        fine = self._finer.frame(finer_cells(cells, n), model, factor)
+        fine = self._finer.frame(cells.finer(n), model, factor)
         rows, columns = fine.shape[0] // n, fine.shape[1] // n
         rays = fine.reshape(rows, n, columns, n).transpose(1, 3, 0, 2).reshape(n * n, rows, columns)
         return average(rays, np.full(n * n, 1 / n**2), model).astype(np.float32)
@@ -390,7 +390,7 @@ def _recorded(
 ) -> np.ndarray:
     """What the panel shows of frames (F, v, u): light, noise and lag; lines without light are 0 (and masked)."""
     share = shutter.lit_share(shutter.lines(frames.shape[1:]))
-    share = share[:, None] if shutter.axis == "rows" else share
+    share = shutter.readout.spread(share)
     recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
     return recorded if np.all(share > 0) else recorded * (share > 0)
 

@@ -124,16 +124,7 @@ ITERATIVE_TWIN = (
 KRYLOV = 1e-3  # relative, of CGLS against LSQR: float32 directions lose orthogonality
 CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum
 
-# Ranks: parts of a float32 sum are rounded before they are added, a few times 2^-24; measured 1e-7 to 4e-7.
+# Frames' gradients are rounded to float32 before they are added, a few times 2^-24; measured 1e-7 to 4e-7.
 RANK_GRADIENT = 1e-6
-# Where ranks draw parts of a cloud the image itself is rounded in another way, and what is left of it less the measurement
-# is a tenth of it or less; measured up to 3.4e-6.
-DOMAIN_GRADIENT = 1e-5
 # Voxel methods on several ranks, which add up their own frames first; measured up to 7e-7 after 8 iterations.
 RANK_VOLUME = 1e-5
-# A volume of Gaussians by domain against the undivided run's, of its largest voxel: measured up to 4e-6, but for voxels on
-# the very edge of a Gaussian's cutoff, which in one run lie inside and in the other outside. Those jump by at most 0.1 % of
-# that Gaussian's density, exp(-3.7^2 / 2); measured one in 4096.
-DOMAIN_VOLUME = 1e-5
-DOMAIN_JUMP = 1.1e-3
-DOMAIN_JUMPS = 1e-3  # share of the voxels

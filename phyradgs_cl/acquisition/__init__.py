@@ -2,7 +2,16 @@
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import ConeGeometry, pixel_centres, transpose_pose
-from phyradgs_cl.acquisition.motion import MOTIONS, Motion
+from phyradgs_cl.acquisition.motion import (
+    MOTIONS,
+    Exact,
+    LineMiddles,
+    MicroViews,
+    Motion,
+    PerRow,
+    Static,
+    StaticStart,
+)
 from phyradgs_cl.acquisition.protocol import PROTOCOLS, Protocol, make_protocol
 from phyradgs_cl.acquisition.scan import Saturation, Scan
 from phyradgs_cl.acquisition.shutter import Shutter
@@ -22,14 +31,20 @@ __all__ = [
     "ConeGeometry",
     "ConstantSpeed",
     "EncoderTable",
+    "Exact",
     "FrameSweeps",
+    "LineMiddles",
+    "MicroViews",
     "Motion",
+    "PerRow",
     "PoseTable",
     "Protocol",
     "Saturation",
     "Scan",
     "Shutter",
     "SpeedRamp",
+    "Static",
+    "StaticStart",
     "TimeCells",
     "make_protocol",
     "pixel_centres",

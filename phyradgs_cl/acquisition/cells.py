@@ -7,9 +7,11 @@ times the projection from the cell's pose. Weights of a line sum to 1. The build
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
@@ -58,37 +60,91 @@ class TimeCells:
             total[start:stop] += weight
         return total
 
+    @property
+    def readout(self) -> Readout:
+        """How frames and poses turn to lines first."""
+        return Readout(self.axis)
 
-def finer_cells(table: TimeCells, factor: int) -> TimeCells:
-    """The same still cells for a panel whose pixels are cut into ``factor`` by ``factor``; cut lines share their times."""
-    pose = table.pose.copy()
-    pose[:, 6:] /= factor
-    pose[:, 3:6] -= (factor - 1) / 2 * (pose[:, 6:9] + pose[:, 9:12])
-    lines = {name: getattr(table, name) * factor for name in ("line_start", "line_stop", "lines")}
-    return replace(table, pose=pose, **lines)
+    @property
+    def is_moving(self) -> bool:
+        """Whether poses change within a cell, as splats can follow."""
+        return self.end_poses is not None
 
+    @property
+    def averages(self) -> bool:
+        """Whether a line has more than one cell."""
+        return bool(self.layer_numbers.any())
 
-def layer_numbers(table: TimeCells) -> np.ndarray:
-    """A number (C,) for every cell, so that no line has two cells of one number; as few numbers as its busiest line has."""
-    numbers = np.zeros(table.count, np.int64)
-    free_from: list[int] = []
-    for cell, (start, stop) in enumerate(zip(table.line_start, table.line_stop, strict=True)):
-        layer = next((k for k, line in enumerate(free_from) if line <= start), len(free_from))
-        if layer == len(free_from):
-            free_from.append(0)
-        numbers[cell] = layer
-        free_from[layer] = int(stop)
-    return numbers
+    def scaled(self, factor: float) -> TimeCells:
+        """The same cells with all lengths multiplied by ``factor``."""
+        ends = None if self.end_poses is None else self.end_poses * factor
+        return replace(self, pose=self.pose * factor, end_poses=ends)
 
+    def finer(self, factor: int) -> TimeCells:
+        """The same still cells for a panel with pixels cut into ``factor`` by ``factor``; cut lines share their times."""
+        pose = self.pose.copy()
+        pose[:, 6:] /= factor
+        pose[:, 3:6] -= (factor - 1) / 2 * (pose[:, 6:9] + pose[:, 9:12])
+        lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
+        return replace(self, pose=pose, **lines)
 
-def layer_weights(table: TimeCells, numbers: np.ndarray) -> np.ndarray:
-    """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``, 0 where it has none."""
-    weights = np.zeros((int(numbers.max(initial=-1)) + 1, table.lines))
-    for cell, layer in enumerate(numbers):
-        lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
-        share = 1.0 if table.line_times is None else table.line_times[cell, 2, lines]
-        weights[layer, lines] = table.weight[cell] * share
-    return weights
+    def still(self) -> TimeCells:
+        """These cells, for operators without motion within a cell; InputError where there is some."""
+        if self.is_moving:
+            remedy = "take --motion per-row"
+            raise InputError("--motion", "cells with motion", "still cells: only splats move", remedy)
+        return self
+
+    def line_poses(self) -> np.ndarray:
+        """Poses (lines, 12) in the middle of each line's exposure, of the cell that is nearest to it; (1, 12) of one cell.
+
+        Raises InputError for a line without a cell.
+        """
+        if self.count == 1:
+            return self.pose
+        lengths = self.line_stop - self.line_start
+        cell = np.repeat(np.arange(self.count), lengths)
+        line = np.arange(cell.size) + np.repeat(self.line_start - (np.cumsum(lengths) - lengths), lengths)
+        order = np.lexsort((self.time_s[cell], line))
+        cell, line = cell[order], line[order]
+        weight = self.weight[cell]
+        total = np.bincount(line, weight, self.lines)
+        past = np.cumsum(weight) - weight / 2 - (np.cumsum(total) - total)[line]
+        nearest = np.lexsort((np.abs(past - total[line] / 2), line))
+        served, first = np.unique(line[nearest], return_index=True)
+        if served.size < self.lines:
+            raise InputError("--motion", "a line without a time cell", "weights of every line that sum to 1")
+        return self.pose[cell[nearest[first]]]
+
+    def line_cells(self) -> np.ndarray:
+        """Per line the range (lines, 2) [first, stop) of cells outside of which none serves it; inside some may not."""
+        line = np.arange(self.lines)
+        first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
+        stop = np.searchsorted(self.line_start, line, side="right")
+        return np.stack([first, stop], -1)
+
+    @cached_property
+    def layer_numbers(self) -> np.ndarray:
+        """A number (C,) for every cell, so that no line has two of one number; as few as its busiest line has cells."""
+        numbers = np.zeros(self.count, np.int64)
+        free_from: list[int] = []
+        for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):
+            layer = next((k for k, line in enumerate(free_from) if line <= start), len(free_from))
+            if layer == len(free_from):
+                free_from.append(0)
+            numbers[cell] = layer
+            free_from[layer] = int(stop)
+        return numbers
+
+    @cached_property
+    def layer_weights(self) -> np.ndarray:
+        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``, 0 where it has none."""
+        weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
+        for cell, layer in enumerate(self.layer_numbers):
+            lines = slice(int(self.line_start[cell]), int(self.line_stop[cell]))
+            share = 1.0 if self.line_times is None else self.line_times[cell, 2, lines]
+            weights[layer, lines] = self.weight[cell] * share
+        return weights
 
 
 def static_cells(

@@ -1,8 +1,15 @@
-"""Motion models: how a reconstruction turns a frame of a scan into time cells."""
+"""Motion models: how a reconstruction turns a frame of a scan into time cells.
+
+A model is a small frozen class with ``cells(scan, frame)``; a class of your own works in every method (docs/methods.md). A
+scan that is not a fly-scan has one pose per frame in every model here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any
+from typing import Protocol as Interface
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
@@ -10,45 +17,152 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.errors import InputError
 
-MOTIONS = ("static", "static-start", "micro-views", "per-row", "exact")
+
+class Motion(Interface):
+    """What methods ask of a model. Its ``name``, if it has one, and a dataclass's fields go into the result's facts."""
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The time cells of one frame, whose line weights sum to 1."""
+        ...
+
+
+def _name(name: str) -> Any:
+    return field(default=name, init=False, repr=False)
+
+
+def _place(scan: Scan, frame: int) -> tuple[Any, ...]:
+    """What the builders of cells begin with."""
+    return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A named motion model; ``strips`` (M) and ``sub_intervals`` (N) matter to micro-views only.
+class Static:
+    """One pose per frame, at the middle of its lit span: a gantry that stands still."""
 
-    ``per-row`` takes every line at its own N exact times; it is what the simulator uses. ``exact`` has ``segments``
-    poses a frame, between which splats move while every line integrates; 0 chooses the number so that the error stays
-    below ``time_error`` (relative), which also bounds the rules that average over time.
-    """
+    name: str = _name("static")
 
-    name: str = "micro-views"
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        return cells.static_cells(*_place(scan, frame))
+
+
+@dataclass(frozen=True)
+class StaticStart:
+    """One pose per frame, its first."""
+
+    name: str = _name("static-start")
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        return cells.static_start_cells(*_place(scan, frame))
+
+
+@dataclass(frozen=True)
+class MicroViews:
+    """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper."""
+
+    name: str = _name("micro-views")
     strips: int = 8
     sub_intervals: int = 5
+
+    def __post_init__(self) -> None:
+        checks.within("strips", self.strips, 1, 10_000)
+        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        if not scan.is_fly:
+            return Static().cells(scan, frame)
+        return cells.micro_view_cells(*_place(scan, frame), self.strips, self.sub_intervals)
+
+
+@dataclass(frozen=True)
+class PerRow:
+    """Every line at its own ``sub_intervals`` exact times; what the simulator uses."""
+
+    name: str = _name("per-row")
+    sub_intervals: int = 5
+
+    def __post_init__(self) -> None:
+        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        if not scan.is_fly:
+            return Static().cells(scan, frame)
+        return cells.per_line_cells(*_place(scan, frame), self.sub_intervals)
+
+
+@dataclass(frozen=True)
+class LineMiddles:
+    """Every line at the middle of its own exposure: ``per-row`` of a method that has one pose per line."""
+
+    name: str = _name("per-row")
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        return PerRow(1).cells(scan, frame)
+
+
+@dataclass(frozen=True)
+class Exact:
+    """``segments`` of a frame, in which splats move while every line integrates over its own window.
+
+    0 segments chooses the number so that the error stays below ``time_error`` (relative), which also bounds the rules that
+    average over time.
+    """
+
+    name: str = _name("exact")
     segments: int = 0
     time_error: float = 0.005
 
     def __post_init__(self) -> None:
-        if self.name not in MOTIONS:
-            raise InputError("motion", repr(self.name), f"one of {', '.join(MOTIONS)}")
-        checks.within("strips", self.strips, 1, 10_000)
-        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
         checks.within("--segments (0 chooses from the time error)", self.segments, 0, 1000)
         checks.within("--time-error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """The time cells of one frame; a scan that is not a fly-scan has one pose a frame in every model.
+        """intensity_peak: as for ``segments_for``."""
+        if not scan.is_fly:
+            return Static().cells(scan, frame)
+        where = _place(scan, frame)
+        segments = self.segments or cells.segments_for(*where[:4], self.time_error, intensity_peak)
+        return cells.exact_cells(*where, segments)
 
-        intensity_peak: as for ``segments_for``.
-        """
-        where = (scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines)
-        if self.name == "static-start":
-            return cells.static_start_cells(*where)
-        if self.name == "static" or not scan.is_fly:
-            return cells.static_cells(*where)
-        if self.name == "micro-views":
-            return cells.micro_view_cells(*where, self.strips, self.sub_intervals)
-        if self.name == "exact":
-            segments = self.segments or cells.segments_for(*where[:4], self.time_error, intensity_peak)
-            return cells.exact_cells(*where, segments)
-        return cells.per_line_cells(*where, self.sub_intervals)
+
+STILL = (Static(), StaticStart(), MicroViews(), PerRow())
+"""The models whose cells stand still, as they are by themselves."""
+MODELS = (Static, StaticStart, MicroViews, PerRow, Exact, LineMiddles)
+MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
+"""The names of the models."""
+
+
+def motion_of(motion: str | Motion) -> Motion:
+    """A model by its name, as it is by itself; a model as it is."""
+    if not isinstance(motion, str):
+        return motion
+    if motion not in MOTIONS:
+        raise InputError("motion", checks.shown(motion), f"one of {', '.join(MOTIONS)}")
+    return next(model() for model in MODELS if model.name == motion)
+
+
+def motion_facts(motion: Motion) -> dict[str, object]:
+    """Name and fields of a model, for a result's facts; what JSON has no word for as Python prints it."""
+    own = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
+    plain = {key: value if isinstance(value, int | float | str) else repr(value) for key, value in own.items()}
+    return {"name": str(getattr(motion, "name", type(motion).__name__)), **plain}
+
+
+def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
+    """The inverse of ``motion_facts``; None for a model that is not ours. Fields of other models are passed over.
+
+    Raises InputError and TypeError for values that a model does not take.
+    """
+    name = facts.get("name")
+    for model in MODELS:
+        own = [f.name for f in fields(model) if f.init]
+        if model.name == name and all(key in facts for key in own):
+            return model(**{key: facts[key] for key in own})  # type: ignore[arg-type]
+    return None
+
+
+def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
+    """InputError unless a model is of a class in ``taken``, or somebody's own."""
+    if not callable(getattr(motion, "cells", None)):
+        raise InputError("--motion", checks.shown(motion), "a model with cells(scan, frame)")
+    if isinstance(motion, MODELS) and type(motion) not in {type(own) for own in taken}:
+        raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")

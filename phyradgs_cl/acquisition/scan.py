@@ -75,8 +75,7 @@ class Scan:
         dark = self.shutter.lit_share(self.lines) == 0
         if not dark.any():
             return
-        by_row = self.shutter.axis == "rows"
-        unlit = np.broadcast_to(dark[:, None] if by_row else dark, self.geometry.detector_shape)
+        unlit = np.broadcast_to(self.shutter.readout.spread(dark), self.geometry.detector_shape)
         mask = unlit if self.pixel_mask is None else (np.asarray(self.pixel_mask) != 0) | unlit
         object.__setattr__(self, "pixel_mask", mask)
 

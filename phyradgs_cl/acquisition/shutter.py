@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
@@ -61,6 +62,11 @@ class Shutter:
             raise InputError(culprit, f"{self.exposure_s:.6g} s", expected, "correct the value or its unit")
 
     @property
+    def readout(self) -> Readout:
+        """How frames and poses turn to lines first."""
+        return Readout(self.axis)
+
+    @property
     def span_s(self) -> float:
         """From the first line's opening to the last line's closing."""
         return self.exposure_s + self.readout_s
@@ -90,7 +96,7 @@ class Shutter:
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
         """How many lines a (rows, columns) detector has along the readout axis."""
-        return detector_shape[0] if self.axis == "rows" else detector_shape[1]
+        return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:
         """Opening delay τ (lines,) of every line index, in seconds after the frame's start."""

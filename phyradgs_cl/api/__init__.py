@@ -6,7 +6,7 @@
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime.
 """
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan, Static, StaticStart
 from phyradgs_cl.api.bridges import as_linear_operator, as_torch
 from phyradgs_cl.api.projectors import Projector, ray_operator
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
@@ -15,12 +15,18 @@ from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Reconstruction
 
 __all__ = [
+    "Exact",
     "Gaussians",
     "Grid",
+    "LineMiddles",
+    "MicroViews",
     "Motion",
+    "PerRow",
     "Projector",
     "Reconstruction",
     "Scan",
+    "Static",
+    "StaticStart",
     "as_linear_operator",
     "as_torch",
     "compare",

@@ -8,12 +8,12 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.motion import motion_of
 from phyradgs_cl.api.devices import Device, runtime_of
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, ROWS, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, RayOperator, SplatProjector
-from phyradgs_cl.reconstructors.splat_frames import scaled_cells
+from phyradgs_cl.operators.splat import DEFAULT_TIME_ERROR
 
 
 def ray_operator(
@@ -23,11 +23,7 @@ def ray_operator(
 
     motion: how frames see the moving gantry (docs/methods.md, but ``exact``). grid: the scan's own when None.
     """
-    tables = [_motion(motion).cells(scan, frame) for frame in range(scan.frames)]
-    if tables[0].end_poses is not None:
-        raise InputError(
-            "motion", "'exact'", "static, static-start, micro-views or per-row", "take 'per-row'"
-        )
+    tables = [motion_of(motion).cells(scan, frame).still() for frame in range(scan.frames)]
     return RayOperator(runtime_of(device), grid or scan.grid, scan.geometry.detector_shape, tables)
 
 
@@ -48,17 +44,16 @@ class Projector:
         affine: bool = False,
         device: Device = None,
     ) -> None:
-        rt, model = runtime_of(device), _motion(motion)
+        rt, model = runtime_of(device), motion_of(motion)
         chosen = range(scan.frames) if frames is None else frames
         self._length_mm = scan.grid.half_longest_mm  # the kernels' float32 likes lengths of order 1
-        tables = [scaled_cells(model.cells(scan, f), 1 / self._length_mm) for f in chosen]
+        tables = [model.cells(scan, f).scaled(1 / self._length_mm) for f in chosen]
         self._cells = [DeviceCells.upload(rt, table) for table in tables]
-        self._by_row = scan.shutter.axis == "rows"
-        rows, columns = scan.geometry.detector_shape
-        self.frames_shape = (len(self._cells), rows, columns)
-        shape = (rows, columns) if self._by_row else (columns, rows)
+        self._readout, detector_shape = scan.shutter.readout, scan.geometry.detector_shape
+        self.frames_shape = (len(self._cells), *detector_shape)
+        shape = self._readout.shape(detector_shape)
         self._splat = SplatProjector(
-            rt, *shape, affine=affine, cutoff_sigma=cutoff_sigma, time_error=model.time_error
+            rt, *shape, affine=affine, cutoff_sigma=cutoff_sigma, time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR)
         )
 
     def __call__(self, gaussians: Gaussians) -> np.ndarray:
@@ -69,7 +64,7 @@ class Projector:
         """The same of parameter rows (11, G); quaternions of any length."""
         inside, _ = self._internal(rows)
         frames = [self._splat.project(inside, cells) for cells in self._cells]
-        return np.stack([self._upright(frame) for frame in frames]) * np.float32(self._length_mm)
+        return np.stack([self._readout.frames(frame) for frame in frames]) * np.float32(self._length_mm)
 
     def rows_gradient(self, rows: np.ndarray, by_frames: np.ndarray) -> np.ndarray:
         """dL/drows (11, G) of rows (11, G) and dL/dframes (F, rows, columns)."""
@@ -77,7 +72,7 @@ class Projector:
         checks.shape("by_frames", by_frames, self.frames_shape)
         total = np.zeros(inside.shape)
         for cells, by_frame in zip(self._cells, by_frames, strict=True):
-            by_line = np.ascontiguousarray(self._upright(by_frame), np.float32)
+            by_line = np.ascontiguousarray(self._readout.frames(by_frame), np.float32)
             total += self._splat.project_adjoint(inside, cells, by_line * np.float32(self._length_mm))
         total[MEAN] /= self._length_mm
         total[SCALE] /= self._length_mm
@@ -98,10 +93,6 @@ class Projector:
         inside[QUATERNION] /= norms
         return inside, norms
 
-    def _upright(self, frame: np.ndarray) -> np.ndarray:
-        """Between (rows, columns) and the readout's lines as rows; its own inverse."""
-        return frame if self._by_row else frame.T
-
 
 class DensityOperator:
     """A ``Projector`` of Gaussians that stay where they are: linear in their densities (G,) in 1/mm."""
@@ -120,7 +111,3 @@ class DensityOperator:
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
         """Frames (F, rows, columns) to densities (G,)."""
         return self._projector.rows_gradient(self._rows, frames)[DENSITY]
-
-
-def _motion(motion: str | Motion) -> Motion:
-    return motion if isinstance(motion, Motion) else Motion(motion)

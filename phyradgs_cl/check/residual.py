@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.check.timing import exposure_arc_rad
 from phyradgs_cl.reconstructors.cgls import Cgls
 from phyradgs_cl.reconstructors.system import System
@@ -20,7 +20,7 @@ def system_of(rt: Runtime, scan: Scan) -> System:
     """The scan's equations, every line at its own times: a time for each voxel that its edge moves in an exposure."""
     voxels = exposure_arc_rad(scan) * max(scan.grid.shape[1:]) / 2
     samples = int(np.clip(math.ceil(voxels), 1, _MOST_SAMPLES))
-    return System.of_scan(rt, scan, Motion("per-row", sub_intervals=samples))
+    return System.of_scan(rt, scan, PerRow(sub_intervals=samples))
 
 
 def fitted(rt: Runtime, scan: Scan, iterations: int = QUICK_ITERATIONS) -> np.ndarray:

@@ -29,11 +29,6 @@ class Axis(str, Enum):
     columns = "columns"
 
 
-class SplitName(str, Enum):
-    frames = "frames"
-    domain = "domain"
-
-
 class DetectorModel(str, Enum):
     log = "log"
     intensity = "intensity"
@@ -162,23 +157,6 @@ Batch = Annotated[
     typer.Option(
         metavar="B",
         help="Frames a step, for splats.",
-        show_default="as many as ranks",
-        rich_help_panel=RANKS,
-    ),
-]
-Split = Annotated[
-    SplitName | None,
-    typer.Option(
-        help="What ranks of mpiexec share out, for splats: the frames, or the domain where the Gaussians are too many.",
-        show_default="frames",
-        rich_help_panel=RANKS,
-    ),
-]
-Parts = Annotated[
-    int | None,
-    typer.Option(
-        metavar="P",
-        help="Parts of a frame's lines, or of the Gaussians, to share out; the same parts give the same bits.",
         show_default="as many as ranks",
         rich_help_panel=RANKS,
     ),

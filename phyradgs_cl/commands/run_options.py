@@ -28,8 +28,6 @@ RUN_OPTIONS: dict[str, Any] = {
     "seed": options.Seed,
     "preset": options.Preset,
     "batch": options.Batch,
-    "split": options.Split,
-    "parts": options.Parts,
     "config": options.Config,
     "assignments": options.Assignments,
     "detector_model": options.LineModel,

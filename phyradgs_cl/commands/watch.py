@@ -23,7 +23,7 @@ EXAMPLE = (
 )
 
 
-@with_run_options("batch", "split", "parts")
+@with_run_options("batch")
 def watch_command(
     folder: Annotated[Path, file_argument("FOLDER", "Folder in which scans arrive, as *.h5.")],
     output: Annotated[

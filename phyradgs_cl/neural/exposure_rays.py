@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers, layer_weights
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 
@@ -27,19 +28,19 @@ class ExposureRays:
     def of_cells(cls, table: TimeCells, grid: Grid) -> ExposureRays:
         """The rays of still cells in mm, for a volume on ``grid`` in mm.
 
-        Raises ValueError for a table whose lines have unlike numbers of cells, or unlike weights: no motion model makes one.
+        Raises InputError for a table whose lines have unlike numbers of cells, or unlike weights: no model here makes one.
         """
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
         pose = table.pose.copy()
         pose[:, :3] -= centre
         pose[:, 3:6] -= centre
-        numbers = layer_numbers(table)
-        weight = layer_weights(table, numbers)
+        weight = table.layer_weights
         if not np.allclose(weight, 1 / len(weight)):
-            raise ValueError("the times of a line do not weigh the same")
+            expected = "equal weights for a neural field"
+            raise InputError("--motion", "times of a line that do not weigh the same", expected)
         cell = np.zeros(weight.shape, np.int64)
         for number, (layer, start, stop) in enumerate(
-            zip(numbers, table.line_start, table.line_stop, strict=True)
+            zip(table.layer_numbers, table.line_start, table.line_stop, strict=True)
         ):
             cell[layer, start:stop] = number
         return cls(pose / unit, cell, table.axis)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition import Motion, Static
+from phyradgs_cl.acquisition.motion import STILL, check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
 
@@ -58,7 +60,9 @@ class NeuralOptions:
     torch_device: where PyTorch works.
     """
 
-    motion: Motion = Motion("static")
+    MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
+
+    motion: Motion = Static()
     detector_model: str = "scan"
     iterations: int = 30
     rays: int = 512
@@ -93,9 +97,7 @@ class NeuralOptions:
             found = f"a finest level of {finest:.3g} cells along a side"
             remedy = "take fewer levels or a smaller level_growth"
             raise InputError("levels", found, f"at most {_FINEST}", remedy)
-        if self.motion.name == "exact":
-            expected = "static, static-start, micro-views or per-row: exact moves splats, and rays have none"
-            raise InputError("--motion", "'exact'", expected, "take --motion per-row")
+        check_motion(self.motion, self.MOTIONS)
 
     def levels_for(self, longest_voxels: int) -> int:
         """Levels of the encoding for a volume of so many voxels along its longest side."""

@@ -42,7 +42,7 @@ class Trainer:
         self.density_per_mm = density_per_mm
         self.unit = density_per_mm * scan.grid.half_longest_mm  # of line integrals
         self.rng = np.random.default_rng(seed)
-        tables = [options.motion.cells(scan, frame) for frame in range(scan.frames)]
+        tables = [options.motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model

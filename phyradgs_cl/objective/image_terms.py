@@ -12,11 +12,11 @@ import numpy as np
 import scipy
 
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2
-_GUARD = 16
 
 
 class ImageLoss:
@@ -34,15 +34,15 @@ class ImageLoss:
     ) -> None:
         self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
         self.ssim_weight, self.l1_weight, self.poisson_weight = ssim_weight, l1_weight, poisson_weight
-        image = _GUARD + lines * pitch
+        image = GUARD + lines * pitch
         kernels = ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient")
-        self._kernels = {name: rt.kernel("loss", name, IMAGE_GUARD=_GUARD) for name in kernels}
-        self._moments = rt.zeros(5 * image + _GUARD)
-        self._partials = rt.zeros(3 * image + _GUARD)
-        self._spread = rt.zeros(3 * image + _GUARD)
+        self._kernels = {name: rt.kernel("loss", name, IMAGE_GUARD=GUARD) for name in kernels}
+        self._moments = rt.zeros(5 * image + GUARD)
+        self._partials = rt.zeros(3 * image + GUARD)
+        self._spread = rt.zeros(3 * image + GUARD)
         self._window = rt.upload(WINDOW, np.float32)
         self._line_sums = rt.zeros((lines, 4))
-        self.gradient = rt.zeros(image + _GUARD)
+        self.gradient = rt.zeros(image + GUARD)
 
     def evaluate(
         self,

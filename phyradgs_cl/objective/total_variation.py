@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, Runtime
-
-_GUARD = 16
+from phyradgs_cl.runtime.layout import GUARD
 
 
 class TotalVariation:
@@ -20,9 +19,9 @@ class TotalVariation:
         nz, ny, nx = shape
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._weight4 = np.array([*_axis_weights(shape)[::-1], 0], np.float32)
-        self._kernel = rt.kernel("total_variation", "total_variation", IMAGE_GUARD=_GUARD)
+        self._kernel = rt.kernel("total_variation", "total_variation", IMAGE_GUARD=GUARD)
         self._row_sums = rt.zeros(nz * ny)
-        self.gradient = rt.zeros(2 * _GUARD + nz * ny * pitch)
+        self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
     def evaluate(self, volume: DeviceArray) -> DeviceArray:
         """dTV/dvolume, until the next call."""

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
-from phyradgs_cl.operators.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 from phyradgs_cl.operators.rays import voxel_matrices
 from phyradgs_cl.runtime import DeviceArray, Room, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 
 _VIEWS_A_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28
@@ -50,8 +50,8 @@ def backproject_lines(
     counts with the rate at which it crosses lines: once for its angular step, and where the frames were filtered
     across lines (``axis`` columns) once more for the filter's scale (docs/mathematics.md).
     """
-    if axis == "columns":
-        frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
+    readout = Readout(axis)
+    frames, pose = readout.frames(frames), readout.poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(frames), -1)
     across = np.int32(axis == "columns")
     views = _Views(frames, matrices, weight)

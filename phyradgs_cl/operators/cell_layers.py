@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
+from phyradgs_cl.acquisition.cells import TimeCells
 
 
 def layers(table: TimeCells) -> list[TimeCells]:
     """The cells of a frame in tables in which no line has more than one; cells sorted by line stay so."""
-    numbers = layer_numbers(table)
+    numbers = table.layer_numbers
     return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 
@@ -26,7 +26,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
     for k in range(max(len(parts) for parts in split)):
         parts = [p[k] if k < len(p) else _empty(p[0]) for p in split]
         weight = np.stack([part.line_weights() for part in parts]).astype(np.float32)
-        weights.append(weight[:, :, None] if tables[0].axis == "rows" else weight[:, None, :])
+        weights.append(tables[0].readout.spread(weight))
         ones.append([replace(part, weight=np.ones(part.count)) for part in parts])
     return ones, weights
 
@@ -37,9 +37,7 @@ def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], ave
     ``intensity``: −ln Σ w exp(−p); ``gap``: what Σ w p is more than that. Lines without cells are 0. The twin of what
     cl/rays.cl does where a line's cells are at hand together; weights of a line sum to 1.
     """
-    seen = [np.broadcast_to(w > 0, p.shape) for p, w in zip(integrals, weights, strict=True)]
-    least = np.minimum.reduce([np.where(s, p, np.inf) for s, p in zip(seen, integrals, strict=True)])
-    least = np.where(np.isfinite(least), least, 0).astype(np.float64)
+    least = brightest(integrals, weights).astype(np.float64)
     more, light = np.zeros_like(least), np.zeros_like(least)
     for p, w in zip(integrals, weights, strict=True):
         beyond = np.where(w > 0, p - least, 0)
@@ -47,6 +45,13 @@ def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], ave
         light += w * np.expm1(-beyond)
     dimmer = np.log1p(np.maximum(light, -0.9999999))
     return (more + dimmer if average == "gap" else least - dimmer).astype(np.float32)
+
+
+def brightest(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
+    """The least of each pixel's line integrals, taken out of exponentials so that they do not overflow; 0 without cells."""
+    pairs = zip(integrals, weights, strict=True)
+    least = np.minimum.reduce([np.where(w > 0, p, np.float32(np.inf)) for p, w in pairs])
+    return np.where(np.isfinite(least), least, 0)
 
 
 def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:

@@ -14,7 +14,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.cell_layers import layered
+from phyradgs_cl.operators.cell_layers import brightest, layered
 from phyradgs_cl.operators.ray_operator import RayOperator
 from phyradgs_cl.runtime import Runtime
 
@@ -41,9 +41,7 @@ class IntensityOperator:
     def expected(self, volume: np.ndarray) -> np.ndarray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
         p = [operator.forward(volume) for operator in self._operators]
-        seen = [np.broadcast_to(weight > 0, self.frames_shape) for weight in self._weights]
-        least = np.minimum.reduce([np.where(s, q, np.inf) for s, q in zip(seen, p, strict=True)])
-        least = np.where(np.isfinite(least), least, 0)
+        least = brightest(p, self._weights)
         light = [w * np.exp(np.where(w > 0, least - q, 0)) for w, q in zip(self._weights, p, strict=True)]
         total = np.sum(light, axis=0)
         inverse = np.divide(1, total, out=np.zeros_like(total), where=total > 0)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from phyradgs_cl.operators.layout import GUARD, DeviceCells, padded_zeros, pitch_of
+from phyradgs_cl.operators.layout import DeviceCells
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
+from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 
 class Layers:

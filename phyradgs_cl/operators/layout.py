@@ -1,8 +1,4 @@
-"""How images, volumes, Gaussians and time cells lie in device memory.
-
-Images and volumes are rows with a pitch: GUARD floats, then (rows, pitch), where every row ends in at
-least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test.
-"""
+"""How Gaussians and time cells lie in device memory."""
 
 from __future__ import annotations
 
@@ -10,38 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers, layer_weights
-from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import pitch_of
 
-GUARD = 16
 STRIDE_OF = 16  # Gaussians are padded to a multiple of the widest vector
 CELL_FLOATS = 24
-
-
-def pitch_of(width: int) -> int:
-    return -(-width // GUARD) * GUARD + GUARD
-
-
-def padded_zeros(rt: Runtime, rows: int, width: int, images: int = 1) -> DeviceArray:
-    """Zeroed memory for ``images`` images or volumes of ``rows`` rows."""
-    return rt.zeros(images * (GUARD + rows * pitch_of(width)) + GUARD)
-
-
-def pad_rows(values: np.ndarray) -> np.ndarray:
-    """(..., rows, width) float to the flat padded layout, float32."""
-    width = values.shape[-1]
-    rows = int(np.prod(values.shape[:-1], dtype=np.int64))
-    flat = np.zeros(2 * GUARD + rows * pitch_of(width), np.float32)
-    flat[GUARD : GUARD + rows * pitch_of(width)].reshape(rows, -1)[:, :width] = values.reshape(rows, width)
-    return flat
-
-
-def unpad_rows(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The inverse of ``pad_rows`` for an image or volume of the given shape."""
-    width, rows = shape[-1], int(np.prod(shape[:-1], dtype=np.int64))
-    body = flat[GUARD : GUARD + rows * pitch_of(width)].reshape(rows, -1)
-    return np.ascontiguousarray(body[:, :width]).reshape(shape)
 
 
 @dataclass(eq=False)
@@ -107,27 +77,25 @@ class DeviceCells:
 
     @classmethod
     def upload(cls, rt: Runtime, table: TimeCells) -> DeviceCells:
-        pose = transpose_pose(table.pose) if table.axis == "columns" else table.pose
+        pose = table.readout.poses(table.pose)
         poses, times = pose, np.zeros(1, np.float32)
         if table.end_poses is not None and table.line_times is not None:
-            ends = transpose_pose(table.end_poses) if table.axis == "columns" else table.end_poses
-            poses = np.concatenate([pose[:, None], ends], 1).reshape(-1, pose.shape[1])
+            poses = np.concatenate([pose[:, None], table.readout.poses(table.end_poses)], 1).reshape(-1, pose.shape[1])
             times = np.zeros((table.count, 3, pitch_of(table.lines)), np.float32)
             times[:, :, : table.lines] = table.line_times
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
-        numbers = layer_numbers(table)
-        weights = layer_weights(table, numbers)
+        weights = table.layer_weights
         return cls(
-            cells=rt.upload(cell_constants(pose, table.weight, numbers)),
+            cells=rt.upload(cell_constants(pose, table.weight, table.layer_numbers)),
             matrices=split_coefficients(rt, projection_matrices(poses)),
             cell_lines=rt.upload(ranges),
-            line_cells=rt.upload(cells_of_lines(ranges, table.lines)),
+            line_cells=rt.upload(table.line_cells(), np.int32),
             line_times=rt.upload(times),
             layer_weights=rt.upload(weights, np.float32),
             count=table.count,
             lines=table.lines,
             layers=len(weights),
-            moving=table.end_poses is not None,
+            moving=table.is_moving,
         )
 
 
@@ -157,18 +125,3 @@ def cell_constants(pose: np.ndarray, weight: np.ndarray, layer: np.ndarray) -> n
         table[:, column] = factor * np.einsum("ci,ci->c", a, b)
     table[:, 17] = layer
     return table.astype(np.float32)
-
-
-def cells_of_lines(ranges: np.ndarray, lines: int) -> np.ndarray:
-    """For every line the range [first, stop) of cells that may serve it; cells are sorted by their first line."""
-    found = np.zeros((lines, 2), np.int32)
-    first = np.full(lines, len(ranges), np.int64)
-    stop = np.zeros(lines, np.int64)
-    for cell, (line_start, line_stop) in enumerate(ranges):
-        first[line_start:line_stop] = np.minimum(first[line_start:line_stop], cell)
-        stop[line_start:line_stop] = np.maximum(stop[line_start:line_stop], cell + 1)
-    reached = np.maximum.accumulate(stop)
-    empty = stop == 0
-    found[:, 0] = np.where(empty, reached, first)
-    found[:, 1] = np.where(empty, reached, stop)
-    return found

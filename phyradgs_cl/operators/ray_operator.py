@@ -12,11 +12,11 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.cell_layers import averaged, layered
-from phyradgs_cl.operators.layout import pad_rows, unpad_rows
 from phyradgs_cl.operators.ray_memory import RayMemory
 from phyradgs_cl.operators.rays import RayCells, RayLayout, launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays_upright import launch_upright, upright_block
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 
 class LinearOperator(Interface):
@@ -61,8 +61,8 @@ class RayOperator:
         _check_tables(tables, detector_shape)
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
         self.volume_shape = grid.shape
-        self._axis = tables[0].axis
-        layout = RayLayout.of_scan(grid, detector_shape, self._axis)
+        self._readout = tables[0].readout
+        layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
         # a GPU's work-items are pixels, whose loads the general kernel has side by side
         self._upright = 0 if rt.pixel_items else upright_block(grid, tables, layout.width, rt.lanes)
         self.memory = memory or RayMemory(rt, layout, len(tables), upright=self._upright > 0)
@@ -113,7 +113,7 @@ class RayOperator:
                     self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
                 )
             by_line = unpad_rows(self.rt.download(frames), layout.frames_shape(listed.size))
-            result[part] = self._lines_first(by_line)
+            result[part] = self._readout.frames(by_line)
         return result
 
     def _turned(self, layout: RayLayout, volume: DeviceArray, average: str) -> DeviceArray | None:
@@ -145,7 +145,7 @@ class RayOperator:
                 listed = self._listed(part)
                 by_line = self.memory.frames(listed.size)
                 if k == 0 or len(parts) > 1:
-                    self.rt.write(by_line, pad_rows(self._lines_first(frames[part])))
+                    self.rt.write(by_line, pad_rows(self._readout.frames(frames[part])))
                 add = part.start > 0
                 launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
             result[brick.box] = layout.inside(self.rt.download(on_device))
@@ -172,16 +172,12 @@ class RayOperator:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)
         return self._lists[key]
 
-    def _lines_first(self, frames: np.ndarray) -> np.ndarray:
-        """Frames (F, rows, columns) with the readout's lines as rows; its own inverse."""
-        return frames if self._axis == "rows" else frames.transpose(0, 2, 1)
-
 
 def _check_tables(tables: Sequence[TimeCells], detector_shape: tuple[int, int]) -> None:
     if not tables:
         raise InputError("tables", "no frames", "the time cells of at least one frame")
     axis = tables[0].axis
-    lines = detector_shape[0] if axis == "rows" else detector_shape[1]
+    lines, _ = tables[0].readout.shape(detector_shape)
     for frame, table in enumerate(tables):
         if (table.axis, table.lines) != (axis, lines):
             found = f"{table.lines} {table.axis} in frame {frame}"

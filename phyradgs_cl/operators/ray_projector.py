@@ -9,11 +9,11 @@ import numpy as np
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.layout import pad_rows, unpad_rows
 from phyradgs_cl.operators.ray_memory import RayMemory
 from phyradgs_cl.operators.ray_operator import RayOperator
 from phyradgs_cl.operators.rays import RayCells, RayLayout, launch_adjoint, launch_forward
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
+from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 log = logging.getLogger(__name__)
 
@@ -64,12 +64,12 @@ class RayProjector:
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
         image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]
-        return image if self.axis == "rows" else np.ascontiguousarray(image.T)
+        return np.ascontiguousarray(table.readout.frames(image))
 
     def adjoint(self, frame: np.ndarray, table: TimeCells, volume: DeviceArray, *, add: bool = False) -> None:
         """Aᵀ of ``forward`` with the log model: a frame (rows, columns) onto a padded volume."""
         self._check(table)
-        image = self.rt.upload(pad_rows(frame if self.axis == "rows" else frame.T))
+        image = self.rt.upload(pad_rows(table.readout.frames(frame)))
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_adjoint(self.rt, self._layout, cells, self._only, image, volume, add=add)
 

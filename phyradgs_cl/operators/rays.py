@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, whole
-from phyradgs_cl.operators.layout import GUARD, pitch_of, projection_matrices
+from phyradgs_cl.operators.layout import projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _RAY_CELL_FLOATS = 16
 BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
@@ -45,9 +46,7 @@ class RayLayout:
     @classmethod
     def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> RayLayout:
         """The whole grid, with the readout's lines as rows of the frames."""
-        rows, columns = detector_shape
-        lines, width = (rows, columns) if axis == "rows" else (columns, rows)
-        return cls(grid, lines, width, whole(grid.shape))
+        return cls(grid, *Readout(axis).shape(detector_shape), whole(grid.shape))
 
     def of(self, brick: Brick) -> RayLayout:
         """The same frames with another part of the grid."""
@@ -108,10 +107,10 @@ class RayCells:
     def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> RayCells:
         counts = np.array([table.count for table in tables])
         starts = np.concatenate([[0], np.cumsum(counts)])
-        pose = np.concatenate([lines_first(table) for table in tables])
+        pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weight = np.concatenate([table.weight for table in tables])
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
-        served = [serving(r, t.lines) + s for r, t, s in zip(ranges, tables, starts[:-1], strict=True)]
+        served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
         stride = int(starts[-1]) + _WIDEST
         matrices = np.zeros((12, stride))
         matrices[:, : starts[-1]] = voxel_matrices(pose, grid).T
@@ -214,22 +213,6 @@ def _defines(rt: Runtime, layout: RayLayout) -> dict[str, int]:
         "RAY_VOXEL_ITEMS": int(rt.pixel_items),
         "RAY_LONG": int(layout.volume_floats >= _LONG_FROM),
     }
-
-
-def lines_first(table: TimeCells) -> np.ndarray:
-    """Poses (C, 12) with the readout's lines as the slow axis of the image."""
-    return transpose_pose(table.pose) if table.axis == "columns" else table.pose
-
-
-def serving(ranges: np.ndarray, lines: int) -> np.ndarray:
-    """For every line the range (lines, 2) [first, stop) of cells outside of which none serves it.
-
-    ranges (C, 2) are sorted by their first line; cells inside may still not serve the line.
-    """
-    line = np.arange(lines)
-    first = np.searchsorted(np.maximum.accumulate(ranges[:, 1]), line, side="right")
-    stop = np.searchsorted(ranges[:, 0], line, side="right")
-    return np.stack([first, stop], -1)
 
 
 def ray_constants(pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:

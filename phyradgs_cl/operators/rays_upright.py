@@ -11,9 +11,9 @@ import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.layout import GUARD, pitch_of
-from phyradgs_cl.operators.rays import BORDER, RayCells, RayLayout, lines_first, ray_constants
+from phyradgs_cl.operators.rays import BORDER, RayCells, RayLayout, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _LINES = 128  # of a detector column for a work-item
 _VOXELS = 512  # of a column of the volume that they may meet in one slice
@@ -29,7 +29,7 @@ def upright_block(grid: Grid, tables: Sequence[TimeCells], width: int, lanes: in
     shared = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     if shared < lanes * sum(table.count for table in tables):
         return 0
-    poses = np.concatenate([lines_first(table) for table in tables])
+    poses = np.concatenate([table.readout.poses(table.pose) for table in tables])
     cells = ray_constants(poses, np.ones(len(poses)), grid).astype(np.float64)
     d00, eu, ev = cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
     lines = tables[0].lines

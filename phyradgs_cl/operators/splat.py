@@ -15,17 +15,10 @@ import numpy as np
 
 from phyradgs_cl.operators.binning import TileLists
 from phyradgs_cl.operators.layers import Layers
-from phyradgs_cl.operators.layout import (
-    GUARD,
-    DeviceCells,
-    DeviceGaussians,
-    pad_rows,
-    padded_zeros,
-    pitch_of,
-    unpad_rows,
-)
+from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.splat_count import UNSEEN, Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
 SUM_FLOATS = 16

@@ -7,17 +7,10 @@ import numpy as np
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.binning import TileLists
 from phyradgs_cl.operators.bricks import Shape, cut
-from phyradgs_cl.operators.layout import (
-    GUARD,
-    DeviceGaussians,
-    pad_rows,
-    padded_zeros,
-    pitch_of,
-    split_coefficients,
-    unpad_rows,
-)
+from phyradgs_cl.operators.layout import DeviceGaussians, split_coefficients
 from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = 20
 SUM_FLOATS = 16

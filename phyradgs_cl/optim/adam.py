@@ -66,13 +66,9 @@ class DeviceAdam:
         shape_weight: float,
         shape_ratio: float,
         shape_floor: float,
-        of: int | None = None,
     ) -> None:
-        """dL/dparameters to dL/draw in place, with the parameter terms added and the statistics gathered.
-
-        The terms are means over ``of`` Gaussians: ``count``, or more where the others are elsewhere.
-        """
-        share = 1.0 / max(count if of is None else of, 1)
+        """dL/dparameters to dL/draw in place, with the parameter terms (means) added and the statistics gathered."""
+        share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain,
             stride // self.rt.lanes,

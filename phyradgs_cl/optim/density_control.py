@@ -13,7 +13,6 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.fields import gaussians as g
-from phyradgs_cl.parallel import Alone, Communicator
 
 _RANGES = {
     "every": (0, 1_000_000_000),
@@ -84,25 +83,20 @@ def control_density(
     control: DensityControl,
     box: np.ndarray,
     rng: np.random.Generator,
-    ranks: Communicator | None = None,
 ) -> Population:
     """One round of density control.
 
-    statistic (G,) mean gradient norm; box (2, 3) lowest and highest corner x y z outside which centres go. ``ranks`` that
-    each have a part of one population do to it what would be done to the whole, with the same draws; ``rng`` is alike on
-    all of them.
+    statistic (G,) mean gradient norm; box (2, 3) lowest and highest corner x y z outside which centres go.
     """
-    among = Alone() if ranks is None else ranks
     rows = activation.apply(population.raw)
-    everyone = among.gather(statistic)
-    room = max(control.max_gaussians - everyone.size, 0)
-    chosen = _strongest(everyone, control.threshold, room)[_own(among, statistic.size)]
+    room = max(control.max_gaussians - statistic.size, 0)
+    chosen = _strongest(statistic, control.threshold, room)
     is_large = rows[g.SCALE].max(0) > control.split_scale
     cloned = np.flatnonzero(chosen & ~is_large)
     split = np.flatnonzero(chosen & is_large)
     rows[g.DENSITY, cloned] *= 0.5
-    copies, first = rows[:, cloned].copy(), _children(rows[:, split], control, rng, among)
-    second = _children(rows[:, split], control, rng, among)
+    copies, first = rows[:, cloned].copy(), _children(rows[:, split], control, rng)
+    second = _children(rows[:, split], control, rng)
     changed = population.raw.copy()
     changed[:, cloned] = activation.invert(rows[:, cloned])
     new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
@@ -133,21 +127,10 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
     return chosen
 
 
-def _own(ranks: Communicator, count: int) -> slice:
-    """Where this rank's ``count`` items are among those of all ranks, joined in the order of the ranks."""
-    counts = ranks.gather(np.array([count]))
-    first = int(counts[: ranks.rank].sum())
-    return slice(first, first + count)
-
-
-def _children(
-    rows: np.ndarray, control: DensityControl, rng: np.random.Generator, ranks: Communicator
-) -> np.ndarray:
+def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
     """One child of each Gaussian (11, S): drawn from it, smaller, half as dense."""
     child = rows.copy()
-    count = rows.shape[1]
-    draws = rng.normal(size=(3, int(ranks.gather(np.array([count])).sum())))[:, _own(ranks, count)]
-    local = draws * rows[g.SCALE]
+    local = rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE]
     child[g.MEAN] += rotate(rows[g.QUATERNION], local)
     child[g.SCALE] /= control.split_factor
     child[g.DENSITY] *= 0.5

@@ -5,19 +5,16 @@ from phyradgs_cl.parallel.ending import failing_together
 from phyradgs_cl.parallel.exact_sum import exact_sum
 from phyradgs_cl.parallel.launch import Launch, launched
 from phyradgs_cl.parallel.mpi import Mpi, launched_ranks
-from phyradgs_cl.parallel.shares import Shares, span
-from phyradgs_cl.parallel.sorted_columns import sorted_columns
+from phyradgs_cl.parallel.shares import span
 
 __all__ = [
     "Alone",
     "Communicator",
     "Launch",
     "Mpi",
-    "Shares",
     "exact_sum",
     "failing_together",
     "launched",
     "launched_ranks",
-    "sorted_columns",
     "span",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NoReturn
 from typing import Protocol as Interface
 
@@ -12,8 +11,7 @@ import numpy as np
 class Communicator(Interface):
     """``size`` processes (ranks) with one scan. Every method but the last two is called by all of them, in one order.
 
-    ``exchanged_bytes`` and ``exchange_s``: what this rank has handed over so far, and how long it was at it, waiting for
-    the others (``idle_s``, where it is measured) included.
+    ``exchanged_bytes``: what this rank has handed over so far.
     """
 
     rank: int
@@ -21,8 +19,6 @@ class Communicator(Interface):
     local_rank: int
     local_size: int
     exchanged_bytes: int
-    exchange_s: float
-    idle_s: float
 
     def add(self, values: np.ndarray) -> None:
         """Sums contiguous ``values`` over all ranks, in place: whole numbers, or numbers that are 0 on all ranks but one.
@@ -47,18 +43,6 @@ class Communicator(Interface):
         """The arrays (n, ...) of all ranks joined along their first axis, in the order of the ranks."""
         ...
 
-    def gather(self, values: np.ndarray) -> np.ndarray:
-        """The arrays (..., n) of all ranks joined along their last axis, in the order of the ranks."""
-        ...
-
-    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Hands ``parts[k]`` (rows, n_k) to rank k; what the ranks have handed to this one, in their order."""
-        ...
-
-    def team(self, number: int) -> Communicator:
-        """The ranks that call with the same ``number``, in their order."""
-        ...
-
     def all_fail(self) -> bool:
         """Called by a rank that fails: whether all do, soon enough; then each may end in its own time."""
         ...
@@ -72,7 +56,7 @@ class Alone:
     """One process: it has everything, and nobody to tell."""
 
     rank, size, local_rank, local_size = 0, 1, 0, 1
-    exchanged_bytes, exchange_s, idle_s = 0, 0.0, 0.0
+    exchanged_bytes = 0
 
     def add(self, values: np.ndarray) -> None:
         pass
@@ -88,15 +72,6 @@ class Alone:
 
     def join(self, values: np.ndarray) -> np.ndarray:
         return values
-
-    def gather(self, values: np.ndarray) -> np.ndarray:
-        return values
-
-    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-        return list(parts)
-
-    def team(self, number: int) -> Alone:
-        return self
 
     def all_fail(self) -> bool:
         return True

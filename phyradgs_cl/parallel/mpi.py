@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, NoReturn
 
@@ -44,14 +42,14 @@ def launched_ranks(launch: Launch | None = None) -> Communicator:
 
 
 class Mpi:
-    """A ``Communicator`` over an mpi4py communicator. ``timed`` waits for all before each call, to tell waiting apart."""
+    """A ``Communicator`` over an mpi4py communicator."""
 
-    def __init__(self, comm: Any, launch: Launch, timed: bool = False) -> None:
-        self._comm, self._launch, self.timed = comm, launch, timed
+    def __init__(self, comm: Any, launch: Launch) -> None:
+        self._comm = comm
         self._failing = comm.Dup()  # where those who fail meet, whatever the others are at
         self.rank, self.size = comm.rank, comm.size
         self.local_rank, self.local_size = launch.local_rank, launch.local_size
-        self.exchanged_bytes, self.exchange_s, self.idle_s = 0, 0.0, 0.0
+        self.exchanged_bytes = 0
 
     def add(self, values: np.ndarray) -> None:
         self._reduce(values, "SUM")
@@ -64,9 +62,9 @@ class Mpi:
 
         assert values.flags.c_contiguous, "a copy would be reduced, and lost"
         flat = values.reshape(-1)
-        with self._counted(values.nbytes):
-            for first in range(0, flat.size, _MOST_VALUES):
-                self._comm.Allreduce(MPI.IN_PLACE, flat[first : first + _MOST_VALUES], getattr(MPI, name))
+        self.exchanged_bytes += values.nbytes
+        for first in range(0, flat.size, _MOST_VALUES):
+            self._comm.Allreduce(MPI.IN_PLACE, flat[first : first + _MOST_VALUES], getattr(MPI, name))
 
     def any(self, flag: bool) -> bool:
         flags = np.array([flag], np.int32)
@@ -74,28 +72,16 @@ class Mpi:
         return bool(flags[0])
 
     def tell(self, value: Any) -> Any:
-        with self._counted(0):
-            return self._comm.bcast(value, 0)
+        return self._comm.bcast(value, 0)
 
     def join(self, values: np.ndarray) -> np.ndarray:
         rows = np.ascontiguousarray(values)
-        with self._counted(rows.nbytes):
-            counts = self._comm.allgather(len(rows))
-            width = int(np.prod(rows.shape[1:], dtype=np.int64))
-            joined = np.empty((sum(counts), *rows.shape[1:]), rows.dtype)
-            self._comm.Allgatherv(rows, [joined, [count * width for count in counts]])
+        self.exchanged_bytes += rows.nbytes
+        counts = self._comm.allgather(len(rows))
+        width = int(np.prod(rows.shape[1:], dtype=np.int64))
+        joined = np.empty((sum(counts), *rows.shape[1:]), rows.dtype)
+        self._comm.Allgatherv(rows, [joined, [count * width for count in counts]])
         return joined
-
-    def gather(self, values: np.ndarray) -> np.ndarray:
-        joined = self.join(np.moveaxis(values, -1, 0))
-        return np.ascontiguousarray(np.moveaxis(joined, 0, -1))
-
-    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-        with self._counted(sum(part.nbytes for rank, part in enumerate(parts) if rank != self.rank)):
-            return self._comm.alltoall(list(parts))
-
-    def team(self, number: int) -> Mpi:
-        return _Team(self, self._comm.Split(number, self.rank), self._launch)
 
     def all_fail(self) -> bool:
         waiting = self._failing.Ibarrier()
@@ -109,32 +95,3 @@ class Mpi:
     def abort(self, status: int) -> NoReturn:
         self._comm.Abort(status)
         raise SystemExit(status)
-
-    @contextmanager
-    def _counted(self, nbytes: int) -> Iterator[None]:
-        begun = time.perf_counter()
-        waited = 0.0
-        if self.timed:
-            self._comm.Barrier()
-            waited = time.perf_counter() - begun
-        try:
-            yield
-        finally:
-            self._note(nbytes, time.perf_counter() - begun, waited)
-
-    def _note(self, nbytes: int, seconds: float, waited: float) -> None:
-        self.exchanged_bytes += nbytes
-        self.exchange_s += seconds
-        self.idle_s += waited
-
-
-class _Team(Mpi):
-    """Some of the ranks; what they exchange counts as the whole's."""
-
-    def __init__(self, whole: Mpi, comm: Any, launch: Launch) -> None:
-        super().__init__(comm, launch, whole.timed)
-        self._whole = whole
-
-    def _note(self, nbytes: int, seconds: float, waited: float) -> None:
-        super()._note(nbytes, seconds, waited)
-        self._whole._note(nbytes, seconds, waited)

@@ -11,6 +11,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.iterative import run_iterations
 from phyradgs_cl.reconstructors.result import (
@@ -21,7 +22,6 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.sart import Sart, SartOptions
-from phyradgs_cl.reconstructors.shared_tv import Descent, tv_descent_for
 from phyradgs_cl.reconstructors.system import System, inner, norm
 from phyradgs_cl.runtime import Runtime
 
@@ -65,7 +65,7 @@ def asd_pocs(
     def make(system: System) -> AsdPocs:
         start = static_fdk(rt, scan)
         epsilon = options.residual_share * norm(system.residual(start))
-        return AsdPocs(system, options, seed, tv_descent_for(rt, scan.grid.shape), epsilon)
+        return AsdPocs(system, options, seed, TvDescent(rt, scan.grid.shape), epsilon)
 
     return run_iterations("asd-pocs", make, scan, options, rt, report, resume)
 
@@ -74,7 +74,7 @@ class AsdPocs:
     """The residual that is reported is that of the volume between the SART pass and the TV steps."""
 
     def __init__(
-        self, system: System, options: AsdPocsOptions, seed: int, descend: Descent, epsilon: float
+        self, system: System, options: AsdPocsOptions, seed: int, descend: TvDescent, epsilon: float
     ) -> None:
         self.system, self.options, self.descend, self.epsilon = system, options, descend, epsilon
         self.sart = Sart(system, options, seed)

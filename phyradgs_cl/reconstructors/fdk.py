@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import LineMiddles, Motion, Scan, Static, StaticStart
+from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
@@ -24,7 +25,7 @@ from phyradgs_cl.reconstructors.fdk_views import (
     warn_if_incomplete,
     widened,
 )
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.runtime import Runtime
 
 _SAME_POSE = 1e-9  # of the largest length: views whose poses differ by a turn alone share their weights
@@ -36,22 +37,17 @@ class FdkOptions:
     """``window`` is the ramp filter's (see ``WINDOWS``).
 
     ``motion``: static (one pose a frame, mid-window), static-start (the frame's first pose) or per-row (every line
-    at the middle of its own exposure).
+    at the middle of its own exposure). Of a model with more poses it takes a line's middle one.
     """
 
+    MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), StaticStart(), LineMiddles())
+
     window: str = "ram-lak"
-    motion: Motion = Motion("static")
-    has_sub_intervals: ClassVar[bool] = False
+    motion: Motion = Static()
 
     def __post_init__(self) -> None:
         checks.one_of("FDK window", self.window, WINDOWS)
-        if self.motion.name in ("micro-views", "exact"):
-            raise InputError(
-                "--motion",
-                repr(self.motion.name),
-                "static, static-start or per-row for --method fdk",
-                "use --method phyradgs to model exposure blur",
-            )
+        check_motion(self.motion, self.MOTIONS)
 
 
 FDK_PRESETS = {window: FdkOptions(window) for window in WINDOWS}  # the first is the default
@@ -62,13 +58,12 @@ def fdk(
 ) -> Reconstruction:
     """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing."""
     started = time.perf_counter()
-    motion = replace(options.motion, sub_intervals=1)  # one pose a line, at the middle of its exposure
-    pose = np.stack([motion.cells(scan, f).pose for f in range(scan.frames)])
-    if pose.shape[1] == 1:
-        pose = pose[:, 0]
+    poses = [options.motion.cells(scan, f).still().line_poses() for f in range(scan.frames)]
+    lines = max(map(len, poses))
+    pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     frames, axis = unmasked_frames(scan), scan.shutter.axis
     volume = fdk_volume(rt, frames, pose, scan.grid, window=options.window, axis=axis)
-    facts = {"method": "fdk", "options": asdict(options), "seconds": time.perf_counter() - started}
+    facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
 
@@ -130,7 +125,7 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 
 def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
     """FDK (z, y, x) in 1/mm at the mid-window poses: what other methods start from, or measure themselves by."""
-    pose = np.concatenate([Motion("static").cells(scan, f).pose for f in range(scan.frames)])
+    pose = np.concatenate([Static().cells(scan, f).pose for f in range(scan.frames)])
     return fdk_volume(rt, unmasked_frames(scan), pose, scan.grid)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.iterative import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
@@ -21,7 +22,6 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.shared_tv import Prox, tv_prox_for
 from phyradgs_cl.reconstructors.system import System, inner, norm
 from phyradgs_cl.runtime import Runtime
 
@@ -57,8 +57,7 @@ def fista_tv(
     """The TV-regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
 
     def make(system: System) -> FistaTv:
-        prox = tv_prox_for(rt, scan.grid.shape, axis_weights(scan.grid), options.tv_iterations)
-        return FistaTv(system, options, prox)
+        return FistaTv(system, options, TvProx(rt, scan.grid.shape, axis_weights(scan.grid)))
 
     return run_iterations("fista-tv", make, scan, options, rt, report, resume)
 
@@ -77,7 +76,7 @@ class FistaTv:
     with the steps.
     """
 
-    def __init__(self, system: System, options: FistaTvOptions, prox: Prox) -> None:
+    def __init__(self, system: System, options: FistaTvOptions, prox: TvProx) -> None:
         self.system, self.options, self.prox = system, options, prox
         shape = system.operator.volume_shape
         self.volume = np.zeros(shape, np.float32)

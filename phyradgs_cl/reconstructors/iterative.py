@@ -1,34 +1,26 @@
-"""The loop around every iterative voxel method: progress, convergence record, Ctrl-C, stopping, going on.
+"""The iterative voxel methods between scan and loop: options, system, convergence, facts.
 
-A method is a class with ``volume``, ``step()``, ``state()`` and ``restore()``; this module runs it.
+A method is a class with ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import ClassVar
 from typing import Protocol as Interface
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition.motion import STILL, check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.reconstructors.checked_state import check_like, checked_history, count_of
-from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
-from phyradgs_cl.reconstructors.reporting import report_once
-from phyradgs_cl.reconstructors.result import (
-    Progress,
-    ProgressReport,
-    Reconstruction,
-    State,
-    history_arrays,
-)
+from phyradgs_cl.reconstructors.checked_state import check_like, count_of
+from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
 from phyradgs_cl.reconstructors.system import System, norm
 from phyradgs_cl.runtime import Runtime
 
@@ -48,7 +40,9 @@ class IterativeOptions:
     transmission_weights: ClassVar[bool] = False
     """Weigh pixels by their transmission; methods that can have an option of this name."""
 
-    motion: Motion = Motion("static")
+    MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
+
+    motion: Motion = Static()
     iterations: int = 20
     nonnegative: bool = True
     tolerance: float = 0.0
@@ -58,9 +52,7 @@ class IterativeOptions:
         checks.within("iterations", self.iterations, 0, MOST_ITERATIONS)
         checks.within("tolerance", self.tolerance, 0, 1)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
-        if self.motion.name == "exact":
-            expected = "static, static-start, micro-views or per-row: exact moves splats, and rays have none"
-            raise InputError("--motion", "'exact'", expected, "take --motion per-row")
+        check_motion(self.motion, self.MOTIONS)
 
 
 class Algorithm(Interface):
@@ -99,94 +91,56 @@ def run_iterations(
     system = System.of_scan(rt, scan, options.motion, options.detector_model)
     if options.transmission_weights:
         system = system.trusting_light()
-    algorithm = make(system)
-    iteration, record = 0, []
-    if resume is not None:
-        check_like(resume, algorithm.state())
-        iteration = count_of(resume, "iteration", options.iterations)
-        record, before_s = checked_history(resume)
-        algorithm.restore(resume)
-        started -= before_s
-    loop = _Loop(algorithm, options, scan.grid, norm(system.measured) or 1.0, report, started, rt.ranks)
-    loop.record = record
-    loop.run(iteration)
+    run = _Iterations(make(system), options, scan.grid, norm(system.measured) or 1.0)
+    loop = Loop(run, rt.ranks, report, started)
+    loop.run(resume)
     facts: dict[str, object] = {
         "method": method,
-        "options": asdict(options),
+        "options": option_facts(options),
         "detector_model": "log" if system.intensity is None else "intensity",
-        "iterations": loop.iteration,
+        "iterations": run.iteration,
         "stopped_by": loop.stopped_by,
-        "seconds": time.perf_counter() - started,
-        "interrupted_at": loop.iteration if loop.stopped_by == "interrupt" else None,
+        "seconds": loop.seconds,
+        "interrupted_at": loop.interrupted_at,
         "ranks": rt.ranks.size,
     }
-    state = None
-    if loop.stopped_by == "interrupt":
-        state = loop.state()
-    return Reconstruction(algorithm.volume, scan.grid, record=loop.record, facts=facts, state=state)
+    volume, state = run.algorithm.volume, loop.state_if_interrupted()
+    return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
 
 
-class _Loop:
-    """Where the run is, and why it ended: iterations, tolerance, interrupt, or the method's own reason."""
+class _Iterations:
+    """An algorithm with its convergence, ``Stepwise`` for the loop."""
+
+    quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 
     def __init__(
-        self,
-        algorithm: Algorithm,
-        options: IterativeOptions,
-        grid: Grid,
-        measured_norm: float,
-        report: ProgressReport,
-        started: float,
-        ranks: Communicator,
+        self, algorithm: Algorithm, options: IterativeOptions, grid: Grid, measured_norm: float
     ) -> None:
-        self.ranks = ranks
-        self.algorithm, self.options, self.grid, self.report = algorithm, options, grid, report
-        self.measured_norm, self.started = measured_norm, started
-        self.record: list[dict[str, float]] = []
-        self.iteration = 0
-        self.stopped_by = "iterations"
+        self.algorithm, self.options, self.grid, self.measured_norm = algorithm, options, grid, measured_norm
+        self.iteration, self.iterations = 0, options.iterations
+        self.residual, self.change = 0.0, 0.0
 
-    def run(self, first: int) -> None:
-        self.iteration = first
-        with stop_on_interrupt() as request:
-            while self.iteration < self.options.iterations:
-                self._iterate()
-                if self.algorithm.finished:
-                    self.stopped_by = self.algorithm.finished
-                elif self.iteration < self.options.iterations and self.ranks.any(request.is_set):
-                    self.stopped_by = "interrupt"
-                if self.stopped_by != "iterations":
-                    return
+    @property
+    def finished(self) -> str | None:
+        return self.algorithm.finished or ("tolerance" if self.change < self.options.tolerance else None)
+
+    def step(self) -> None:
+        before = self.algorithm.volume
+        self.residual = self.algorithm.step() / self.measured_norm
+        self.iteration += 1
+        size = norm(self.algorithm.volume)
+        self.change = norm(self.algorithm.volume - before) / size if size else 0.0
+
+    def measures(self) -> dict[str, float]:
+        return {"residual": self.residual, "change": self.change}
 
     def state(self) -> dict[str, np.ndarray]:
-        """What ``restore`` and a loop need to go on from here."""
-        so_far = history_arrays(self.record, time.perf_counter() - self.started)
-        return {**self.algorithm.state(), "iteration": np.array(self.iteration), **so_far}
+        return {**self.algorithm.state(), "iteration": np.array(self.iteration)}
 
-    def _iterate(self) -> None:
-        before = self.algorithm.volume
-        residual = self.algorithm.step() / self.measured_norm
-        self.iteration += 1
-        if not np.isfinite(residual):
-            remedy = "check the scan for extreme values, or lower the relaxation"
-            raise NumericalError(
-                "residual", f"{residual} at iteration {self.iteration}", "a finite number", remedy
-            )
-        after = self.algorithm.volume
-        size = norm(after)
-        change = norm(after - before) / size if size else 0.0
-        seconds = time.perf_counter() - self.started
-        self.record.append(
-            {"iteration": self.iteration, "residual": residual, "change": change, "seconds": seconds}
-        )
-        if change < self.options.tolerance:
-            self.stopped_by = "tolerance"
-        total = self.options.iterations
-        progress = Progress(
-            *(self.iteration, total, residual, 0, seconds),
-            quantity="residual",
-            state=self.state,
-            volume=lambda: (self.algorithm.volume, self.grid),
-        )
-        if report_once(self.ranks, self.report, progress) and self.iteration < total:
-            self.stopped_by = "interrupt"
+    def restore(self, state: State) -> None:
+        check_like(state, self.algorithm.state())
+        self.iteration = count_of(state, "iteration", self.iterations)
+        self.algorithm.restore(state)
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return self.algorithm.volume, self.grid

@@ -1,4 +1,4 @@
-"""The loop around a neural field: scan and options to trainer, progress, record, Ctrl-C, going on.
+"""Neural fields: scan and options to trainer, and the trainer to the loop.
 
 The one place where the scan, the field and its training meet; PyTorch is imported when a run begins.
 """
@@ -6,28 +6,22 @@ The one place where the scan, the field and its training meet; PyTorch is import
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.errors import InputError, NumericalError
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions, require_torch
-from phyradgs_cl.reconstructors.checked_state import (
-    check_array,
-    checked_history,
-    count_of,
-    restore_generator,
-)
+from phyradgs_cl.reconstructors.checked_state import check_array, count_of, restore_generator
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
+from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.result import (
-    Progress,
     ProgressReport,
     Reconstruction,
     State,
-    history_arrays,
+    option_facts,
     state_arrays,
 )
 from phyradgs_cl.reconstructors.splat_start import internal_scale
@@ -61,13 +55,11 @@ def reconstruct_neural(
     scale = internal_scale(static_fdk(rt, scan), scan.grid)
     field = first_field(options, max(scan.grid.shape), seed)
     trainer = Trainer(scan, options, field, device, scale.density_per_mm, seed)
-    run = _Run(trainer, options.iterations, report, started)
-    if resume is not None:
-        run.restore(resume)
-    run.loop()
+    loop = Loop(_Passes(trainer, options.iterations), rt.ranks, report, started)
+    loop.run(resume)
     facts: dict[str, object] = {
         "method": method,
-        "options": asdict(options),
+        "options": option_facts(options),
         "seed": seed,
         "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm,
@@ -79,40 +71,36 @@ def reconstruct_neural(
         "iterations": trainer.passes,
         "torch_device": str(device),
         "torch_version": _torch_version(),
-        "seconds": time.perf_counter() - run.started,
-        "interrupted_at": trainer.passes if run.is_interrupted else None,
+        "seconds": loop.seconds,
+        "interrupted_at": loop.interrupted_at,
     }
     volume = trainer.volume(scan.grid)
-    state = run.state() if run.is_interrupted else None
-    return Reconstruction(volume, scan.grid, record=run.record, facts=facts, state=state)
+    state = loop.state_if_interrupted()
+    return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
 
 
-class _Run:
-    """Where the run is, and whether somebody has stopped it: passes over the frames, reported one by one."""
+class _Passes:
+    """A trainer, ``Stepwise`` for the loop: a step is a frame, an iteration a pass over all of them."""
 
-    def __init__(self, trainer: Trainer, iterations: int, report: ProgressReport, started: float) -> None:
-        self.trainer, self.iterations, self.report, self.started = trainer, iterations, report, started
-        self.record: list[dict[str, float]] = []
-        self.is_interrupted = False
+    quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
 
-    def loop(self) -> None:
-        """All passes; Ctrl-C (or a report that raises KeyboardInterrupt) ends the run after the step under way."""
-        trainer = self.trainer
-        with stop_on_interrupt() as request:
-            while trainer.passes < self.iterations and not self.is_interrupted:
-                trainer.step()
-                if trainer.is_between_passes:
-                    self._report()
-                self.is_interrupted |= request.is_set
-                self.is_interrupted &= trainer.passes < self.iterations
+    def __init__(self, trainer: Trainer, iterations: int) -> None:
+        self.trainer, self.iterations = trainer, iterations
+
+    @property
+    def iteration(self) -> int:
+        return self.trainer.passes
+
+    def step(self) -> None:
+        self.trainer.step()
+
+    def measures(self) -> dict[str, float]:
+        return {"loss": float(np.mean(self.trainer.losses))}
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the trainer and a loop need to go on from here."""
-        so_far = history_arrays(self.record, time.perf_counter() - self.started)
-        return {**self.trainer.state(), **so_far}
+        return self.trainer.state()
 
     def restore(self, state: State) -> None:
-        """Goes on from a state; raises InputError for one that this run cannot have left."""
         trainer, frames = self.trainer, self.trainer.scan.frames
         names = ("parameters", "moments", "queue", "losses")
         parameters, moments, queue, losses = state_arrays(state, names)
@@ -125,30 +113,11 @@ class _Run:
             raise InputError("checkpoint, array queue", found, expected, "start without --resume")
         check_array("losses", losses, (steps % frames or min(steps, frames),), np.float64)
         restore_generator(trainer.rng, state)
-        self.record, before_s = checked_history(state)
-        self.started -= before_s
         trainer.steps, trainer.queue, trainer.losses = steps, queue.tolist(), losses.tolist()
         trainer.restore(parameters, moments, count_of(state, "updates", steps))
 
-    def _report(self) -> None:
-        trainer = self.trainer
-        loss = float(np.mean(trainer.losses))
-        if not np.isfinite(loss):
-            found = f"{loss} at iteration {trainer.passes}"
-            remedy = "check the scan for extreme values, or lower the rate"
-            raise NumericalError("loss", found, "a finite number", remedy)
-        seconds = time.perf_counter() - self.started
-        self.record.append({"iteration": trainer.passes, "loss": loss, "seconds": seconds})
-        grid = trainer.scan.grid
-        now = Progress(
-            *(trainer.passes, self.iterations, loss, 0, seconds),
-            state=self.state,
-            volume=lambda: (trainer.volume(grid), grid),
-        )
-        try:
-            self.report(now)
-        except KeyboardInterrupt:
-            self.is_interrupted = True
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return self.trainer.volume(self.trainer.scan.grid), self.trainer.scan.grid
 
 
 def _torch_version() -> str:

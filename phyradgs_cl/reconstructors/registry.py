@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import MOTIONS, Motion, Scan
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.asd_pocs import AsdPocsOptions, asd_pocs
 from phyradgs_cl.reconstructors.cgls import CglsOptions, cgls
@@ -26,13 +27,8 @@ from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 
-_MOTION_KEYS = ("motion", "strips", "sub_intervals", "segments", "time_error")
-_MODELS_WITH = {
-    "strips": ("micro-views",),
-    "sub_intervals": ("micro-views", "per-row"),
-    "segments": ("exact",),
-    "time_error": ("exact",),
-}
+_COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
+"""The fields of motion models, by which options name them."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,8 @@ def method_name(method: object) -> str:
 def method_options(method: str, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
 
-    ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together.
+    ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
+    may be a model of one's own.
     Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
     """
     method = method_name(method)
@@ -86,8 +83,10 @@ def method_options(method: str, preset: str | None = None, changes: Mapping[str,
         raise InputError("--preset", checks.shown(name), f"one of {', '.join(presets)} for --method {method}")
     changes = dict(changes or {})
     base = presets[name]
-    motion = _motion(method, base, {key: changes.pop(key, None) for key in _MOTION_KEYS})
-    return _changed(replace(base, motion=motion), changes, f"--method {method}")
+    motion = changes.pop("motion", None)
+    counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
+    base = replace(base, motion=_motion(method, base, motion, counts))
+    return _changed(base, changes, f"--method {method}")
 
 
 def reconstruct(
@@ -133,66 +132,55 @@ def input_options(changes: Mapping[str, Any]) -> InputOptions:
 
 
 def motions_of(method: str) -> tuple[str, ...]:
-    """The motion models that a method takes: those that its options accept."""
-    return _motions(next(iter(METHODS[method].presets.values())))
+    """The names of the motion models that a method takes."""
+    return tuple(_models(next(iter(METHODS[method].presets.values()))))
 
 
-def _motions(base: Any) -> tuple[str, ...]:
-    return tuple(name for name in MOTIONS if _accepts(base, replace(base.motion, name=name)))
+def _models(options: Any) -> dict[str, Any]:
+    """The models of ``options`` by name, with what the preset says of its own."""
+    return {model.name: model for model in (*options.MOTIONS, options.motion)}
 
 
-def _accepts(options: Any, motion: Motion) -> bool:
-    try:
-        replace(options, motion=motion)
-    except InputError:
-        return False
-    return True
+def _has(model: Any, count: str) -> bool:
+    return any(f.name == count and f.init for f in fields(model))
 
 
-def _motion(method: str, options: Any, given: dict[str, Any]) -> Motion:
-    """The motion of ``options`` with the name and the counts that are given, of which the model must have each."""
-    base: Motion = options.motion
-    names = motions_of(method)
-    name = _implied_motion(base.name, given, names) if given["motion"] is None else given["motion"]
-    if name not in names:
-        raise InputError("--motion", checks.shown(name), f"one of {', '.join(names)} for --method {method}")
-    counts = {key: value for key, value in given.items() if key != "motion" and value is not None}
+def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
+    """The model of ``options`` by its name, with the counts that are given, of which it must have each; or one's own."""
+    if callable(getattr(motion, "cells", None)) and not counts:
+        return motion
+    models = _models(options)
+    name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
+    if not isinstance(name, str) or name not in models:
+        raise InputError("--motion", checks.shown(name), f"one of {', '.join(models)} for --method {method}")
+    model = models[name]
     for key, value in counts.items():
         option = "--" + key.replace("_", "-")
-        if key == "sub_intervals" and not getattr(options, "has_sub_intervals", True):
-            raise InputError(
-                option, f"--method {method}", "a method with more than one pose a line", "leave it out"
-            )
-        if name not in _MODELS_WITH[key]:
-            having = " or ".join(n for n in _MODELS_WITH[key] if n in names)
+        if not _has(model, key):
+            having = " or ".join(n for n, other in models.items() if _has(other, key))
+            found = f"--motion {name} for --method {method}"
             expected = f"--motion {having}" if having else "a method with a motion that has them"
-            raise InputError(
-                option, f"--motion {name} for --method {method}", expected, f"leave {option} out"
-            )
-        counts[key] = _converted(getattr(base, key), value, option)
-    return replace(base, name=name, **counts)
+            raise InputError(option, found, expected, f"leave {option} out")
+        model = replace(model, **{key: _converted(getattr(model, key), value, option)})
+    return model
 
 
-def _motion_keys(options: Any) -> list[str]:
-    """The names by which the motion of ``options`` can be changed: counts that one of its models has."""
-    if not hasattr(options, "motion"):
-        return []
-    counts = [key for key, models in _MODELS_WITH.items() if set(models) & set(_motions(options))]
-    if not getattr(options, "has_sub_intervals", True):
-        counts.remove("sub_intervals")
-    return ["motion", *counts]
-
-
-def _implied_motion(usual: str, given: Mapping[str, Any], names: tuple[str, ...]) -> str:
+def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
     """The usual model; where that follows the motion in its own way, the one that has what is given.
 
     A method that is static by itself stays so until it is told otherwise.
     """
-    counts = [key for key in _MOTION_KEYS if key != "motion" and given[key] is not None]
-    if usual.startswith("static") or all(usual in _MODELS_WITH[key] for key in counts):
+    if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
-    having = [name for name in names if all(name in _MODELS_WITH[key] for key in counts)]
+    having = [name for name, model in models.items() if all(_has(model, key) for key in counts)]
     return having[0] if len(having) == 1 else usual
+
+
+def _motion_options(options: Any) -> list[str]:
+    """The names by which the motion of ``options`` can be changed."""
+    if not hasattr(options, "motion"):
+        return []
+    return ["motion", *(key for key in _COUNTS if any(_has(m, key) for m in _models(options).values()))]
 
 
 def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
@@ -201,7 +189,7 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
-            names = [*known, *_motion_keys(options)]
+            names = [*known, *_motion_options(options)]
             remedy = near_miss(key, names, "leave it out")
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
         values[key] = _converted(known[key], value, f"{culprit}: option {key}")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
+from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
 
@@ -55,6 +57,11 @@ ProgressReport = Callable[[Progress], None]
 
 def ignore_progress(progress: Progress) -> None:
     """The default report: none."""
+
+
+def option_facts(options: Any) -> dict[str, object]:
+    """A method's options for the facts of its result."""
+    return {**asdict(options), "motion": motion_facts(options.motion)}
 
 
 def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition import Exact, Scan, TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators import DeviceCells
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
-from phyradgs_cl.reconstructors.system import averages
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
 _PEAK_PERCENTILE = 99.9  # noise has peaks of its own
 
@@ -31,49 +30,27 @@ class Scale:
 
 
 class DeviceFrames:
-    """The scan on the device: time cells, measurement in internal units and mask of every frame.
+    """The scan on the device: time cells, measurement in internal units and mask of every frame."""
 
-    With ``keeps_frames`` false the measurements stay on the host, and ``get`` copies one at a time.
-    """
-
-    def __init__(
-        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, keeps_frames: bool = True
-    ) -> None:
-        self.rt, self.count = rt, scan.frames
-        by_column = scan.shutter.axis == "columns"
-        rows, columns = scan.geometry.detector_shape
-        self.lines, self.width = (columns, rows) if by_column else (rows, columns)
+    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
+        self.count = scan.frames
+        readout = scan.shutter.readout
+        self.lines, self.width = readout.shape(scan.geometry.detector_shape)
         tables, merges = cells_of_scan(scan, options)
-        tables = [scaled_cells(table, 1 / scale.length_mm) for table in tables]
-        self._tables = tables
-        self._cells = [DeviceCells.upload(rt, table) for table in tables]
-        self._parts: dict[tuple[int, int, int], DeviceCells] = {}
+        self._cells = [DeviceCells.upload(rt, table.scaled(1 / scale.length_mm)) for table in tables]
         self.intensity_unit = scale.line_integral if merges else None
-        self._line_integral, self._by_column = np.float32(scale.line_integral), by_column
-        self._frames = scan.projections
-        self._measured = [rt.upload(self._internal(f)) for f in range(scan.frames)] if keeps_frames else []
-        self._mask, self._pixels = _upload_masks(rt, scan, by_column)
+        measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
+        self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
+        self._mask, self._pixels = _upload_masks(rt, scan)
         self._transmission: list[DeviceArray] = []
         if options.poisson_weight > 0:
             valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
             trust = transmission_weights(scan.projections, valid)
-            self._transmission = [rt.upload(pad_rows(t.T if by_column else t)) for t in trust]
-
-    def _internal(self, frame: int) -> np.ndarray:
-        """A frame in internal units, lines first, padded."""
-        image = self._frames[frame] / self._line_integral
-        return pad_rows(image.T if self._by_column else image)
+            self._transmission = [rt.upload(pad_rows(readout.frames(t))) for t in trust]
 
     def cells(self, frame: int) -> DeviceCells:
         """The time cells of a frame."""
         return self._cells[frame]
-
-    def part(self, frame: int, lines: range) -> DeviceCells:
-        """The cells of a frame as far as they serve ``lines``."""
-        key = frame, lines.start, lines.stop
-        if key not in self._parts:
-            self._parts[key] = DeviceCells.upload(self.rt, cells_within(self._tables[frame], lines))
-        return self._parts[key]
 
     def transmission(self, frame: int) -> DeviceArray | None:
         """Weights of the Poisson term, where it counts."""
@@ -86,43 +63,27 @@ class DeviceFrames:
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
         shared = frame if len(self._mask) > 1 else 0
-        measured = self._measured[frame] if self._measured else self.rt.upload(self._internal(frame))
-        return self._cells[frame], measured, self._mask[shared], self._pixels[shared]
+        return self._cells[frame], self._measured[frame], self._mask[shared], self._pixels[shared]
 
 
 def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], bool]:
     """The time cells of every frame, in mm, and whether the detector merges intensities of several."""
     model = scan.detector_model if options.detector_model == "scan" else options.detector_model
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
-    tables = [options.motion.cells(scan, frame, peak) for frame in range(scan.frames)]
+    cells, motion = options.motion.cells, options.motion
+    if isinstance(motion, Exact):
+        cells = partial(motion.cells, intensity_peak=peak)
+    tables = [cells(scan, frame) for frame in range(scan.frames)]
     # of one value both models are the mean
-    return tables, model == "intensity" and any(averages(table) for table in tables)
+    return tables, model == "intensity" and any(table.averages for table in tables)
 
 
-def _upload_masks(rt: Runtime, scan: Scan, by_column: bool) -> tuple[list[DeviceArray], list[float]]:
+def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
     """Masks that are 1 where a pixel counts: one for all frames, or one a frame."""
     if scan.pixel_mask is None:
         masks = [np.ones(scan.geometry.detector_shape, np.float32)]
     else:
         stack = scan.pixel_mask if scan.pixel_mask.ndim == 3 else scan.pixel_mask[None]
         masks = [(m == 0).astype(np.float32) for m in stack]
-    arrays = [rt.upload(pad_rows(m.T if by_column else m)) for m in masks]
+    arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in masks]
     return arrays, [float(m.sum()) for m in masks]
-
-
-def scaled_cells(table: TimeCells, factor: float) -> TimeCells:
-    """The same cells with all lengths multiplied by ``factor``."""
-    ends = None if table.end_poses is None else table.end_poses * factor
-    return replace(table, pose=table.pose * factor, end_poses=ends)
-
-
-def cells_within(table: TimeCells, lines: range) -> TimeCells:
-    """The cells that serve any of ``lines``, and only those lines; at least one cell, which may serve none."""
-    start = np.clip(table.line_start, lines.start, lines.stop)
-    stop = np.clip(table.line_stop, lines.start, lines.stop)
-    kept = np.flatnonzero(stop > start)
-    kept = kept if kept.size else np.zeros(1, np.int64)
-    names = ("pose", "time_s", "weight", "end_poses", "line_times")
-    arrays = {name: getattr(table, name) for name in names}
-    some = {name: None if values is None else values[kept] for name, values in arrays.items()}
-    return replace(table, line_start=start[kept], line_stop=np.maximum(stop, start)[kept], **some)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Static, StaticStart
+from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 
-SPLITS = ("frames", "domain")
 _WEIGHT = (0, 1e6)
 _RANGES = {
     "ssim_weight": _WEIGHT,
@@ -45,12 +46,12 @@ class SplatOptions:
     what the scan says. ``pixel_footprint`` lets pixels average over their area.
 
     ``iterations`` counts frames: a step of Adam is taken every ``batch`` of them (0: as many as there are ranks), with
-    rates × √batch. ``split`` says what ranks share out: ``frames``, every rank with all Gaussians, or the ``domain``, every
-    rank with its own. ``parts``: into how many parts a frame's lines, or the Gaussians, are cut for that (0: as many as
-    there are ranks for them); the same batch and parts give the same bits on any number of ranks (docs/cluster.md).
+    rates × √batch. The same batch gives the same bits on any number of ranks (docs/cluster.md).
     """
 
-    motion: Motion = Motion("exact")
+    MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), StaticStart(), MicroViews(), Exact())
+
+    motion: Motion = Exact()
     affine: bool = False
     detector_model: str = "scan"
     pixel_footprint: bool = False
@@ -74,8 +75,6 @@ class SplatOptions:
     scale_min_voxels: float = 0.0
     scale_max: float = 1.0
     batch: int = 0
-    split: str = "frames"
-    parts: int = 0
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
 
@@ -83,14 +82,11 @@ class SplatOptions:
         checks.within("--iterations", self.iterations, 0, 1_000_000_000)
         checks.within("--gaussians (0 chooses from the grid)", self.gaussians, 0, 100_000_000)
         checks.within("--batch (0: as many as ranks)", self.batch, 0, 1_000_000)
-        checks.one_of("--split", self.split, SPLITS)
-        checks.within("--parts (0: as many as ranks)", self.parts, 0, 1_000_000)
         checks.fields_within("", self, _RANGES)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         if self.scale_max <= self.scale_min:
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
-        if self.motion.name == "per-row":
-            raise InputError("--motion", "'per-row'", "static, static-start, micro-views or exact")
+        check_motion(self.motion, self.MOTIONS)
 
     def activation(self, grid: Grid) -> Activation:
         """Bounds of the scales on ``grid`` (in internal units)."""
@@ -105,23 +101,20 @@ class SplatOptions:
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Frames a step: as asked, else one for every rank that has work of its own, none twice."""
+        """Frames per step: as asked, else one for every rank, none twice."""
         if self.batch > frames:
             raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
-        return self.batch or (min(ranks, frames) if self.split == "frames" else 1)
+        return self.batch or min(ranks, frames)
 
     @property
     def asks_for_gaussians(self) -> bool:
         """Whether the size of the first cloud is somebody's own wish and not a preset's."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
-    def as_dict(self) -> dict[str, object]:
-        return asdict(self)
-
 
 PUBLISHED_CONTROL = DensityControl(threshold=5e-5, prune_aspect=0.0)
 _PAPER = SplatOptions(
-    motion=Motion("micro-views", 8, 5),
+    motion=MicroViews(8, 5),
     gaussians=50_000,
     iterations=20_000,
     rates=PUBLISHED_RATES,
@@ -130,7 +123,7 @@ _PAPER = SplatOptions(
 _RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 # a sixth of the iterations with everything at the same share of them, and two or three segments a frame
 _QUICK = SplatOptions(
-    motion=Motion("exact", time_error=0.02),
+    motion=Exact(time_error=0.02),
     iterations=500,
     parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
@@ -139,7 +132,7 @@ _QUICK = SplatOptions(
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER, "released": _RELEASED}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
-    motion=Motion("static"),
+    motion=Static(),
     affine=True,
     gaussians=50_000,
     ssim_weight=0.25,

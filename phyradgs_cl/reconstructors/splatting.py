@@ -11,17 +11,25 @@ import time
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Exact, Scan
 from phyradgs_cl.operators.splat import PAIR_KERNELS
 from phyradgs_cl.operators.splat_count import Work
 from phyradgs_cl.optim import Population
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State
+from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
 from phyradgs_cl.reconstructors.splat_frames import Scale
 from phyradgs_cl.reconstructors.splat_options import SplatOptions
 from phyradgs_cl.reconstructors.splat_run import SplatRun
 from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
+
+REPORT_EVERY, LEAST_RECORDED = 50, 20
+
+
+def record_interval(iterations: int) -> int:
+    """Iterations from line to line of the record: as for reports, but fewer in short runs, to show how they went."""
+    return max(1, min(REPORT_EVERY, iterations // LEAST_RECORDED))
 
 
 def reconstruct_splats(
@@ -42,35 +50,33 @@ def reconstruct_splats(
     scale, population, rng = rt.ranks.tell(_start(rt, scan, options, seed) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
-    if resume is not None:
-        run.restore(resume)
-    run.optimise(report, started)
+    loop = Loop(run, rt.ranks, report, started, record_interval(options.iterations), REPORT_EVERY)
+    loop.run(resume)
     cloud = run.present_cloud()
     volume = run.present_volume()[0]
     facts = {
         "method": method,
-        "options": options.as_dict(),
+        "options": option_facts(options),
         "seed": seed,
         "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm,
         "gaussians_asked": options.gaussians_for(run.grid),
         "gaussians_first": first_count,
         "gaussians": cloud.count,
-        "seconds": time.perf_counter() - started + run.seconds_before,
+        "seconds": loop.seconds,
         "density_control_seconds": run.control_seconds,
         "density_control_rounds": run.control_rounds,
-        "interrupted_at": run.interrupted_at,
+        "interrupted_at": loop.interrupted_at,
         "detector_model": "log" if run.frames.intensity_unit is None else "intensity",
         "batch": run.batch,
         "ranks": rt.ranks.size,
     }
-    if options.motion.name == "exact":
+    if isinstance(options.motion, Exact):
         facts |= time_facts(run)
     if rt.profile:
         facts["evaluated_pairs"] = evaluated_pairs(run)
-    state = run.state() if run.interrupted_at is not None else None
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
-    return Reconstruction(volume, scan.grid, cloud, run.record, facts, state)
+    return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
 
 
 def _start(
@@ -96,8 +102,7 @@ def evaluated_pairs(run: SplatRun) -> dict[str, int]:
 
 
 def _first_frame_work(run: SplatRun) -> Work:
-    """Of this rank's first Gaussians in the first frame."""
-    cloud, cells = run.clouds[0], run.frames.cells(0)
-    cloud.activate(run.objective.adam)
-    run.objective.projector.prepare(cloud.gaussians, cells)
-    return run.objective.projector.work(cloud.gaussians, cells)
+    gaussians, cells, projector = run.cloud.gaussians, run.frames.cells(0), run.frame_step.projector
+    run.cloud.activate(run.adam)
+    projector.prepare(gaussians, cells)
+    return projector.work(gaussians, cells)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.cells import TimeCells, layer_numbers
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators.intensity import IntensityOperator
 from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
@@ -37,14 +36,12 @@ class System:
     @classmethod
     def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> System:
         """The scan's frames with the cells of ``motion``; ``detector_model``: log, intensity, or the scan's own."""
-        tables = [motion.cells(scan, f) for f in range(scan.frames)]
+        tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         operator: LinearOperator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: Intensity | None = None
-        if model == "intensity" and any(
-            averages(table) for table in tables
-        ):  # of one value both are the mean
+        if model == "intensity" and any(table.averages for table in tables):  # of one value both are the mean
             intensity = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
@@ -114,11 +111,6 @@ class System:
         intensity = None if self.intensity is None else self.intensity.subset(chosen)
         light = None if self.light is None else self.light[chosen]
         return System(self.operator.subset(chosen), self.measured[chosen], valid, intensity, light)
-
-
-def averages(table: TimeCells) -> bool:
-    """Whether a line of the frame has more than one cell."""
-    return bool(layer_numbers(table).any())
 
 
 def norm(values: np.ndarray) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.reconstructors.prepared import prepared
 from phyradgs_cl.report.run import Run
@@ -56,7 +56,7 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
     if run.scan is None or count < 1:
         return []
     scan, chosen = prepared(run.scan, run.before), chosen_frames(run.scan.frames, count)
-    motion = Motion("per-row", sub_intervals=TIMES_A_LINE)
+    motion = PerRow(sub_intervals=TIMES_A_LINE)
     tables = [motion.cells(scan, frame) for frame in chosen]
     operator = RayOperator(rt, run.stored.grid, scan.geometry.detector_shape, tables)
     computed = operator.forward(run.stored.volume)

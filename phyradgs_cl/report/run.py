@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
@@ -48,7 +49,7 @@ class Run:
         segments = self.stored.provenance.get("segments")
         known = {"segments": segments} if table.get("name") == "exact" and isinstance(segments, int) else {}
         try:
-            return Motion(**{**table, **known})
+            return motion_from_facts({**table, **known})
         except (InputError, TypeError):  # of another version, or of another program
             return None
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, PerRow
 from phyradgs_cl.report.curve import convergence_charts
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.geometry_drawing import orbit_drawing, side_drawing
@@ -151,13 +152,17 @@ def _motion_words(run: Run) -> str:
     motion = run.motion
     if motion is None:
         return ""
-    words = {
-        "static": "the dashed line is the one pose of a frame",
-        "static-start": "the dashed line is the one pose of a frame",
-        "micro-views": f"dots are the poses of {motion.strips} strips × {motion.sub_intervals} sub-intervals",
-        "per-row": f"dots are the {motion.sub_intervals} poses of some of the lines",
-        "exact": "dashed lines bound the segments in which Gaussians move",
-    }[motion.name]
+    match motion:
+        case MicroViews():
+            words = f"dots are the poses of {motion.strips} strips × {motion.sub_intervals} sub-intervals"
+        case PerRow():
+            words = f"dots are the {motion.sub_intervals} poses of some of the lines"
+        case LineMiddles():
+            words = "dots are the poses of some of the lines"
+        case Exact():
+            words = "dashed lines bound the segments in which Gaussians move"
+        case _:
+            words = "the dashed line is the one pose of a frame"
     return f"The run's motion is {motion.name}: {words}."
 
 

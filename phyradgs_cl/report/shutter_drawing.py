@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, Motion, Scan
+from phyradgs_cl.acquisition import CircularOrbit, LineMiddles, MicroViews, Motion, PerRow, Scan, StaticStart
 from phyradgs_cl.report.axes import TOP, Axes, svg, text
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.markup import Markup, element, joined
@@ -84,25 +84,25 @@ def _windows(axes: Axes, scan: Scan, start_s: float) -> list[Markup]:
 def _sampling(axes: Axes, scan: Scan, motion: Motion) -> list[Markup]:
     """When the run took its poses: a line for one a frame, edges of segments, or dots on lines."""
     bottom, top = axes.y
-    if motion.name in ("micro-views", "per-row") and scan.is_fly:
+    if isinstance(motion, MicroViews | PerRow | LineMiddles) and scan.is_fly:
         return [axes.dot(time_s, line, "sample") for time_s, line in _sample_times(scan, motion)]
     first_s, last_s = scan.shutter.lit_span_s
     cells = motion.cells(scan, 0)
-    at_s = [first_s if motion.name == "static-start" else scan.shutter.middle_s]
-    if cells.end_poses is not None:
+    at_s = [first_s if isinstance(motion, StaticStart) else scan.shutter.middle_s]
+    if cells.is_moving:
         at_s = np.linspace(first_s, last_s, cells.count + 1).tolist()
     return [axes.polyline([(t, bottom), (t, top)], "pose") for t in at_s]
 
 
 def _sample_times(scan: Scan, motion: Motion) -> list[tuple[float, float]]:
     """(time after the frame's start, line) of the poses, of some of the lines where every line has its own."""
-    rows = scan.lines if motion.name == "per-row" else min(motion.strips, scan.lines)
-    if rows * motion.sub_intervals > _MOST_CELLS:
+    rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
+    if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
         return []
     cells = motion.cells(scan, 0)
     line = (cells.line_start + cells.line_stop - 1) / 2
     shown = np.ones(cells.count, bool)
-    if motion.name == "per-row":
+    if not isinstance(motion, MicroViews):
         shown = np.isin(line, np.unique(np.linspace(0, scan.lines - 1, _LINES_WITH_DOTS).round()))
     times_s = cells.time_s - float(scan.frame_start_s[0])
     chosen = np.flatnonzero(shown)[:_MOST_DOTS]

@@ -9,14 +9,14 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import __version__, checks, signals
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
@@ -46,7 +46,7 @@ from phyradgs_cl.reconstructors.interrupt import (
     finish_despite_interrupt,
     keep_finished_work,
 )
-from phyradgs_cl.reconstructors.system import averages
+from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 
@@ -182,7 +182,7 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     """Says what can be reconstructed, but is hardly what was meant."""
-    motion: Motion = options.motion
+    motion = options.motion
     if (
         scan.detector_model == "intensity"
         and not hasattr(options, "detector_model")
@@ -190,7 +190,7 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     ):
         found = "%s averages intensity over an exposure; --method %s averages line integrals"
         log.warning(found, job.scan, job.method)
-    if scan.is_fly and motion.name == "micro-views" and motion.strips > scan.lines:
+    if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
         found = "%d strips are more than the %d lines of %s: a strip a line is the most there is"
         log.warning(found, motion.strips, scan.lines, job.scan)
     grid = scan.with_grid(job.before).grid
@@ -210,9 +210,8 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
 
 def _averages(scan: Scan, options: Any) -> bool:
     """Whether the method merges several poses into a line: of one pose, both detector models are the same."""
-    if options.motion.name == "exact":
-        return scan.is_fly
-    return getattr(options, "has_sub_intervals", True) and averages(options.motion.cells(scan, 0))
+    cells = options.motion.cells(scan, 0)
+    return cells.is_moving or cells.averages
 
 
 def profile_report(rt: Runtime, result: Reconstruction) -> str:
@@ -248,7 +247,7 @@ def _provenance(
 
 def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
     """What a run that goes on must have in common with the one that it continues, as JSON."""
-    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **asdict(options)}
+    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **option_facts(options)}
     return json.dumps({"scan": scan_hash[:16], **run}, sort_keys=True, default=repr)
 
 

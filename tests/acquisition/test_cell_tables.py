@@ -13,8 +13,10 @@ from phyradgs_cl.acquisition import (
     ConeGeometry,
     ConstantSpeed,
     EncoderTable,
+    Exact,
     FrameSweeps,
-    Motion,
+    MicroViews,
+    PerRow,
     PoseTable,
     Protocol,
     Scan,
@@ -24,10 +26,8 @@ from phyradgs_cl.acquisition import (
 )
 from phyradgs_cl.acquisition.cells import (
     exact_cells,
-    finer_cells,
-    layer_numbers,
-    layer_weights,
     micro_view_cells,
+    per_line_cells,
     segments_for,
     static_cells,
 )
@@ -48,17 +48,17 @@ def micro_views(strips: int, sub_intervals: int):
 
 
 def test_cells_that_only_touch_share_a_layer() -> None:
-    np.testing.assert_array_equal(layer_numbers(micro_views(3, 1)), 0)
+    np.testing.assert_array_equal(micro_views(3, 1).layer_numbers, 0)
     table = micro_views(2, 3)
-    assert sorted(layer_numbers(table)) == [0, 0, 1, 1, 2, 2]
+    assert sorted(table.layer_numbers) == [0, 0, 1, 1, 2, 2]
 
 
 @pytest.mark.parametrize(
     "table", [micro_views(3, 2), exact_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, 4)]
 )
 def test_layers_hold_every_lines_weights_once(table) -> None:
-    numbers = layer_numbers(table)
-    weights = layer_weights(table, numbers)
+    numbers = table.layer_numbers
+    weights = table.layer_weights
     assert weights.shape == (numbers.max() + 1, LINES)
     np.testing.assert_allclose(weights.sum(0), table.line_weights(), rtol=0, atol=FLOAT64)
     for line in range(LINES):
@@ -70,14 +70,48 @@ def test_layers_hold_every_lines_weights_once(table) -> None:
 
 
 def test_no_cell_needs_no_layer() -> None:
-    empty = replace(static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES), weight=np.zeros(0))
-    assert layer_weights(empty, np.zeros(0, np.int64)).shape == (0, LINES)
+    none = np.zeros(0, np.int32)
+    one = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
+    empty = replace(one, line_start=none, line_stop=none, weight=np.zeros(0))
+    assert empty.layer_weights.shape == (0, LINES)
+
+
+def test_a_line_s_pose_is_that_of_the_middle_of_its_exposure() -> None:
+    where = (ORBIT, Shutter(0.8, 0.6), 1, 3.0, LINES)
+    middles = per_line_cells(*where, 1).pose
+    np.testing.assert_array_equal(per_line_cells(*where, 1).line_poses(), middles)
+    np.testing.assert_allclose(per_line_cells(*where, 5).line_poses(), middles, rtol=0, atol=1e-12)
+    strips = micro_view_cells(*where, 2, 3)
+    expected = np.repeat(strips.pose[[1, 4]], LINES // 2, axis=0)
+    np.testing.assert_array_equal(strips.line_poses(), expected)
+    assert static_cells(*where).line_poses().shape == (1, 12)
+    with pytest.raises(InputError, match="a line without a time cell"):
+        replace(strips, line_stop=strips.line_start + 1).line_poses()
+
+
+def test_cells_that_serve_a_line() -> None:
+    """Sorted by first line, but of any length, with gaps and with lines that nothing serves."""
+    ranges = np.array([[1, 2], [1, 9], [2, 3], [4, 6], [10, 12], [10, 11]])
+    one = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, 14)
+    served = replace(one, line_start=ranges[:, 0], line_stop=ranges[:, 1], weight=np.ones(6)).line_cells()
+    for line, (first, stop) in enumerate(served):
+        inside = np.flatnonzero((ranges[:, 0] <= line) & (line < ranges[:, 1]))
+        assert all(first <= cell < stop for cell in inside)
+    assert served[0, 0] >= served[0, 1] and served[13, 0] >= served[13, 1]
+
+
+def test_cells_with_motion_are_for_splats() -> None:
+    moving = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, 2)
+    with pytest.raises(InputError, match="--motion: found cells with motion"):
+        moving.still()
+    far = moving.scaled(50.0)
+    np.testing.assert_array_equal(far.end_poses, 50.0 * moving.end_poses)
 
 
 @pytest.mark.parametrize("factor", [2, 3])
 def test_finer_pixels_lie_inside_of_those_they_were_cut_from(factor) -> None:
     table = micro_views(2, 2)
-    finer = finer_cells(table, factor)
+    finer = table.finer(factor)
     assert finer.lines == factor * LINES
     np.testing.assert_array_equal(finer.line_stop, factor * table.line_stop)
     np.testing.assert_array_equal(finer.line_start, factor * table.line_start)
@@ -175,7 +209,7 @@ def test_one_segment_of_a_gantry_at_rest() -> None:
         EncoderTable(np.arange(2.0), np.arange(2.0)),
         FrameSweeps(np.zeros(1), 1.0, np.zeros(1), np.ones(1)),
         PoseTable(np.arange(2.0), GEOMETRY.pose(np.arange(2.0))),
-        Motion(),
+        MicroViews(),
         Protocol(),
         Shutter(0.8),
         a_scan(),
@@ -208,16 +242,17 @@ def test_a_static_table_is_one_cell_of_all_lines() -> None:
 
 
 def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
-    assert Motion() == Motion("micro-views", 8, 5, 0, 0.005)
-    for name, lowest, highest in (
-        ("strips", 1, 10_000),
-        ("sub_intervals", 1, 10_000),
-        ("segments", 0, 1000),
-        ("time_error", 1e-6, 1),
+    assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
+    for model, name, lowest, highest in (
+        (MicroViews, "strips", 1, 10_000),
+        (MicroViews, "sub_intervals", 1, 10_000),
+        (PerRow, "sub_intervals", 1, 10_000),
+        (Exact, "segments", 0, 1000),
+        (Exact, "time_error", 1e-6, 1),
     ):
         for inside in (lowest, highest):
-            assert getattr(Motion(**{name: inside}), name) == inside
+            assert getattr(model(**{name: inside}), name) == inside
         for outside in (lowest * 0.9 - 1e-9, highest * 1.001):
             with pytest.raises(InputError):
-                Motion(**{name: outside})
+                model(**{name: outside})
     assert ConeGeometry(50.0, 70.0, (1, 1), (0.6, 0.5)).detector_shape == (1, 1)

@@ -11,11 +11,11 @@ from phyradgs_cl.acquisition import (
     ConeGeometry,
     ConstantSpeed,
     EncoderTable,
-    Motion,
+    Exact,
     Shutter,
     SpeedRamp,
 )
-from phyradgs_cl.acquisition.cells import exact_cells, layer_numbers, segments_for, static_cells
+from phyradgs_cl.acquisition.cells import exact_cells, segments_for, static_cells
 from phyradgs_cl.errors import InputError
 
 LINES = 9
@@ -110,7 +110,7 @@ def test_there_are_never_more_than_1000_segments() -> None:
 )
 def test_impossible_numbers_are_named(change, option) -> None:
     with pytest.raises(InputError, match=option):
-        Motion("exact", **change)
+        Exact(**change)
     with pytest.raises(InputError, match="segments"):
         exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 0)
 
@@ -124,6 +124,6 @@ def test_averaged_intensities_take_more_segments_where_contrast_is_high() -> Non
 def test_segments_that_begin_at_different_lines_still_meet_in_one_line() -> None:
     """What decides whether a detector's averaging matters: not where cells begin, but whether a line has two."""
     meeting = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 4)
-    assert layer_numbers(meeting).max() > 0
+    assert meeting.layer_numbers.max() > 0
     alone = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 1)
-    assert layer_numbers(alone).max() == 0
+    assert alone.layer_numbers.max() == 0

@@ -11,10 +11,10 @@ from phyradgs_cl.acquisition import (
     CircularOrbit,
     ConeGeometry,
     ConstantSpeed,
-    Motion,
     Protocol,
     Scan,
     Shutter,
+    Static,
 )
 from phyradgs_cl.acquisition.cells import (
     micro_view_cells,
@@ -136,7 +136,7 @@ def test_dark_lines_join_the_mask_of_a_scan() -> None:
 def test_a_pulsed_scan_knows_when_it_needs_a_pose(is_fly) -> None:
     pulsed = scan(DARK_FROM, is_fly=is_fly)
     pulsed.check_timing()
-    assert Motion("static").cells(pulsed, 1).time_s[0] == pytest.approx(START_S + 0.55)
+    assert Static().cells(pulsed, 1).time_s[0] == pytest.approx(START_S + 0.55)
 
 
 @pytest.mark.parametrize("is_fly", [True, False])

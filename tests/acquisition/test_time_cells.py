@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Scan, Shutter
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    Exact,
+    MicroViews,
+    PerRow,
+    Scan,
+    Shutter,
+    Static,
+    StaticStart,
+)
 from phyradgs_cl.acquisition.cells import (
     exact_cells,
     micro_view_cells,
@@ -14,6 +25,7 @@ from phyradgs_cl.acquisition.cells import (
     static_cells,
     static_start_cells,
 )
+from phyradgs_cl.acquisition.motion import motion_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -113,7 +125,7 @@ def test_counts_below_one_are_refused() -> None:
         with pytest.raises(InputError, match="strips|sub-intervals"):
             micro_view_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, strips, sub_intervals)
         with pytest.raises(InputError, match="strips|sub-intervals"):
-            Motion("micro-views", strips, sub_intervals)
+            MicroViews(strips, sub_intervals)
     with pytest.raises(InputError, match="time samples"):
         per_line_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)
 
@@ -133,11 +145,11 @@ def scan(is_fly: bool) -> Scan:
 @pytest.mark.parametrize(
     "motion, fly_count, standing_count",
     [
-        (Motion("static"), 1, 1),
-        (Motion("static-start"), 1, 1),
-        (Motion("micro-views", 4, 3), 12, 1),
-        (Motion("per-row", sub_intervals=3), 30, 1),
-        (Motion("exact", segments=5), 5, 1),
+        (Static(), 1, 1),
+        (StaticStart(), 1, 1),
+        (MicroViews(4, 3), 12, 1),
+        (PerRow(sub_intervals=3), 30, 1),
+        (Exact(segments=5), 5, 1),
     ],
 )
 def test_motion_models_of_moving_and_standing_scans(motion, fly_count, standing_count) -> None:
@@ -156,11 +168,11 @@ def test_without_a_number_segments_follow_from_the_time_error(peak) -> None:
     where = (ORBIT, fly.shutter, 1, START_S)
     segments = segments_for(*where, 0.001, peak)
     expected = exact_cells(*where[:3], START_S, 10, segments)
-    found = Motion("exact", time_error=0.001).cells(fly, 1, peak)
+    found = Exact(time_error=0.001).cells(fly, 1, peak)
     np.testing.assert_array_equal(found.line_times, expected.line_times)
     np.testing.assert_array_equal(found.pose, expected.pose)
 
 
 def test_unknown_motion_is_refused() -> None:
     with pytest.raises(InputError, match="micro-views"):
-        Motion("micro-view")
+        motion_of("micro-view")

@@ -30,7 +30,7 @@ from tables.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, pha
 from tables.raw_counts import Panel, measured_attenuation
 from tables.results import read_lines
 
-from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Motion
+from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Static
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import only_run
@@ -317,7 +317,7 @@ def test_both_scans_of_a_case_agree_in_poses_and_truth(rt: Runtime) -> None:
     fly, still = case.scan(FLY), case.scan(STILL)
     assert (fly.is_fly, still.is_fly) == (True, False)
     for frame in (0, 24):
-        poses = [Motion("static").cells(scan, frame).pose for scan in (fly, still)]
+        poses = [Static().cells(scan, frame).pose for scan in (fly, still)]
         np.testing.assert_allclose(*poses, atol=1e-9)
     assert case.scan(FLY) is fly
     assert case.measure(case.truth)["psnr_db"] == np.inf

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Static
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.runtime import device, pocl
 from phyradgs_cl.workflow import evaluate, load_scan, reconstruct
@@ -79,21 +79,19 @@ def test_frames_that_do_not_follow_each_other_are_said(warned, scan, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("motion", "is_fly", "has_sub_intervals", "expected"),
+    ("motion", "is_fly", "expected"),
     [
-        (Motion("micro-views"), True, True, True),
-        (Motion("exact"), True, True, True),
-        (Motion("static"), True, True, False),
-        (Motion("per-row"), True, False, False),  # one pose a line: there is nothing to average
-        (Motion("micro-views"), False, True, False),
+        (MicroViews(), True, True),
+        (Exact(), True, True),
+        (Static(), True, False),
+        (LineMiddles(), True, False),  # one pose per line: there is nothing to average
+        (MicroViews(), False, False),
     ],
 )
-def test_detector_models_differ_only_where_poses_are_averaged(
-    scan, motion, is_fly, has_sub_intervals, expected
-):
+def test_detector_models_differ_only_where_poses_are_averaged(scan, motion, is_fly, expected):
     loaded = load_scan(scan)
     object.__setattr__(loaded, "is_fly", is_fly)
-    options = SimpleNamespace(motion=motion, has_sub_intervals=has_sub_intervals)
+    options = SimpleNamespace(motion=motion)
     assert reconstruct._averages(loaded, options) == expected
 
 

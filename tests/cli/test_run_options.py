@@ -18,7 +18,7 @@ def asked() -> tuple[typer.Typer, list[object]]:
     app = typer.Typer()
 
     @app.command()
-    @with_run_options("seed", "parts")
+    @with_run_options("seed", "batch")
     def command(
         scan: str,
         request: RunRequest,
@@ -42,7 +42,7 @@ def test_a_command_gets_what_was_given_and_none_for_the_rest(asked, tmp_path: Pa
     assert request.assignments == ["relaxation=0.5", "iterations=3"]
     given = {name: value for name, value in request.given.items() if value is not None}
     assert given == {"method": "sirt", "motion": "per-row", "ignore_lag": True, "memory": "1GiB"}
-    assert set(request.given) == set(RUN_OPTIONS) - {"seed", "parts", "config", "assignments"}
+    assert set(request.given) == set(RUN_OPTIONS) - {"seed", "batch", "config", "assignments"}
     config.write_text("iterations = 7\nseed = 5\n", encoding="utf-8")
     settings = request.settings()
     assert (settings.method, settings.seed, settings.memory) == ("sirt", 5, 2**30)
@@ -55,7 +55,7 @@ def test_nothing_given_is_nothing_given(asked) -> None:
     assert seen[1] == RunRequest(None, [], dict.fromkeys(seen[1].given))
 
 
-@pytest.mark.parametrize("option", ["--seed", "--parts"])
+@pytest.mark.parametrize("option", ["--seed", "--batch"])
 def test_what_is_left_out_is_no_option(asked, option: str) -> None:
     app, seen = asked
     assert CliRunner().invoke(app, ["s.h5", option, "1"]).exit_code == 2

@@ -90,14 +90,14 @@ def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(
 def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch, method) -> None:
     from phyradgs_cl.reconstructors import iterative
 
-    iterate = iterative._Loop._iterate
+    step = iterative._Iterations.step
 
-    def poisoned(self: iterative._Loop) -> None:
+    def poisoned(self: iterative._Iterations) -> None:
         if self.iteration == 2:
             self.measured_norm = float("nan")
-        iterate(self)
+        step(self)
 
-    monkeypatch.setattr(iterative._Loop, "_iterate", poisoned)
+    monkeypatch.setattr(iterative._Iterations, "step", poisoned)
     words = ["--method", method, "--iterations", "5", "--checkpoint-every", "1e-6"]
     words += ["--set", "noise_stop=0"] if method == "cgls" else []
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3

@@ -14,11 +14,12 @@ from phyradgs_cl.acquisition import (
     ConstantSpeed,
     EncoderTable,
     FrameSweeps,
-    Motion,
+    MicroViews,
     PoseTable,
     Saturation,
     Shutter,
     SpeedRamp,
+    Static,
 )
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
@@ -113,7 +114,7 @@ def test_standing_gantry_stays_static_with_the_same_poses(tmp_path, make_scan, k
     again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
     assert not again.is_fly
     for frame in range(scan.frames):  # the pose that a reconstruction uses
-        ours, theirs = (Motion("micro-views").cells(s, frame).pose for s in (scan, again))
+        ours, theirs = (MicroViews().cells(s, frame).pose for s in (scan, again))
         np.testing.assert_allclose(theirs, ours, rtol=0, atol=LENGTH_TOLERANCE_MM)
 
 
@@ -141,7 +142,7 @@ def test_pulse_and_lag_come_back(tmp_path, make_scan, is_fly) -> None:
     assert (again.shutter, again.lag) == (pulsed, 0.04)
     np.testing.assert_array_equal(again.pixel_mask, scan.pixel_mask)
     for frame in range(scan.frames):
-        ours, theirs = (Motion("static").cells(s, frame).pose for s in (scan, again))
+        ours, theirs = (Static().cells(s, frame).pose for s in (scan, again))
         np.testing.assert_allclose(theirs, ours, rtol=0, atol=LENGTH_TOLERANCE_MM)
     facts = scan_summary(path)
     assert (facts["pulse_start_s"], facts["pulse_length_s"], facts["lag"]) == (0.25, 0.5, 0.04)
@@ -156,7 +157,7 @@ def test_a_standing_gantry_on_a_pose_table_keeps_its_pulsed_pose(tmp_path, make_
     again = read_scan(tmp_path / "scan.h5", counts_to_attenuation)
     assert again.shutter.pulse_s is None
     for frame in range(scan.frames):
-        ours, theirs = (Motion("static").cells(s, frame).pose for s in (scan, again))
+        ours, theirs = (Static().cells(s, frame).pose for s in (scan, again))
         np.testing.assert_allclose(theirs, ours, rtol=0, atol=LENGTH_TOLERANCE_MM)
 
 

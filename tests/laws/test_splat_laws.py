@@ -10,9 +10,9 @@ from tolerances import ADJOINT, GRADIENT, SPLAT_CLOUD
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields.gaussians import DENSITY
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.operators.twins.splat import splat_frame
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
 STEP = 1e-5
 

@@ -14,10 +14,12 @@ from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.neural.fields import first_field
 from phyradgs_cl.neural.trainer import Trainer
+from phyradgs_cl.parallel import Alone
 from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.reconstructors.neural_run import _Run
-from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.neural_run import _Passes
+from phyradgs_cl.reconstructors.result import Progress, ignore_progress
 
 NEURAL = ("naf", "sax-nerf")
 SMALL = {"rays": 96, "levels": 2, "base_resolution": 8, "torch_device": "cpu"}
@@ -91,22 +93,21 @@ def test_a_run_goes_on_from_any_report_to_the_same_bits(rt, scan, method, stop) 
     assert [x["loss"] for x in rest.record] == [x["loss"] for x in whole.record]
 
 
-def small_run(scan: Scan) -> _Run:
+def small_run(scan: Scan) -> Loop:
     """Three passes of naf, not begun yet."""
     options = method_options("naf", None, SHORT["naf"])
     trainer = Trainer(scan, options, first_field(options, 16, 0), torch.device("cpu"), 1.0, 0)
-    return _Run(trainer, 3, lambda progress: None, 0.0)
+    return Loop(_Passes(trainer, 3), Alone(), ignore_progress, 0.0)
 
 
 def test_a_run_goes_on_from_the_middle_of_a_pass(scan) -> None:
     """The state between two steps, as a signal leaves it."""
     whole, part, rest = small_run(scan), small_run(scan), small_run(scan)
-    whole.loop()
+    whole.run(None)
     for _ in range(scan.frames + 4):
-        part.trainer.step()
-    rest.restore(part.state())
-    rest.loop()
-    assert np.array_equal(rest.trainer.volume(scan.grid), whole.trainer.volume(scan.grid))
+        part.method.step()
+    rest.run(part.state())
+    assert np.array_equal(rest.method.present_volume()[0], whole.method.present_volume()[0])
     assert rest.record[-1]["loss"] == whole.record[-1]["loss"]
 
 

@@ -44,9 +44,8 @@ def test_no_gaussian_costs_nothing() -> None:
     assert value == 0 and gradient.shape == (11, 0)
 
 
-@pytest.mark.parametrize(("count", "others"), [(5, 0), (16, 0), (21, 0), (1, 0), (5, 7)])
-def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_differences, count, others) -> None:
-    """A Gaussian alone too, and where some of those that the means are over are elsewhere."""
+@pytest.mark.parametrize("count", [1, 5, 16, 21])
+def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_differences, count) -> None:
     activation = Activation(0.01, 0.6)
     raw = activation.invert(make_cloud(count, 72, scale=(0.03, 0.3))).astype(np.float32).astype(float)
     raw[6:10] *= 1.7  # raw quaternions need not be unit
@@ -72,11 +71,9 @@ def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_difference
         shape_weight=TERMS.shape_weight,
         shape_ratio=TERMS.shape_ratio,
         shape_floor=TERMS.shape_floor,
-        of=count + others if others else None,
     )
     found = any_rt.download(gradients)[:11, :count]
     expected = finite_differences(lambda r: parameter_loss(activation.apply(r), TERMS)[0], raw)
-    expected *= count / (count + others)
     np.testing.assert_allclose(found, expected, rtol=0, atol=PARAMETER_GRADIENT * np.abs(expected).max())
     np.testing.assert_array_equal(any_rt.download(statistics), 0)  # nothing was in view
 

@@ -18,10 +18,10 @@ from tolerances import (
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, static_cells
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.operators.twins.splat_moving import moving_frame
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
 PIXEL_VARIANCE = 1 / 12

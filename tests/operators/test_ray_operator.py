@@ -182,16 +182,6 @@ def test_bricks_for_little_local_memory(rt, monkeypatch) -> None:
     np.testing.assert_allclose(operator.adjoint(y), usual, rtol=FLOAT32, atol=1e-6)
 
 
-def test_cells_that_serve_a_line() -> None:
-    """Sorted by first line, but of any length, with gaps and with lines that nothing serves."""
-    ranges = np.array([[1, 2], [1, 9], [2, 3], [4, 6], [10, 12], [10, 11]])
-    served = rays.serving(ranges, 14)
-    for line, (first, stop) in enumerate(served):
-        inside = np.flatnonzero((ranges[:, 0] <= line) & (line < ranges[:, 1]))
-        assert all(first <= cell < stop for cell in inside)
-    assert served[0, 0] >= served[0, 1] and served[13, 0] >= served[13, 1]
-
-
 def test_other_arrays_than_float32_in_c_order(rt) -> None:
     operator = RayOperator(rt, GRID, SHAPE, tables("static"))
     x, y = noise(GRID.shape, 87), noise(operator.frames_shape, 88)

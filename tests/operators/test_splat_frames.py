@@ -16,9 +16,9 @@ from tolerances import (
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.layout import pad_rows
 from phyradgs_cl.operators.twins.splat import splat_frame, splat_image
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
 START_S = 0.4

@@ -13,8 +13,6 @@ from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import (
     TimeCells,
     exact_cells,
-    layer_numbers,
-    layer_weights,
     micro_view_cells,
     per_line_cells,
     static_cells,
@@ -135,7 +133,7 @@ def test_nothing_drawn_is_nothing_seen(any_rt, make_table) -> None:
 @MOTIONS
 def test_no_line_has_two_cells_in_a_layer(make_table, motion) -> None:
     table = make_table(motion)
-    weights = layer_weights(table, layer_numbers(table))
+    weights = table.layer_weights
     np.testing.assert_allclose(weights.sum(axis=0), 1, rtol=0, atol=1e-12)
     busiest = max(
         sum(a <= v < b for a, b in zip(table.line_start, table.line_stop, strict=True))

@@ -6,7 +6,7 @@ import importlib.util
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from pathlib import Path
@@ -25,17 +25,14 @@ _WORK = threading.Lock()  # drivers are not asked to do with several threads
 class Threads:
     """A ``Communicator`` whose ranks are threads, one at work at a time; slots hold what each has brought to a call."""
 
-    exchange_s, idle_s = 0.0, 0.0
-
-    def __init__(self, rank: int, slots: list[Any], barrier: threading.Barrier, teams: dict) -> None:
+    def __init__(self, rank: int, slots: list[Any], barrier: threading.Barrier) -> None:
         self.rank, self.size = rank, len(slots)
         self.local_rank, self.local_size = rank, len(slots)
-        self._slots, self._barrier, self._teams = slots, barrier, teams
-        self._whole: Threads = self
+        self._slots, self._barrier = slots, barrier
         self.exchanged_bytes = 0
 
     def _all(self, value: Any, nbytes: int = 0) -> list[Any]:
-        self._whole.exchanged_bytes += nbytes  # counted as under MPI
+        self.exchanged_bytes += nbytes  # counted as under MPI
         self._slots[self.rank] = value
         _WORK.release()
         try:
@@ -64,23 +61,6 @@ class Threads:
     def join(self, values: np.ndarray) -> np.ndarray:
         return np.concatenate(self._all(values, values.nbytes))
 
-    def gather(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate(self._all(values, values.nbytes), axis=-1)
-
-    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-        others = sum(part.nbytes for rank, part in enumerate(parts) if rank != self.rank)
-        return [given[self.rank] for given in self._all(list(parts), others)]
-
-    def team(self, number: int) -> Threads:
-        numbers = self._all(number)
-        members = [rank for rank, other in enumerate(numbers) if other == number]
-        key = (number, len(self._teams.setdefault(self.rank, [])))
-        self._teams[self.rank].append(number)
-        shared = self._all((key, [None] * len(members), threading.Barrier(len(members)), {}))[members[0]]
-        team = Threads(members.index(self.rank), *shared[1:])
-        team._whole = self._whole
-        return team
-
     def all_fail(self) -> bool:
         return False
 
@@ -91,12 +71,12 @@ class Threads:
 
 def on_ranks(size: int, work: Callable[[Threads], Any]) -> list[Any]:
     """What ``work`` returns on each of ``size`` ranks; the first exception of any of them."""
-    slots, barrier, teams = [None] * size, threading.Barrier(size), {}
+    slots, barrier = [None] * size, threading.Barrier(size)
 
     def one(rank: int) -> Any:
         try:
             with _WORK:
-                return work(Threads(rank, slots, barrier, teams))
+                return work(Threads(rank, slots, barrier))
         except BaseException:
             barrier.abort()
             raise

@@ -7,12 +7,11 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from phyradgs_cl.commands import ranks as commands
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.parallel import Launch, Shares, launched, sorted_columns, span
+from phyradgs_cl.parallel import Launch, launched, span
 from phyradgs_cl.runtime import device as devices
 
 LAUNCHERS = {
@@ -59,32 +58,6 @@ def test_runs_cover_all_and_differ_by_one_at_most(count, parts) -> None:
     runs = [span(count, parts, part) for part in range(parts)]
     assert [i for run in runs for i in run] == list(range(count))
     assert max(map(len, runs)) - min(map(len, runs)) <= 1
-
-
-@pytest.mark.parametrize(("size", "frames"), [(1, 1), (2, 5), (4, 4), (3, 1), (5, 2), (7, 3)])
-def test_every_frame_has_its_ranks(ranks_of, size, frames) -> None:
-    shares = ranks_of(size, lambda ranks: Shares.of(ranks, frames))
-    by_frame = {place: [s.team for s in shares if place in s.places] for place in range(frames)}
-    for teams in by_frame.values():
-        assert sorted(team.rank for team in teams) == list(range(teams[0].size))
-    assert max(len(s.places) for s in shares) == -(-frames // size)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3])
-def test_columns_are_sorted_over_ranks(ranks_of, size) -> None:
-    rng = np.random.default_rng(1)
-    key = rng.integers(0, 9, 23).astype(float)  # with equals
-    columns = np.stack([key, np.arange(23.0)])
-    expected = columns[:, np.argsort(key, kind="stable")]
-    ends = [0, 5, 16, 23] if size == 3 else [23 * r // size for r in range(size + 1)]
-
-    def work(ranks) -> np.ndarray:
-        mine = slice(ends[ranks.rank], ends[ranks.rank + 1])
-        return sorted_columns(ranks, key[mine], columns[:, mine], lambda n, rank: span(n, size, rank))
-
-    found = ranks_of(size, work)
-    np.testing.assert_array_equal(np.concatenate(found, axis=1), expected)
-    assert [part.shape[1] for part in found] == [len(span(23, size, r)) for r in range(size)]
 
 
 def _device(index: int, name: str, rank: int) -> SimpleNamespace:

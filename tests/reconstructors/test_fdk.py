@@ -10,9 +10,10 @@ from phyradgs_cl.acquisition import (
     CircularOrbit,
     ConeGeometry,
     FrameSweeps,
-    Motion,
+    MicroViews,
     Scan,
     Shutter,
+    StaticStart,
     pixel_centres,
 )
 from phyradgs_cl.errors import InputError
@@ -100,13 +101,13 @@ def test_scan_and_volume_agree(rt) -> None:
     middle = geometry.pose(first + 0.1 * 1.5 / 2)
     result = fdk(scan, FdkOptions(), rt)
     np.testing.assert_allclose(result.volume, fdk_volume(rt, frames, middle, grid), rtol=0, atol=FLOAT32)
-    begun = fdk(scan, FdkOptions(motion=Motion("static-start")), rt)
+    begun = fdk(scan, FdkOptions(motion=StaticStart()), rt)
     np.testing.assert_allclose(
         begun.volume, fdk_volume(rt, frames, geometry.pose(first), grid), rtol=0, atol=FLOAT32
     )
     assert np.abs(begun.volume - result.volume).max() > 1e-3
-    with pytest.raises(InputError, match="micro-views"):
-        FdkOptions(motion=Motion("micro-views"))
+    with pytest.raises(InputError, match="MicroViews"):
+        FdkOptions(motion=MicroViews())
 
 
 def test_masked_pixels_are_filled_along_their_row() -> None:

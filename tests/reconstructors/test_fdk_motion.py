@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tolerances import FDK_LINES, FDK_PARTIAL, FLOAT32
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Motion, Scan, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, LineMiddles, Scan, Shutter
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume
@@ -59,7 +59,7 @@ def error_at_rest(rt) -> float:
 def test_per_row_undoes_the_readout(rt, error_at_rest, axis, direction) -> None:
     """As good as a gantry at rest, in either direction, where one pose a frame is clearly worse."""
     scan = rolling_scan(axis, direction)
-    per_row = error(fdk(scan, FdkOptions(motion=Motion("per-row")), rt).volume)
+    per_row = error(fdk(scan, FdkOptions(motion=LineMiddles()), rt).volume)
     static = error(fdk(scan, FdkOptions(), rt).volume)
     assert per_row <= FDK_LINES * error_at_rest
     assert (
@@ -72,7 +72,7 @@ def test_per_row_undoes_the_readout(rt, error_at_rest, axis, direction) -> None:
 def test_per_row_keeps_levels_in_short_scans(rt, axis, readout_deg) -> None:
     """No view from the other side hides a wrong weight here; without the filter's scale columns are 4 % off."""
     scan = rolling_scan(axis, readout_deg=readout_deg, arc_deg=220.0)
-    volume = fdk(scan, FdkOptions(motion=Motion("per-row")), rt).volume
+    volume = fdk(scan, FdkOptions(motion=LineMiddles()), rt).volume
     z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
     for c, r in BALLS[:2]:
         inside = (x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < (0.7 * r) ** 2
@@ -87,7 +87,7 @@ def test_no_motion_is_static(rt, axis) -> None:
         scan.projections, GEOMETRY, scan.trajectory, Shutter(0.0, 0.0, axis), scan.frame_start_s, GRID
     )
     static = fdk(scan, FdkOptions(), rt).volume
-    per_row = fdk(scan, FdkOptions(motion=Motion("per-row")), rt).volume
+    per_row = fdk(scan, FdkOptions(motion=LineMiddles()), rt).volume
     np.testing.assert_allclose(per_row, static, rtol=0, atol=FLOAT32 * np.abs(static).max())
 
 

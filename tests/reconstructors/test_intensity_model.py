@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, MicroViews, PerRow, Protocol, Scan, Static
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
@@ -60,15 +60,15 @@ def test_the_scan_says_which_model_unless_it_is_told(rt, scan, method) -> None:
 
 
 def test_of_one_pose_a_line_both_models_are_the_mean(rt, scan) -> None:
-    for motion in (Motion("static"), Motion("per-row", sub_intervals=1)):
+    for motion in (Static(), PerRow(sub_intervals=1)):
         assert System.of_scan(rt, scan, motion, "scan").intensity is None
-    assert System.of_scan(rt, scan, Motion("micro-views", 2, 2), "scan").intensity is not None
-    assert System.of_scan(rt, scan, Motion("micro-views", 2, 2), "log").intensity is None
+    assert System.of_scan(rt, scan, MicroViews(2, 2), "scan").intensity is not None
+    assert System.of_scan(rt, scan, MicroViews(2, 2), "log").intensity is None
 
 
 def test_what_comes_back_is_the_gradient_of_the_misfit(rt, scan) -> None:
     """−Jᵀ(p − I(x)) is the derivative of half the squared residual, along random directions."""
-    system = System.of_scan(rt, scan, Motion("per-row", sub_intervals=3), "scan")
+    system = System.of_scan(rt, scan, PerRow(sub_intervals=3), "scan")
     rng = np.random.default_rng(3)
     x = rng.uniform(0, 2, GRID.shape).astype(np.float32)
     d = rng.uniform(-1, 1, GRID.shape).astype(np.float32)

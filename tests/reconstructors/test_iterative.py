@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from scipy.sparse.linalg import lsqr
 from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Scan, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, Scan, Static, make_protocol
 from phyradgs_cl.detector import beer_lambert_noise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -433,4 +433,4 @@ def test_bad_options_are_named(method, changes, culprit) -> None:
 def test_every_iterative_method_is_registered() -> None:
     assert set(ITERATIVE) <= set(METHODS)
     for name in ITERATIVE:
-        assert method_options(name).motion == Motion("static")
+        assert method_options(name).motion == Static()

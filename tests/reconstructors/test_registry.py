@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
+from phyradgs_cl.acquisition import Exact, Scan, Static, TimeCells
+from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import METHODS, method_options
+from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.reconstructors.registry import motions_of
+from phyradgs_cl.reconstructors.sirt import SirtOptions
 
 ABSURD = {
     "NaN": float("nan"),
@@ -123,6 +127,45 @@ def test_unknown_options_of_a_table_name_the_table_and_what_it_has() -> None:
         method_options("phyradgs", None, {"control": {"threshhold": 1.0}})
     assert "'threshold'" in refusal.value.remedy
     assert "strips" not in refusal.value.expected
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Two poses per line, of which the first half of the panel has its own."""
+
+    early: float = 0.25
+    offsets: tuple[float, ...] = (0.0,)
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        shutter, half = scan.shutter, scan.lines // 2
+        share = np.array([self.early, 0.75, self.early, 1.0])
+        first = np.array([0, 0, half, half], np.int32)
+        last = np.array([half, half, scan.lines, scan.lines], np.int32)
+        time_s = scan.frame_start_s[frame] + share * shutter.span_s
+        pose = scan.trajectory.pose(frame, time_s)
+        return TimeCells(pose, time_s, first, last, np.full(4, 0.5), scan.lines, shutter.axis)
+
+
+@pytest.mark.parametrize("method", ["fdk", "sirt", "fista-tv", "phyradgs"])
+def test_a_motion_of_ones_own_works_and_is_named(method, rt) -> None:
+    scan = simulate("foot", size=16, detector=20, views=6, device=rt)
+    few = {} if method == "fdk" else {"iterations": 2}
+    own, static = (
+        reconstruct(scan, method, rt, method_options(method, None, {**few, "motion": motion}))
+        for motion in (Halves(), Static())
+    )
+    assert np.isfinite(own.volume).all() and np.any(own.volume != static.volume)
+    assert own.facts["options"]["motion"] == {"name": "Halves", "early": 0.25, "offsets": "(0.0,)"}
+    assert static.facts["options"]["motion"] == {"name": "static"}
+
+
+def test_a_motion_of_ones_own_has_cells_and_no_counts() -> None:
+    with pytest.raises(InputError, match="--motion"):
+        method_options("sirt", None, {"motion": Halves(), "strips": 3})
+    with pytest.raises(InputError, match=r"cells\(scan, frame\)"):
+        SirtOptions(motion="per-row")
+    with pytest.raises(InputError, match=r"one of Static\(\), .* or a class of your own"):
+        SirtOptions(motion=Exact())
 
 
 def test_only_splats_are_exact_in_time_and_fdk_has_no_micro_views() -> None:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from tolerances import CLOUD_VOLUME, FLOAT64, GAIN_LAW, SCALE_LAW
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, PerRow, Protocol, Scan, Static
 from phyradgs_cl.detector import attenuation_to_counts, counts_to_attenuation
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import splat_run
+from phyradgs_cl.reconstructors import splatting
 from phyradgs_cl.reconstructors.phyradgs import phyradgs
 from phyradgs_cl.reconstructors.r2 import r2
 from phyradgs_cl.reconstructors.result import Progress
@@ -26,7 +26,7 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(
-    motion=Motion("micro-views", 4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
+    motion=MicroViews(4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
 )
 STEADY = replace(OPTIONS, control=DensityControl(every=0))
 
@@ -90,7 +90,7 @@ def test_more_counts_make_the_same_volume(rt, scan, gain) -> None:
 
 def test_exact_motion_says_how_it_averaged(rt, scan) -> None:
     """Which rules served how many pairs, and K; with the same bits every time and a loss like that of micro-views."""
-    options = replace(OPTIONS, motion=Motion("exact", segments=3))
+    options = replace(OPTIONS, motion=Exact(segments=3))
     result = phyradgs(scan, options, rt)
     assert result.facts["segments"] == 3
     assert sum(result.facts["time_rules"].values()) == pytest.approx(1.0)
@@ -119,7 +119,7 @@ def test_the_cloud_is_the_volume(rt, scan) -> None:
 @pytest.mark.parametrize("how", ["a report that raises", "a signal"])
 def test_ctrl_c_keeps_what_there_is_and_can_go_on(rt, scan, monkeypatch, how) -> None:
     """Stopped after 8 of 30 iterations; resumed from there, the volume is that of an undisturbed run, bit for bit."""
-    monkeypatch.setattr(splat_run, "REPORT_EVERY", 4)
+    monkeypatch.setattr(splatting, "REPORT_EVERY", 4)
     seen: list[int] = []
 
     def stop_at_8(progress: Progress) -> None:
@@ -182,7 +182,7 @@ def test_r2_is_affine_and_static_unless_told(rt, scan) -> None:
 
 def test_motion_matters(rt, scan) -> None:
     static, moving = (
-        phyradgs(scan, replace(STEADY, motion=motion), rt, seed=1) for motion in (Motion("static"), Motion())
+        phyradgs(scan, replace(STEADY, motion=motion), rt, seed=1) for motion in (Static(), MicroViews())
     )
     assert difference(static.volume, moving.volume) > 0.01
 
@@ -192,7 +192,7 @@ def test_motion_matters(rt, scan) -> None:
     [
         ({"iterations": -1}, "--iterations"),
         ({"gaussians": -1}, "--gaussians"),
-        ({"motion": Motion("per-row")}, "--motion"),
+        ({"motion": PerRow()}, "--motion"),
     ],
 )
 def test_impossible_options_are_named(change, option) -> None:

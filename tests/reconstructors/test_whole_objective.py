@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tolerances import FINITE_DIFFERENCE_STEP, WHOLE_GRADIENT, WHOLE_VALUE
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Motion, Scan, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, MicroViews, Scan, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Grid
@@ -28,7 +28,7 @@ SHAPE, COUNT, SEED = (13, 15), 5, 17
 UNIT = Scale(length_mm=20.0, density_per_mm=0.05)
 GRID = Grid((7, 9, 10), (4.0, 4.2, 4.0), (1.0, 0.0, -1.0))  # half the longest side is 20 mm
 OPTIONS = SplatOptions(
-    motion=Motion("micro-views", 3, 2),
+    motion=MicroViews(3, 2),
     iterations=1,
     ssim_weight=0.25,
     l1_weight=0.7,
@@ -97,11 +97,11 @@ def test_gradient_of_everything(rt, make_cloud, finite_differences, axis) -> Non
     population = Population(raw, np.zeros((2, *raw.shape)))
     run = SplatRun(rt, scan, OPTIONS, UNIT, population, np.random.default_rng(SEED))
     run.step()
-    assert run.objective.loss.value() == pytest.approx(image_term(raw), rel=WHOLE_VALUE)
-    found = rt.download(run.clouds[0].gradients)[:11, :COUNT]
+    assert run.measures()["loss"] == pytest.approx(image_term(raw), rel=WHOLE_VALUE)
+    found = rt.download(run.cloud.gradients)[:11, :COUNT]
     expected = finite_differences(objective, raw, FINITE_DIFFERENCE_STEP)
     for name, part in {"mean": MEAN, "scale": SCALE, "quaternion": QUATERNION, "density": DENSITY}.items():
         error = np.linalg.norm(found[part] - expected[part]) / np.linalg.norm(expected[part])
         assert error <= WHOLE_GRADIENT, name
-    moved = rt.download(run.clouds[0].raw)[:, :COUNT] - raw
+    moved = rt.download(run.cloud.raw)[:, :COUNT] - raw
     np.testing.assert_array_equal(np.sign(moved[MEAN]), -np.sign(expected[MEAN]))  # and it goes downhill

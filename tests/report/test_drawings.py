@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import Motion, PoseTable, Shutter, make_protocol
+from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
+from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.report.axes import Axes, decades, ticks
 from phyradgs_cl.report.curve import convergence_charts
 from phyradgs_cl.report.geometry_drawing import orbit_drawing, panel_corners, side_drawing
@@ -44,10 +45,10 @@ def kinds(scan_maker, small_scan) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize("motion", ["static", "static-start", "micro-views", "per-row", "exact"])
-def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds, motion) -> None:
+@pytest.mark.parametrize("model", MODELS)
+def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds, model) -> None:
     for name, scan in kinds.items():
-        drawings = [shutter_drawing(scan, Motion(motion)), frames_drawing(scan)]
+        drawings = [shutter_drawing(scan, model()), frames_drawing(scan)]
         drawings += [orbit_drawing(scan), side_drawing(scan)]
         for drawing in drawings:
             assert "nan" not in drawing and "inf" not in drawing, name
@@ -62,7 +63,7 @@ def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(small_
 
 
 def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
-    motion = Motion("micro-views", strips=4, sub_intervals=3)
+    motion = MicroViews(strips=4, sub_intervals=3)
     svg = shutter_drawing(small_scan, motion)
     drawn, (outline,) = dots(svg, "sample"), shapes(svg, "polygon", "lit")
     cells = motion.cells(small_scan, 0)

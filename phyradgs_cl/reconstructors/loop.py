@@ -1,0 +1,161 @@
+"""The loop around every method that goes step by step: progress, convergence record, Ctrl-C, stopping, going on.
+
+A method is a class with ``Stepwise``'s attributes; ``Loop`` runs it, on one process or on ranks that do the same.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Protocol as Interface
+
+import numpy as np
+
+from phyradgs_cl.errors import NumericalError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.parallel import Communicator
+from phyradgs_cl.reconstructors.checked_state import checked_history
+from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, State, history_arrays
+
+SILENT_S = 10.0
+
+
+class Stepwise(Interface):
+    """A method between its start and its result."""
+
+    quantity: str
+    """What ``measures`` says of how far the run is from its goal: loss or residual. It must stay finite."""
+    remedy: str
+    """What helps where it does not."""
+    iteration: int
+    """Iterations done. A step may make several, or a part of one."""
+    iterations: int
+    """Iterations to do."""
+    finished: str | None
+    """Why the method stops by itself, else None."""
+
+    def step(self) -> None: ...
+
+    def measures(self) -> Mapping[str, float]:
+        """A line of the record: ``quantity``, and what else there is to tell."""
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What ``restore`` needs to go on with the next step."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """The inverse of ``state``; raises InputError for one that this run cannot have left."""
+        ...
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        """The present estimate (nz, ny, nx) in 1/mm, and its grid in mm."""
+        ...
+
+
+class Loop:
+    """Where a run is, and why it ended: ``iterations``, ``interrupt``, or the method's own reason.
+
+    The record has a line, and the report a call, for every so many iterations; a report comes sooner where they are slow.
+    ``started`` is the ``time.perf_counter`` from which seconds count.
+    """
+
+    def __init__(
+        self,
+        method: Stepwise,
+        ranks: Communicator,
+        report: ProgressReport,
+        started: float,
+        record_every: int = 1,
+        report_every: int = 1,
+    ) -> None:
+        self.method, self.ranks, self.report = method, ranks, report
+        self.record_every, self.report_every = record_every, report_every
+        self.record: list[dict[str, float]] = []
+        self.stopped_by = "iterations"
+        self._started = started
+        self._reported = time.perf_counter()
+
+    def run(self, resume: State | None) -> None:
+        """All steps, those of ``resume`` excepted. Ctrl-C, or a report that raises KeyboardInterrupt, ends the run after the
+        step under way, if there would be another one.
+        """
+        method = self.method
+        if resume is not None:
+            method.restore(resume)
+            self.record, before_s = checked_history(resume)
+            self._started -= before_s
+        with stop_on_interrupt() as request:
+            while method.iteration < method.iterations and self.stopped_by == "iterations":
+                before = method.iteration
+                method.step()
+                is_stopped = self._tell(before) or request.is_set
+                if method.finished:
+                    self.stopped_by = method.finished
+                elif self.ranks.any(is_stopped) and method.iteration < method.iterations:
+                    self.stopped_by = "interrupt"
+
+    @property
+    def seconds(self) -> float:
+        """Since the start, those before an interruption included."""
+        return time.perf_counter() - self._started
+
+    @property
+    def interrupted_at(self) -> int | None:
+        """The iteration after which somebody has stopped the run."""
+        return self.method.iteration if self.stopped_by == "interrupt" else None
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What ``run`` needs to go on from here."""
+        return {**self.method.state(), **history_arrays(self.record, self.seconds)}
+
+    def state_if_interrupted(self) -> dict[str, np.ndarray] | None:
+        """The state of a run that can go on; None of one that has ended."""
+        return self.state() if self.stopped_by == "interrupt" else None
+
+    def _tell(self, before: int) -> bool:
+        """Keeps and reports what the step from iteration ``before`` has reached; whether the report asks to stop."""
+        is_recorded = self._reaches(self.record_every, before)
+        is_reported = self._reaches(self.report_every, before) or self._was_silent_long(before)
+        if not (is_recorded or is_reported):
+            return False
+        measures = self._checked_measures()
+        iteration, seconds = self.method.iteration, self.seconds
+        if is_recorded:
+            self.record.append({"iteration": iteration, **measures, "seconds": seconds})
+        if not is_reported or self.ranks.rank > 0:  # rank 0 speaks for all
+            return False
+        self._reported = time.perf_counter()
+        progress = Progress(
+            iteration,
+            self.method.iterations,
+            measures[self.method.quantity],
+            int(measures.get("gaussians", 0)),
+            seconds,
+            quantity=self.method.quantity,
+            state=self.state,
+            volume=self.method.present_volume,
+        )
+        try:
+            self.report(progress)
+        except KeyboardInterrupt:
+            return True
+        return False
+
+    def _reaches(self, every: int, before: int) -> bool:
+        """Whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
+        now = self.method.iteration
+        return now // every > before // every or now == self.method.iterations
+
+    def _was_silent_long(self, before: int) -> bool:
+        """Whether iterations are so slow that a user wonders; ranks would have to agree on a time, and report by number."""
+        is_slow = time.perf_counter() - self._reported > SILENT_S
+        return is_slow and self.ranks.size == 1 and self.method.iteration > before
+
+    def _checked_measures(self) -> Mapping[str, float]:
+        measures, name = self.method.measures(), self.method.quantity
+        if not np.isfinite(measures[name]):
+            found = f"{measures[name]} at iteration {self.method.iteration}"
+            raise NumericalError(name, found, "a finite number", self.method.remedy)
+        return measures
