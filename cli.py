@@ -121,7 +121,7 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
     except _CLICK_ERROR as error:
         return complain(usage_text(error, arguments))
     except OSError as error:  # one that no reader or writer has named
-        from phyradgs_cl.io.atomic import NO_SPACE
+        from phyradgs_cl.io.output import NO_SPACE
 
         text = f"{error.filename or 'operating system'}: {error.strerror or error}"
         return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)

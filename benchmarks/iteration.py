@@ -17,9 +17,9 @@ from splat_speed import fly_scan
 
 from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Scan, Static
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
-from phyradgs_cl.reconstructors.splat_run import SplatRun
-from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"static": Static(), "8x5": MicroViews(8, 5), "exact": Exact()}

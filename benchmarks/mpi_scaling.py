@@ -36,11 +36,11 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.parallel import launched_ranks
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import splat_ranks
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
-from phyradgs_cl.reconstructors.splat_run import SplatRun
-from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale
+from phyradgs_cl.reconstructors.splats import ranks as splat_ranks
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.layout import projection_matrices
+from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.fdk import fdk_volume
 from phyradgs_cl.runtime import Runtime

@@ -3,7 +3,7 @@
     python benchmarks/startup.py [--repeat 5] [--json FILE]
 
 Prints a table in Markdown: the best of some runs of each command, the sum of `python -X importtime`, and the packages that
-take most of it. "wall" and "CPU" include the process that looks at an HDF5 file first (phyradgs_cl/io/hdf5_trial.py); the
+take most of it. "wall" and "CPU" include the process that looks at an HDF5 file first (phyradgs_cl/io/hdf5/trial.py); the
 last row is what `info` takes without it. The budget is 0.5 s on a quiet machine.
 """
 
@@ -26,7 +26,7 @@ import numpy as np
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
 
-NO_LOOK = "import phyradgs_cl.io.hdf5 as h; h.survive = lambda path: None; "
+NO_LOOK = "import phyradgs_cl.io.hdf5.source as h; h.survive = lambda path: None; "
 START = "from phyradgs_cl.__main__ import main; main()"
 SHOWN = 4
 

@@ -21,7 +21,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.io import sha256_of, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import METHODS, InputOptions, Reconstruction, reconstruct
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
 _SPLAT_TRIALS = (20, 200)  # iterations

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl.io import json_lines
-from phyradgs_cl.io.facts import FINITE, SCALAR, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
+from phyradgs_cl.io.hdf5.facts import FINITE, SCALAR, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
 from phyradgs_cl.io.json_lines import Line, append_line, refuse_irregular
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]

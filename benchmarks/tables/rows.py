@@ -10,7 +10,7 @@ from typing import Any
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural import NeuralOptions, has_accelerator, has_torch
 from phyradgs_cl.reconstructors import METHODS, method_options
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
 _MOST_NEURAL_VOXELS = 128  # a side, on a CPU: beyond it a run takes hours
 KINDS = ("table1", "table2", "phantom")

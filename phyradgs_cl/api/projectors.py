@@ -13,7 +13,7 @@ from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, ROWS, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, RayOperator, SplatProjector
-from phyradgs_cl.operators.splat import DEFAULT_TIME_ERROR
+from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
 
 
 def ray_operator(

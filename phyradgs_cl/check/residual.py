@@ -8,8 +8,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.check.timing import exposure_arc_rad
-from phyradgs_cl.reconstructors.cgls import Cgls
-from phyradgs_cl.reconstructors.system import System
+from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 QUICK_ITERATIONS, FINE_ITERATIONS = 12, 20

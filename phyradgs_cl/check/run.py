@@ -24,7 +24,7 @@ from phyradgs_cl.check.saturation import CountReader, check_saturation
 from phyradgs_cl.check.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
+from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
 

@@ -15,7 +15,7 @@ from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.commands.options import Device
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, read_scan
-from phyradgs_cl.io.scan_copy import copy_with_offset
+from phyradgs_cl.io.scan.copy import copy_with_offset
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
-from phyradgs_cl.io.atomic import temporary_name
+from phyradgs_cl.io.output import temporary_name
 
 
 @contextmanager

@@ -11,18 +11,18 @@ from pathlib import Path
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.data_exchange import import_data_exchange
-from phyradgs_cl.importers.naf import import_naf
-from phyradgs_cl.importers.nxtomo import import_nxtomo
+from phyradgs_cl.importers.formats.data_exchange import import_data_exchange
+from phyradgs_cl.importers.formats.naf import import_naf
+from phyradgs_cl.importers.formats.nxtomo import import_nxtomo
+from phyradgs_cl.importers.formats.phyradgs_real import import_phyradgs_real
+from phyradgs_cl.importers.formats.phyradgs_synthetic import import_phyradgs
+from phyradgs_cl.importers.formats.r2_gaussian import import_r2
+from phyradgs_cl.importers.formats.rtk import import_rtk
+from phyradgs_cl.importers.formats.tiff_folder import import_tiff
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.phyradgs_real import import_phyradgs_real
-from phyradgs_cl.importers.phyradgs_synthetic import import_phyradgs
-from phyradgs_cl.importers.r2_gaussian import import_r2
 from phyradgs_cl.importers.recognise import recognise
-from phyradgs_cl.importers.rtk import import_rtk
-from phyradgs_cl.importers.tiff_folder import import_tiff
 from phyradgs_cl.importers.volumes import foreign_volume, load_attenuation, load_volume
-from phyradgs_cl.io.held_warnings import held_warnings
+from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 
 __all__ = [
     "FORMATS",

@@ -7,10 +7,11 @@ from pathlib import Path
 import h5py
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import phyradgs_real, phyradgs_synthetic, r2_gaussian, tiff
-from phyradgs_cl.importers.folder import SafeFolder
-from phyradgs_cl.importers.hdf5_frames import opened
-from phyradgs_cl.importers.meta_image import SUFFIXES as STACKS
+from phyradgs_cl.importers.formats import phyradgs_real, phyradgs_synthetic, r2_gaussian
+from phyradgs_cl.importers.reading import tiff
+from phyradgs_cl.importers.reading.folder import SafeFolder
+from phyradgs_cl.importers.reading.hdf5_frames import opened
+from phyradgs_cl.importers.reading.meta_image import SUFFIXES as STACKS
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _BY_SUFFIX = {".pickle": "naf", ".pkl": "naf", ".xml": "rtk", ".toml": "tiff"}

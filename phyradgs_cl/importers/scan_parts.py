@@ -9,8 +9,8 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.frames import LineIntegrals
 from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.reading.frames import LineIntegrals
 from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io import default_grid
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from phyradgs_cl import io
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import tiff
-from phyradgs_cl.importers.bounded import read_json, read_npy
-from phyradgs_cl.importers.meta_image import read_meta_image
-from phyradgs_cl.importers.nifti import read_nifti
-from phyradgs_cl.importers.nrrd import read_nrrd
-from phyradgs_cl.importers.voxels import Voxels, upright
+from phyradgs_cl.importers.reading import tiff
+from phyradgs_cl.importers.reading.bounded import read_json, read_npy
+from phyradgs_cl.importers.reading.meta_image import read_meta_image
+from phyradgs_cl.importers.reading.nifti import read_nifti
+from phyradgs_cl.importers.reading.nrrd import read_nrrd
+from phyradgs_cl.importers.reading.voxels import Voxels, upright
 from phyradgs_cl.io import LoadedVolume
 
 

@@ -1,6 +1,5 @@
 """Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
 
-from phyradgs_cl.io.atomic import check_writable, written_beside
 from phyradgs_cl.io.checkpoint import (
     checkpoint_path,
     former_checkpoint_path,
@@ -8,13 +7,14 @@ from phyradgs_cl.io.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
-from phyradgs_cl.io.grid_io import default_grid
 from phyradgs_cl.io.hashing import hashing, sha256_of
+from phyradgs_cl.io.hdf5.grid import default_grid
 from phyradgs_cl.io.lock import only_run
-from phyradgs_cl.io.scan_file import ToAttenuation, read_scan, scan_summary
-from phyradgs_cl.io.scan_writer import write_scan
-from phyradgs_cl.io.scanner_file import Scanner, load_scanner, with_detector_count
-from phyradgs_cl.io.volume_file import (
+from phyradgs_cl.io.output import check_writable, written_beside
+from phyradgs_cl.io.scan.reader import ToAttenuation, read_scan, scan_summary
+from phyradgs_cl.io.scan.writer import write_scan
+from phyradgs_cl.io.scanner import Scanner, load_scanner, with_detector_count
+from phyradgs_cl.io.volume import (
     LoadedVolume,
     StoredVolume,
     file_kind,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.io.facts import damage
+from phyradgs_cl.io.hdf5.facts import damage
 from phyradgs_cl.io.regular import read_regular, regular_file
 from phyradgs_cl.text import plain_text
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from phyradgs_cl.io.hdf5_look.__main__ import in_use_bytes
+from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 
 try:
     import resource

@@ -10,12 +10,12 @@ import torch
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.arrays import to_array, to_tensor
-from phyradgs_cl.neural.exposure_average import intensity_average, log_squares
-from phyradgs_cl.neural.exposure_rays import ExposureRays
-from phyradgs_cl.neural.neural_field import NeuralField, voxel_values
+from phyradgs_cl.neural.field.on_grid import NeuralField, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
-from phyradgs_cl.neural.pixel_choice import chosen_times, scattered_pixels, windows_and_scattered_pixels
-from phyradgs_cl.neural.ray_integral import line_integrals, sample_shifts
+from phyradgs_cl.neural.rays.average import intensity_average, log_squares
+from phyradgs_cl.neural.rays.exposure import ExposureRays
+from phyradgs_cl.neural.rays.integral import line_integrals, sample_shifts
+from phyradgs_cl.neural.rays.pixel_choice import chosen_times, scattered_pixels, windows_and_scattered_pixels
 from phyradgs_cl.neural.torch_device import repeatable
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8

@@ -4,12 +4,12 @@ Each knows its domain, its range and its transpose, and no algorithm.
 """
 
 from phyradgs_cl.operators.backproject import backproject, backproject_lines
-from phyradgs_cl.operators.intensity import IntensityOperator
-from phyradgs_cl.operators.layout import DeviceCells, DeviceGaussians
-from phyradgs_cl.operators.ray_operator import LinearOperator, RayOperator
-from phyradgs_cl.operators.ray_projector import RayProjector
-from phyradgs_cl.operators.splat import DEFAULT_CUTOFF_SIGMA, SplatProjector
-from phyradgs_cl.operators.voxelise import Voxeliser, voxelise
+from phyradgs_cl.operators.rays.intensity import IntensityOperator
+from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
+from phyradgs_cl.operators.rays.projector import RayProjector
+from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians
+from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, SplatProjector
+from phyradgs_cl.operators.splats.voxelise import Voxeliser, voxelise
 
 __all__ = [
     "DEFAULT_CUTOFF_SIGMA",

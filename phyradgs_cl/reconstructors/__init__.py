@@ -8,7 +8,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "prepared": ["InputOptions"],
+        "preprocess": ["InputOptions"],
         "registry": ["METHODS", "Method", "input_options", "method_name", "method_options", "reconstruct"],
         "result": ["Progress", "ProgressReport", "Reconstruction", "State", "ignore_progress"],
     },

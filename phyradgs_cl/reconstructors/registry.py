@@ -11,19 +11,19 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.asd_pocs import AsdPocsOptions, asd_pocs
-from phyradgs_cl.reconstructors.cgls import CglsOptions, cgls
 from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, fdk
-from phyradgs_cl.reconstructors.fista_tv import FistaTvOptions, fista_tv
-from phyradgs_cl.reconstructors.naf import NAF_PRESETS, naf
-from phyradgs_cl.reconstructors.phyradgs import phyradgs
-from phyradgs_cl.reconstructors.prepared import InputOptions, prepared
-from phyradgs_cl.reconstructors.r2 import r2
+from phyradgs_cl.reconstructors.neural.naf import NAF_PRESETS, naf
+from phyradgs_cl.reconstructors.neural.sax_nerf import SAX_PRESETS, sax_nerf
+from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
-from phyradgs_cl.reconstructors.sart import OS_SART, SartOptions, os_sart, sart
-from phyradgs_cl.reconstructors.sax_nerf import SAX_PRESETS, sax_nerf
-from phyradgs_cl.reconstructors.sirt import SirtOptions, sirt
-from phyradgs_cl.reconstructors.splat_options import PRESETS, R2_PUBLISHED
+from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED
+from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
+from phyradgs_cl.reconstructors.splats.r2 import r2
+from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocsOptions, asd_pocs
+from phyradgs_cl.reconstructors.voxels.cgls import CglsOptions, cgls
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions, fista_tv
+from phyradgs_cl.reconstructors.voxels.sart import OS_SART, SartOptions, os_sart, sart
+from phyradgs_cl.reconstructors.voxels.sirt import SirtOptions, sirt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 

@@ -15,7 +15,7 @@ from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, element, joined, raw_text
-from phyradgs_cl.report.projections import View, computed_views
+from phyradgs_cl.report.pictures.projections import View, computed_views
 from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 

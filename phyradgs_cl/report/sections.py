@@ -7,16 +7,16 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, PerRow
-from phyradgs_cl.report.curve import convergence_charts
+from phyradgs_cl.report.charts.curve import convergence_charts
+from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
+from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
-from phyradgs_cl.report.geometry_drawing import orbit_drawing, side_drawing
 from phyradgs_cl.report.markup import Markup, element, joined
-from phyradgs_cl.report.png import bytes_of, data_uri, diverging, png_bytes, upright
-from phyradgs_cl.report.projections import TIMES_A_LINE, View
+from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, upright
+from phyradgs_cl.report.pictures.projections import TIMES_A_LINE, View
+from phyradgs_cl.report.pictures.slices import planes_of, windows_of
+from phyradgs_cl.report.pictures.viewer import viewer
 from phyradgs_cl.report.run import Run
-from phyradgs_cl.report.shutter_drawing import frames_drawing, shutter_drawing, shutter_words
-from phyradgs_cl.report.slices import planes_of, windows_of
-from phyradgs_cl.report.viewer import viewer
 
 _MOST_ROWS = 400  # of provenance
 

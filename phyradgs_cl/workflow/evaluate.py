@@ -11,7 +11,7 @@ import numpy as np
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import check_writable, written_beside
-from phyradgs_cl.io.volume_file import interruption
+from phyradgs_cl.io.volume import interruption
 from phyradgs_cl.metrics import compare, resampled, slices_png
 from phyradgs_cl.reconstructors.interrupt import (
     finish_despite_interrupt,

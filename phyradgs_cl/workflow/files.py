@@ -20,8 +20,8 @@ from phyradgs_cl.io import (
     scan_summary,
     volume_summary,
 )
-from phyradgs_cl.io.hdf5 import open_hdf5
-from phyradgs_cl.io.held_warnings import held_warnings
+from phyradgs_cl.io.hdf5.held_warnings import held_warnings
+from phyradgs_cl.io.hdf5.source import open_hdf5
 
 _KINDS = {
     "scan": "a scan",

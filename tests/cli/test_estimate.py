@@ -14,7 +14,7 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.estimate import duration, estimate, shortened
 from phyradgs_cl.reconstructors import method_options
 from phyradgs_cl.reconstructors.result import Reconstruction
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.workflow import load_scan
 
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4"]

@@ -222,7 +222,7 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
 
 def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(scan, tmp_path):
     body = """
-        import phyradgs_cl.reconstructors.iterative as i
+        import phyradgs_cl.reconstructors.voxels.run as i
         from phyradgs_cl.errors import DeviceError
         def iterate(loop):
             signal.raise_signal(signal.SIGINT)

@@ -88,7 +88,7 @@ def test_a_picture_that_cannot_be_written_is_one_warning(tmp_path, monkeypatch, 
     def full(*arguments: object) -> None:
         raise OutputError("now.png", "no room left")
 
-    monkeypatch.setattr("phyradgs_cl.report.preview.write_preview", full)
+    monkeypatch.setattr("phyradgs_cl.report.pictures.preview.write_preview", full)
     preview = Preview(tmp_path / "now.png", lambda progress: None, every_s=0.0)
     for iteration in range(3):
         preview(Progress(iteration, 9, 0.5, 0, 1.0, volume=lambda: (np.ones((2, 2, 2)), Grid.cube(2, 2.0))))

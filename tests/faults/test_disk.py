@@ -17,7 +17,8 @@ from tables.results import append_line, read_lines
 
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import checkpoint_path, new_hdf5, read_checkpoint, write_checkpoint, write_volume
+from phyradgs_cl.io import checkpoint_path, read_checkpoint, write_checkpoint, write_volume
+from phyradgs_cl.io.hdf5 import new as new_hdf5
 
 ARRAYS = {"volume": np.arange(5000, dtype=np.float32), "iteration": np.array(3)}
 GRID = Grid.cube(4, 2.0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.errors import OutOfMemoryError
-from phyradgs_cl.reconstructors import sirt
+from phyradgs_cl.reconstructors.voxels import sirt
 
 # In a process of its own that may map no more than so many MiB beyond what it has at the start.
 LIMITED = """
@@ -88,7 +88,7 @@ def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(
 
 @pytest.mark.parametrize("method", ["sirt", "os-sart", "cgls", "fista-tv", "asd-pocs"])
 def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch, method) -> None:
-    from phyradgs_cl.reconstructors import iterative
+    from phyradgs_cl.reconstructors.voxels import run as iterative
 
     step = iterative._Iterations.step
 

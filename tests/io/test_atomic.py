@@ -173,7 +173,7 @@ def test_a_scan_that_fails_half_way_leaves_the_old_one(tmp_path, make_scan, monk
     def fails(*_: object) -> None:
         raise RuntimeError("interrupted")
 
-    monkeypatch.setattr("phyradgs_cl.io.scan_writer.write_motion", fails)
+    monkeypatch.setattr("phyradgs_cl.io.scan.writer.write_motion", fails)
     with pytest.raises(RuntimeError, match="interrupted"):
         write_scan(tmp_path / "scan.h5", make_scan(title="new"))
     assert sha256_of(tmp_path / "scan.h5") == before and names(tmp_path) == ["scan.h5"]

@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, 
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator, RayProjector
-from phyradgs_cl.operators.cell_layers import layers
+from phyradgs_cl.operators.rays.cell_layers import layers
 from phyradgs_cl.operators.twins.rays import intensity_change, intensity_volume, ray_frame
 
 GRID = Grid((5, 7, 6), (0.35, 0.26, 0.3), (0.1, -0.05, 0.1))

@@ -15,7 +15,7 @@ from tolerances import (
 
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, SplatProjector
-from phyradgs_cl.operators.layout import projection_matrices
+from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import unpad_rows

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.layout import projection_matrices
+from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.operators.twins.splat import precision_matrices, splat_frame
 from phyradgs_cl.runtime.layout import pad_rows
 

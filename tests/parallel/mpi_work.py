@@ -16,9 +16,9 @@ from phyradgs_cl.optim import DensityControl  # noqa: E402
 from phyradgs_cl.parallel import launched_ranks  # noqa: E402
 from phyradgs_cl.reconstructors import reconstruct as run_method  # noqa: E402
 from phyradgs_cl.reconstructors.fdk import static_fdk  # noqa: E402
-from phyradgs_cl.reconstructors.splat_options import SplatOptions  # noqa: E402
-from phyradgs_cl.reconstructors.splat_run import SplatRun  # noqa: E402
-from phyradgs_cl.reconstructors.splat_start import first_population, internal_scale  # noqa: E402
+from phyradgs_cl.reconstructors.splats.options import SplatOptions  # noqa: E402
+from phyradgs_cl.reconstructors.splats.run import SplatRun  # noqa: E402
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 CONTROL = DensityControl(every=6, start_iteration=5, threshold=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.checked_state import (
+from phyradgs_cl.reconstructors.checkpoint import (
     check_array,
     checked_history,
     count_of,

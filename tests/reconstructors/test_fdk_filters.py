@@ -10,7 +10,7 @@ from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, FdkOptions, fdk_volume
-from phyradgs_cl.reconstructors.fdk_filters import WINDOWS, ramp_filter, ramp_spectrum
+from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter, ramp_spectrum
 
 FROM_SHARP_TO_SMOOTH = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
 

@@ -13,8 +13,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import fdk_volume
-from phyradgs_cl.reconstructors.fdk_arc import view_arc
-from phyradgs_cl.reconstructors.fdk_weights import (
+from phyradgs_cl.reconstructors.fdk.arc import view_arc
+from phyradgs_cl.reconstructors.fdk.weights import (
     displaced_weight,
     fan_angle,
     measured_fan,

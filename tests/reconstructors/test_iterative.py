@@ -20,13 +20,13 @@ from phyradgs_cl.objective import TvDescent, TvProx
 from phyradgs_cl.objective.tv_descent import tv_gradient
 from phyradgs_cl.objective.tv_prox import isotropic_tv, tv_prox
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
-from phyradgs_cl.reconstructors.asd_pocs import AsdPocs, AsdPocsOptions
-from phyradgs_cl.reconstructors.cgls import Cgls
-from phyradgs_cl.reconstructors.fista_tv import FistaTv, FistaTvOptions
 from phyradgs_cl.reconstructors.result import Progress
-from phyradgs_cl.reconstructors.sart import OS_SART, Sart, SartOptions, spread_order
-from phyradgs_cl.reconstructors.sirt import Sirt, SirtOptions
-from phyradgs_cl.reconstructors.system import System, norm
+from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
+from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
+from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, spread_order
+from phyradgs_cl.reconstructors.voxels.sirt import Sirt, SirtOptions
+from phyradgs_cl.reconstructors.voxels.system import System, norm
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")

@@ -14,7 +14,7 @@ from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.reconstructors.registry import motions_of
-from phyradgs_cl.reconstructors.sirt import SirtOptions
+from phyradgs_cl.reconstructors.voxels.sirt import SirtOptions
 
 ABSURD = {
     "NaN": float("nan"),

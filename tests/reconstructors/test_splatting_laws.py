@@ -14,14 +14,14 @@ from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, PerRow, Pro
 from phyradgs_cl.detector import attenuation_to_counts, counts_to_attenuation
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import voxelise
+from phyradgs_cl.operators.splats import voxelise
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import splatting
-from phyradgs_cl.reconstructors.phyradgs import phyradgs
-from phyradgs_cl.reconstructors.r2 import r2
 from phyradgs_cl.reconstructors.result import Progress
-from phyradgs_cl.reconstructors.splat_options import SplatOptions
+from phyradgs_cl.reconstructors.splats import method as splatting
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
+from phyradgs_cl.reconstructors.splats.r2 import r2
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)

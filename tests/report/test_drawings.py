@@ -10,10 +10,10 @@ import pytest
 
 from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
 from phyradgs_cl.acquisition.motion import MODELS
-from phyradgs_cl.report.axes import Axes, decades, ticks
-from phyradgs_cl.report.curve import convergence_charts
-from phyradgs_cl.report.geometry_drawing import orbit_drawing, panel_corners, side_drawing
-from phyradgs_cl.report.shutter_drawing import frames_drawing, shutter_drawing
+from phyradgs_cl.report.charts.axes import Axes, decades, ticks
+from phyradgs_cl.report.charts.curve import convergence_charts
+from phyradgs_cl.report.charts.geometry import orbit_drawing, panel_corners, side_drawing
+from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing
 
 
 def shapes(svg: str, tag: str, class_: str) -> list[np.ndarray]:

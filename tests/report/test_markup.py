@@ -11,8 +11,8 @@ from skimage import io
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, raw_text
-from phyradgs_cl.report.png import bytes_of, diverging, png_bytes
-from phyradgs_cl.report.slices import BUDGET_PIXELS, planes_of, windows_of
+from phyradgs_cl.report.pictures.png import bytes_of, diverging, png_bytes
+from phyradgs_cl.report.pictures.slices import BUDGET_PIXELS, planes_of, windows_of
 
 
 def test_text_is_escaped_and_elements_are_not() -> None:

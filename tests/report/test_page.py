@@ -22,8 +22,8 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report.facts import number, shown
-from phyradgs_cl.report.projections import chosen_frames, computed_views
-from phyradgs_cl.report.slices import Window
+from phyradgs_cl.report.pictures.projections import chosen_frames, computed_views
+from phyradgs_cl.report.pictures.slices import Window
 from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
 
 ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}

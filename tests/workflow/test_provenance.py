@@ -13,7 +13,7 @@ from tables import results as bench_results
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import read_volume, write_volume
-from phyradgs_cl.io.facts import PROVENANCE, read_facts
+from phyradgs_cl.io.hdf5.facts import PROVENANCE, read_facts
 from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.files import load_scan

@@ -12,8 +12,8 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.io.hdf5 import open_hdf5
-from phyradgs_cl.io.scan_header import read_header
+from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
 from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_name, method_options
 from phyradgs_cl.runtime import MEMORY_VARIABLE

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.io.facts import FINITE, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
+from phyradgs_cl.io.hdf5.facts import FINITE, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
 from phyradgs_cl.io.json_lines import Line
 from phyradgs_cl.io.names import shortened
 from phyradgs_cl.reconstructors import input_options

@@ -1,0 +1,77 @@
+"""Pickles of NAF and SAX-NeRF: one dictionary with geometry, projections and the true volume.
+
+Lengths are in mm, densities in 1/m and projections in density × metre: dimensionless line integrals.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.formats import tigre_frame
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.frames import line_integrals, upright
+from phyradgs_cl.importers.reading.pickle import read_pickle
+from phyradgs_cl.importers.scan_parts import put_together
+from phyradgs_cl.importers.timing import make_timing, turning
+from phyradgs_cl.io.tables import Fields, described
+
+OPTIONS = (
+    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
+    *("detector_model", "part"),
+)
+_PER_MM = 1e-3  # of a density per metre
+_PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
+
+
+def import_naf(path: Path, options: ImportOptions) -> Scan:
+    """The train (or val, or both) projections of a pickle."""
+    options.refuse_unused("naf", OPTIONS)
+    data = Fields(f"{path}:", read_pickle(path))
+    geometry, grid = tigre_frame.read_geometry(data, 1.0), tigre_frame.read_grid(data, 1.0)
+    frames, angle_rad = _frames(data, _PARTS[options.part], geometry.detector_shape)
+    timing = make_timing(str(path), len(angle_rad), options)
+    reference = None
+    if data.has("image"):
+        volume = _array(data, "image", 3)
+        reference = tigre_frame.turned_volume(data.name("image"), volume, grid, _PER_MM)
+    frames = upright(frames, options, tigre_frame.ROW_0)
+    integrals = line_integrals(str(path), frames, options, custom="attenuation")
+    trajectory = turning(geometry, angle_rad, timing)
+    return put_together(
+        integrals,
+        trajectory,
+        geometry,
+        timing,
+        options,
+        title=path.stem,
+        source=str(path),
+        grid=grid,
+        reference=reference,
+    )
+
+
+def _frames(data: Fields, parts: tuple[str, ...], panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Projections (F, v, u) as stored and their angles (F,)."""
+    stacks, angles = [], []
+    for part in parts:
+        table = data.table(part)
+        stack = _array(table, "projections", 3)
+        checks.shape(table.name("projections"), stack, (None, *panel))
+        stacks.append(stack)
+        angles.append(table.numbers("angles", len(stack)))
+    return np.concatenate(stacks), np.concatenate(angles)
+
+
+def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
+    values = table.get(key)
+    if not isinstance(values, np.ndarray) or values.ndim != ndim or values.dtype.kind not in "iuf":
+        found = f"shape {values.shape}" if isinstance(values, np.ndarray) else described(values)
+        raise InputError(table.name(key), found, f"an array of numbers with {ndim} axes")
+    if 0 in values.shape:
+        raise InputError(table.name(key), f"shape {values.shape}", "no empty axis")
+    return np.asarray(values)

@@ -1,0 +1,226 @@
+"""NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from options.
+
+The format does not say which row is on top. Row 0 is taken as the lowest, as that reader takes it, and this is said;
+flips that the file declares, in either of the ways in which the nxtomo package has written them, are undone first. The
+rotation axis's column becomes a detector offset.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.formats.moving_poses import Turned
+from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.reading.frames import line_integrals, united, upright
+from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
+from phyradgs_cl.importers.scan_parts import checked, needed, put_together
+from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
+from phyradgs_cl.io.hdf5.datasets import (
+    read_array,
+    read_attribute,
+    read_integers,
+    read_number,
+    read_values,
+    read_word,
+)
+from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
+from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.header import find_entry
+
+_log = logging.getLogger(__name__)
+OPTIONS = (
+    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
+    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
+    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
+)
+_MOVES = ("x_translation", "y_translation", "z_translation")
+
+
+def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
+    """The projections of the file's NXtomo entry, with its flats and darks."""
+    options.refuse_unused("nxtomo", OPTIONS)
+    with opened(path) as source:
+        entry = find_entry(source)
+        _refuse_ours(source, entry)
+        detector = f"{entry}/{schema.DETECTOR}"
+        frames = read_frames(source, f"{detector}/data")
+        key = _image_key(source, detector, len(frames))
+        used = key == schema.PROJECTION
+        turn = _turned(source, detector)
+        mask = _mask(source, detector, frames.shape, used)
+        geometry = _geometry(source, entry, (frames.shape[1], frames.shape[2]), turn, options)
+        timing, trajectory = _motion(source, entry, used, geometry, options)
+        quantity = read_attribute(source, f"{detector}/data", "quantity")
+        _refuse_moves(source, entry, used)
+        title = _title(source, entry, path)
+    if options.row_0 is None:
+        text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
+        _log.warning(text, path, option_name("row_0"))
+    frames = upright(turn.frames(frames), options, "bottom")
+    integrals = line_integrals(
+        f"{path}:{detector}/data",
+        frames[used],
+        options,
+        flats=frames[key == schema.FLAT],
+        darks=frames[key == schema.DARK],
+        custom=quantity,
+    )
+    if mask is not None:
+        mask = upright(turn.frames(mask), options, "bottom")
+        integrals = replace(integrals, mask=united(mask, integrals.mask))
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+
+
+def _refuse_ours(source: Hdf5Source, entry: str) -> None:
+    """A scan of this package has more to say than an import would keep."""
+    if source.find(f"{entry}/{schema.EXTRA}") is not None:
+        found, expected = "a scan file of this package", "a file of another program"
+        raise InputError(source.name(f"{entry}/{schema.EXTRA}"), found, expected, "use it as it is")
+
+
+def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
+    """What every frame is (F,); all projections where the file does not say."""
+    for name in ("image_key", "image_key_control"):
+        if source.find(f"{detector}/{name}") is not None:
+            key = read_integers(source, f"{detector}/{name}", (frames,))
+            key = np.where(key == -1, schema.INVALID, key)  # nxtomo's frames taken to check the alignment
+            if not np.any(key == schema.PROJECTION):
+                raise InputError(source.name(f"{detector}/{name}"), "no projection", "at least one 0")
+            return key
+    return np.full(frames, schema.PROJECTION)
+
+
+def _turned(source: Hdf5Source, detector: str) -> Turned:
+    """Flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
+    flips = [_flag(source, f"{detector}/{name}") for name in ("y_flipped", "x_flipped")]
+    for index, name in enumerate(("rx", "ry")):
+        address = f"{detector}/transformations/{name}"
+        if source.find(address) is not None:
+            half_turns = read_number(source, address, ANGLE) / np.pi
+            if abs(half_turns - round(half_turns)) > 1e-6:
+                raise InputError(source.name(address), f"{half_turns * 180:g}°", "0° or 180°: a flip")
+            flips[index] ^= bool(round(half_turns) % 2)
+    return Turned(rows=flips[0], columns=flips[1])
+
+
+def _flag(source: Hdf5Source, address: str) -> bool:
+    if source.find(address) is None:
+        return False
+    return bool(np.any(read_values(source, address, source.dataset(address), kinds="biu")))
+
+
+def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.ndarray) -> np.ndarray | None:
+    address = f"{detector}/pixel_mask"
+    if source.find(address) is None:
+        return None
+    mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
+    if mask.shape not in (shape, shape[1:]):
+        raise InputError(source.name(address), f"shape {mask.shape}", f"{shape[1:]} or {shape}")
+    mask = mask if mask.ndim == 2 else mask[used]
+    return mask if mask.any() else None
+
+
+def _geometry(
+    source: Hdf5Source, entry: str, panel: tuple[int, int], turn: Turned, options: ImportOptions
+) -> ConeGeometry:
+    detector, where = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
+    to_axis = options.source_to_axis_mm
+    if to_axis is None and source.find(where) is not None:
+        to_axis = abs(read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
+    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
+    to_detector = options.source_to_detector_mm
+    if to_detector is None:
+        behind = optional_length(source, f"{detector}/distance")
+        to_detector = None if behind is None else to_axis + behind
+    to_detector = needed(to_detector, "source_to_detector_mm", source.name(f"{detector}/distance"))
+    pitch = options.pixel_size_mm or tuple(_pitch(source, detector, axis) for axis in "yx")
+    offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
+    return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
+
+
+def _pitch(source: Hdf5Source, detector: str, axis: str) -> float:
+    size = optional_length(source, f"{detector}/{axis}_pixel_size")
+    if size is None:
+        remedy = f"say {option_name('pixel_size_mm')} V,U"
+        raise InputError(source.name(f"{detector}/{axis}_pixel_size"), "nothing", "a length", remedy)
+    return size
+
+
+def _axis_offset(
+    source: Hdf5Source, detector: str, pitch: tuple[float, ...], turn: Turned, options: ImportOptions
+) -> tuple[float, float]:
+    """Detector offset (v, u) in mm from the axis's column, counted from the panel's middle as nxtomo does."""
+    for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"):
+        address = f"{detector}/{name}"
+        if source.find(address) is None:
+            continue
+        column = read_number(source, address)
+        flipped = turn.columns != (options.column_0 == "right")
+        if column != 0:
+            _log.warning("%s: taken as %g columns from the panel's middle", source.name(address), column)
+        return 0.0, (column if flipped else -column) * pitch[1]
+    return 0.0, 0.0
+
+
+def _motion(
+    source: Hdf5Source, entry: str, used: np.ndarray, geometry: ConeGeometry, options: ImportOptions
+) -> tuple[Timing, CircularOrbit]:
+    """Timing and orbit; a stored ``rotation_angle_end`` is each frame's own sweep, else angles follow each other."""
+    detector, sample = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}"
+    sign = gantry_sign(options, read_attribute(source, f"{sample}/rotation_angle", "rotates") or "sample")
+    angle = sign * read_array(source, f"{sample}/rotation_angle", used.shape, ANGLE)[used]
+    sweeps = source.find(f"{sample}/rotation_angle_end") is not None and options.frame_time_s is None
+    starts = f"{detector}/frame_start_time"
+    start_s = read_array(source, starts, used.shape, TIME)[used] if sweeps else None
+    stored = StoredTiming(
+        exposure_s=_duration(source, f"{detector}/count_time", used),
+        readout_s=_duration(source, f"{detector}/detector_readout_time", used),
+        start_s=start_s,
+    )
+    timing = make_timing(source.name(entry), int(used.sum()), options, stored)
+    if not sweeps:
+        return timing, turning(geometry, angle, timing)
+    last = sign * read_array(source, f"{sample}/rotation_angle_end", used.shape, ANGLE)[used]
+    return timing, CircularOrbit(
+        geometry, FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
+    )
+
+
+def _duration(source: Hdf5Source, address: str, used: np.ndarray) -> float | None:
+    """One time in s, stored once or equal for all projections."""
+    if not isinstance(source.find(address), h5py.Dataset):
+        return None
+    dataset = source.dataset(address)
+    if dataset.size == 1:
+        return read_number(source, address, TIME)
+    values = read_array(source, address, used.shape, TIME)[used]
+    if np.ptp(values) > 1e-6 * np.abs(values).max():
+        found = f"{values.min():.6g} to {values.max():.6g} s"
+        raise InputError(source.name(address), found, "one time for all projections")
+    return float(values[0])
+
+
+def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
+    """A sample that moves between projections would need poses of its own."""
+    for name in _MOVES:
+        address = f"{entry}/{schema.SAMPLE}/{name}"
+        if source.find(address) is None:
+            continue
+        values = read_array(source, address, (None,), LENGTH)
+        values = values[used] if values.shape == used.shape else values
+        if np.ptp(values) > 0:
+            found = f"{values.min():.6g} to {values.max():.6g} mm"
+            raise InputError(source.name(address), found, "a sample that stays where it is")
+
+
+def _title(source: Hdf5Source, entry: str, path: Path) -> str:
+    address = f"{entry}/title"
+    return (read_word(source, address) if source.find(address) is not None else "") or path.stem

@@ -1,0 +1,209 @@
+"""Real scans of PhyRadGS: a JSON of calibrated views with the arcs of their rolling shutter, and 16-bit TIFF frames.
+
+A view's ``detector`` is a 4×4 matrix from the panel to the world (mm): column 0 along the rows of the image, column 1
+down them, column 3 the panel's centre. The matrix holds where the panel stands on its circle; at other times of the
+frame it has turned about +z by as much as its angle. Rows are read one after the other, the first stored one first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
+from phyradgs_cl.importers.formats.phyradgs_synthetic import readout_ratio, start_times_s
+from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.reading import tiff
+from phyradgs_cl.importers.reading.bounded import read_json
+from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering
+from phyradgs_cl.importers.reading.frames import line_integrals
+from phyradgs_cl.importers.scan_parts import put_together
+from phyradgs_cl.importers.timing import Timing
+from phyradgs_cl.io.tables import Fields
+
+OPTIONS = (
+    "exposure_s",
+    "readout_direction",
+    "pixel_size_mm",
+    "quantity",
+    "flat_value",
+    "detector_model",
+    "first_view",
+)
+PROJECTIONS = "projections"
+_ANGLES = ("first_row_start_angle", "first_row_end_angle", "last_row_end_angle")
+_TIMES_A_FRAME = 33
+_GAP = 1e-3  # of a frame's span, between the windows of two frames
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """Where a body turns: centre (x, y), radius, and for each view its height and angles (F,), (F, 3), in mm and rad."""
+
+    centre: np.ndarray
+    radius: float
+    z: np.ndarray
+    angle_rad: np.ndarray
+
+    @classmethod
+    def read(cls, common: Fields, views: list[Fields], body: str) -> Circle:
+        """The circle of "source" or "detector"."""
+        circle = common.table(body)
+        tables = [view.table("rolling_shutter").table(body) for view in views]
+        angles = np.deg2rad([[table.number(key) for key in _ANGLES] for table in tables])
+        centre = circle.numbers("center")
+        if len(centre) < 2:
+            raise InputError(circle.name("center"), f"{len(centre)} numbers", "x, y and perhaps z")
+        z = np.array([table.number("z") for table in tables])
+        return cls(centre[:2], circle.length("radius"), z, angles)
+
+    def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Angles (T,) and points (T, 3) at times in exposures after the view's start."""
+        start, closed, _ = self.angle_rad[view]
+        angle = start + (closed - start) * share
+        x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
+        return angle, np.stack([x, y, np.full(angle.shape, self.z[view])], -1)
+
+
+def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
+    """A folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON itself."""
+    options.refuse_unused("phyradgs-real", OPTIONS)
+    description = path if path.is_file() else geometry_file(SafeFolder(path))
+    meta = Fields(f"{description}:", read_json(description))
+    frames, views = _frames_and_views(description, list(meta.tables("views")), options)
+    panel = (frames.shape[1], frames.shape[2])
+    common = meta.table("rolling_shutter_geometry")
+    source, detector = (Circle.read(common, views, body) for body in ("source", "detector"))
+    timing = _timing(str(description), detector, options)
+    poses = _all_poses(views, source, detector, timing, panel, _pitch(options, str(description)))
+    turn = turn_of(poses[0, 0])
+    direction = options.readout_direction or (-1 if turn.rows else 1)
+    shutter = Shutter(timing.shutter.exposure_s, timing.shutter.readout_s, "rows", direction)
+    timing = Timing(shutter, timing.start_s, True)
+    poses = turn.poses(poses, panel)
+    times = timing.start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
+    integrals = line_integrals(
+        str(description), turn.frames(frames), _with_flat(options, frames), custom="counts"
+    )
+    trajectory = PoseTable(times.ravel(), poses.reshape(-1, 12), f"{description} views")
+    plain = plain_geometry(poses[:, 0], panel)
+    title = path.resolve().stem
+    return put_together(integrals, trajectory, plain, timing, options, title=title, source=str(path))
+
+
+def geometry_file(folder: SafeFolder) -> Path:
+    """The folder's only JSON file."""
+    found = folder.matching(".json")
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found[:5]) or "none"
+        remedy = "name the file itself"
+        raise InputError(str(folder.root), f"JSON files: {names}", "one that describes the views", remedy)
+    return found[0]
+
+
+def _frames_and_views(
+    description: Path, views: list[Fields], options: ImportOptions
+) -> tuple[np.ndarray, list[Fields]]:
+    """Frames (F, v, u) as stored, and their F views: all of the file, or those from ``first_view`` on."""
+    folder = SafeFolder(description.parent)
+    if folder.exists(PROJECTIONS) and not (folder.root / PROJECTIONS).is_symlink():
+        folder = SafeFolder(folder.root / PROJECTIONS)
+    paths = folder.matching(*tiff.SUFFIXES)
+    if options.first_view is not None:
+        check_numbering(paths, "complete the frames")  # each takes the view of its place
+        views = views[options.first_view : options.first_view + len(paths)]
+    if not paths or len(paths) != len(views):
+        remedy = f"say {option_name('first_view')} if the JSON holds several scans"
+        found = f"{len(paths)} TIFF files for {len(views)} views"
+        raise InputError(str(folder.root), found, "one frame a view", remedy)
+    frames = tiff.read_tiffs(paths)
+    if len(frames) != len(views):
+        raise InputError(str(folder.root), f"{len(frames)} pages for {len(views)} views", "one page a file")
+    return frames, views
+
+
+def _with_flat(options: ImportOptions, frames: np.ndarray) -> ImportOptions:
+    """Without a flat value, the brightest pixel of all frames stands for air, as in the published treatment."""
+    if options.flat_value is not None or options.quantity not in (None, "counts"):
+        return options
+    brightest = float(frames.max())
+    if not brightest > 0:
+        raise InputError("frames", "nothing but zeros", "counts")
+    return replace(options, flat_value=brightest)
+
+
+def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
+    if options.pixel_size_mm is None:
+        remedy = f"say {option_name('pixel_size_mm')} V,U"
+        raise InputError(f"{culprit} pixel size", "nothing", "a length in mm along v and along u", remedy)
+    return options.pixel_size_mm
+
+
+def _timing(culprit: str, detector: Circle, options: ImportOptions) -> Timing:
+    """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
+    exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
+    if exposure_s <= 0:
+        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+    first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
+    ratio = readout_ratio(culprit, closed - first, done - closed)
+    shutter = Shutter(exposure_s, ratio * exposure_s)
+    start_s = start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
+    least_s = shutter.span_s * (1 + _GAP)
+    steps_s = np.maximum(np.diff(start_s), least_s)
+    return Timing(shutter, np.concatenate([[0.0], np.cumsum(steps_s)]), True)
+
+
+def _all_poses(
+    views: list[Fields],
+    source: Circle,
+    detector: Circle,
+    timing: Timing,
+    panel: tuple[int, int],
+    pitch: tuple[float, float],
+) -> np.ndarray:
+    """Poses (F, T, 12) of the stored images at T times of every frame's window."""
+    share = np.linspace(0, timing.shutter.span_s / timing.shutter.exposure_s, _TIMES_A_FRAME)
+    return np.stack([
+        _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
+        for i, view in enumerate(views)
+    ])  # fmt: skip
+
+
+def _view_poses(
+    view: Fields,
+    source_mm: np.ndarray,
+    detector: tuple[np.ndarray, np.ndarray],
+    centre: np.ndarray,
+    panel: tuple[int, int],
+    pitch: tuple[float, float],
+) -> np.ndarray:
+    """Poses (T, 12) of one view, its panel turned about +z from where its matrix holds."""
+    rotation, stands_at = _matrix(view)
+    angle_rad, centre_mm = detector
+    turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])
+    cos, sin, zero = np.cos(turned_rad), np.sin(turned_rad), np.zeros_like(turned_rad)
+    turn = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], -1).reshape(-1, 3, 3)
+    step_v, step_u = pitch[0] * turn @ rotation[:, 1], pitch[1] * turn @ rotation[:, 0]
+    first = centre_mm - (panel[1] - 1) / 2 * step_u - (panel[0] - 1) / 2 * step_v
+    return np.concatenate([source_mm, first, step_u, step_v], -1)
+
+
+def _matrix(view: Fields) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and centre (3,) of a view's detector matrix."""
+    rows = view.get("detector")
+    good = isinstance(rows, list) and len(rows) == 4
+    matrix = (
+        np.array([Fields(view.name("detector"), {"row": row}).numbers("row", 4) for row in rows])
+        if good
+        else None
+    )
+    if matrix is None:
+        raise InputError(view.name("detector"), "no 4×4 matrix", "four rows of four numbers")
+    rotation = matrix[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
+        raise InputError(view.name("detector"), "columns that are not orthonormal", "a rotation and a centre")
+    return rotation, matrix[:3, 3]

@@ -1,0 +1,83 @@
+"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame where its first and last line began and ended.
+
+The arcs are all that the files say about time: the exposure takes ``exposure_s`` (1 s unless it is given), and the
+gantry turns at the speed that makes the exposure's arc of it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.formats.r2_gaussian import R2Folder, entries_of
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.scan_parts import put_together
+from phyradgs_cl.importers.timing import Timing
+from phyradgs_cl.io.tables import Fields
+
+META = "meta_data_motion_blur_rolling_shutter_fps18.json"
+OPTIONS = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
+_KEYS = ("first_line_start", "first_line_end", "last_line_end")
+_SAME = 1e-3  # relative spread of arcs that still counts as one exposure and one readout
+
+
+def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
+    """A folder's ``simulate_train`` (or test, or all) frames, read out along columns unless the options differ."""
+    options.refuse_unused("phyradgs", OPTIONS)
+    opened = R2Folder.opened(path, META, options.unit_mm)
+    entries = entries_of(opened.meta, "simulate_", options.part)
+    marks = np.array([[entry.number(key) for key in _KEYS] for entry in entries])
+    timing = timing_of_marks(opened.meta, marks, options)
+    sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
+    grid, reference = opened.reference()
+    integrals = opened.projections(entries, options)
+    return put_together(
+        integrals,
+        CircularOrbit(opened.geometry, sweeps),
+        opened.geometry,
+        timing,
+        options,
+        title=path.resolve().name,
+        source=str(path),
+        grid=grid,
+        reference=reference,
+    )
+
+
+def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
+    """Timing from angles (F, 3): first line's start and end, last line's end.
+
+    The first stored line is read first: column 0, or with a readout along rows the one at the top.
+    """
+    exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
+    if exposure_s <= 0:
+        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+    ratio = readout_ratio(
+        culprit.culprit, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]
+    )
+    axis = options.readout_axis or "columns"
+    custom = 1 if axis == "columns" else -1
+    direction = custom if options.readout_direction is None else options.readout_direction
+    shutter = Shutter(exposure_s, ratio * exposure_s, axis, direction)
+    return Timing(shutter, start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s), True)
+
+
+def readout_ratio(culprit: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
+    """T_ro/T_exp from arcs (F,) of all frames, which must agree on it."""
+    if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
+        found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
+        raise InputError(f"{culprit} exposure", found, "arcs that turn one way, none of them 0")
+    ratio = readout_arc / exposure_arc
+    if ratio.min() < 0 or np.ptp(ratio) > _SAME * max(1.0, ratio.max()):
+        found = f"readout over exposure from {ratio.min():.6g} to {ratio.max():.6g}"
+        raise InputError(f"{culprit} readout", found, "one ratio of at least 0 for all frames")
+    return float(np.median(ratio))
+
+
+def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
+    """Opening times (F,) of a gantry that turns at the mean speed of its exposures."""
+    speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
+    return (first_rad - first_rad[0]) / speed_rad_per_s

@@ -1,0 +1,72 @@
+"""Scans of RTK: a geometry XML and a stack of projections as MetaImage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.formats.moving_poses import Turned, plain_geometry, table_over_time, turn_of
+from phyradgs_cl.importers.formats.rtk_xml import RtkGeometry, read_rtk_xml
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.folder import SafeFolder
+from phyradgs_cl.importers.reading.frames import line_integrals
+from phyradgs_cl.importers.reading.meta_image import SUFFIXES, MetaStack, read_meta_stack
+from phyradgs_cl.importers.scan_parts import put_together
+from phyradgs_cl.importers.timing import Timing, make_timing, turning
+
+OPTIONS = (
+    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
+    *("quantity", "flat_value", "detector_model"),
+)
+
+
+def import_rtk(path: Path, options: ImportOptions) -> Scan:
+    """A folder with one .xml and one .mha (or .mhd), or the .xml itself with the stack beside it."""
+    options.refuse_unused("rtk", OPTIONS)
+    folder = SafeFolder(path if path.is_dir() else path.parent)
+    description = path if path.is_file() else _only(folder, (".xml",), "geometry")
+    stack_path = _only(folder, SUFFIXES, "stack of projections")
+    rtk, stack = read_rtk_xml(description), read_meta_stack(stack_path)
+    if len(stack.frames) != rtk.frames:
+        found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
+        raise InputError(str(stack_path), found, "one frame a projection")
+    timing = make_timing(str(description), rtk.frames, options)
+    trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
+    custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
+    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
+    title = description.stem
+    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+
+
+def _trajectory(
+    rtk: RtkGeometry, stack: MetaStack, timing: Timing, culprit: str
+) -> tuple[CircularOrbit | PoseTable, ConeGeometry, Turned]:
+    """A circular orbit where one describes the file, else a table of poses; and how images have to be turned."""
+    panel = (stack.frames.shape[1], stack.frames.shape[2])
+
+    def stored(position: np.ndarray) -> np.ndarray:
+        return rtk.poses(position, stack.origin_mm, stack.step_u_mm, stack.step_v_mm)
+
+    turn = turn_of(stored(np.zeros(1))[0])
+
+    def poses(position: np.ndarray) -> np.ndarray:
+        return turn.poses(stored(position), panel)
+
+    at_frames = poses(np.arange(rtk.frames, dtype=np.float64))
+    geometry = plain_geometry(at_frames, panel)
+    if rtk.is_circular and stack.step_u_mm[1] == 0 and stack.step_v_mm[0] == 0:
+        return turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
+    return table_over_time(poses, timing, culprit), geometry, turn
+
+
+def _only(folder: SafeFolder, suffixes: tuple[str, ...], what: str) -> Path:
+    found = folder.matching(*suffixes)
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found[:5]) or "none"
+        raise InputError(
+            str(folder.root), f"{' or '.join(suffixes)} files: {names}", f"one {what}", "leave only one"
+        )
+    return found[0]

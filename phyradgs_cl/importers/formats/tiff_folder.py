@@ -1,0 +1,194 @@
+"""A folder of TIFF frames and one TOML that says what they are, where things stood and when they were taken.
+
+The tables [source], [detector], [volume], [readout] and [beam] are those of a scanner file; [frames], [angles] and
+[timing] are added. Row 0 of an image is its top, column 0 its left, seen from the source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, QUANTITIES, ROTATES, ROW_0, ImportOptions
+from phyradgs_cl.importers.reading import tiff
+from phyradgs_cl.importers.reading.bounded import read_numbers
+from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
+from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, united, upright
+from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign
+from phyradgs_cl.importers.scan_parts import put_together, with_options
+from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
+from phyradgs_cl.io.scanner import Scanner, scanner_from
+from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
+
+OPTIONS = (
+    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
+    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
+    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
+)
+_OWN = {
+    "frames": ("projections", "flats", "darks", "mask", "quantity", "flat_value", "row_0", "column_0"),
+    "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
+    "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s"),
+}
+_TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
+_PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
+_SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
+
+
+def import_tiff(path: Path, options: ImportOptions) -> Scan:
+    """A folder with one TOML, or the TOML itself with its frames beside it."""
+    options.refuse_unused("tiff", OPTIONS)
+    folder = SafeFolder(path if path.is_dir() else path.parent)
+    description = path if path.is_file() else description_of(folder)
+    tables = _tables(description)
+    said = _with_file(options, tables["frames"], tables["angles"])
+    stacks = _stacks(folder, tables["frames"], tables["angles"])
+    frames, rows, columns = stacks["projections"].shape
+    scanner = _scanner(description, tables[""], (rows, columns))
+    geometry = with_options(scanner.geometry, options)
+    stored = _stored_timing(tables["timing"], tables["angles"], scanner)
+    timing = make_timing(str(description), frames, options, stored)
+    angle_rad = gantry_sign(said, "gantry") * _angles_rad(folder, tables["angles"], frames)
+    integrals = _line_integrals(stacks, said, tables["frames"], str(description))
+    return put_together(
+        integrals,
+        turning(geometry, angle_rad, timing),
+        geometry,
+        timing,
+        options,
+        title=tables[""].word("title", default=folder.root.resolve().name),
+        source=str(path),
+        grid=scanner.grid if tables[""].has("volume") else None,
+        lag=scanner.lag,
+    )
+
+
+def description_of(folder: SafeFolder) -> Path:
+    """The folder's only TOML file."""
+    found = folder.matching(".toml")
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found[:5]) or "none"
+        raise InputError(str(folder.root), f"TOML files: {names}", "one that describes the scan")
+    return found[0]
+
+
+def _tables(path: Path) -> dict[str, Fields]:
+    """The file's own tables by name, and under "" what a scanner file has; unknown names are refused."""
+    content = read_toml(path)
+    refuse_unknown(str(path), content, (*_SCANNER, *_OWN), "a name")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), _OWN[name]) for name in _OWN}
+    return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in _OWN}), **tables}
+
+
+def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
+    """The options, and under them what the file says in the same words."""
+    said = {
+        "quantity": frames.word("quantity", QUANTITIES) if frames.has("quantity") else None,
+        "flat_value": frames.length("flat_value") if frames.has("flat_value") else None,
+        "row_0": frames.word("row_0", ROW_0) if frames.has("row_0") else None,
+        "column_0": frames.word("column_0", COLUMN_0) if frames.has("column_0") else None,
+        "rotates": angles.word("rotates", ROTATES) if angles.has("rotates") else None,
+    }
+    return ImportOptions(**{**vars(options), **{k: getattr(options, k) or v for k, v in said.items()}})
+
+
+def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
+    """All images (n, v, u) that [frames] names, as stored."""
+    found = {}
+    for name in ("projections", "flats", "darks", "mask"):
+        if name != "projections" and not frames.has(name):
+            continue
+        paths = _files(folder, frames, name)
+        if name == "projections" and not any(angles.has(key) for key in _PER_FRAME):
+            check_numbering(paths, "complete the frames, or give every one its angle: [angles] values_deg or file")
+        found[name] = tiff.read_tiffs(paths)
+    return found
+
+
+def _line_integrals(
+    stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, culprit: str
+) -> LineIntegrals:
+    """Line integrals of the projections, with the pixels not to be used."""
+    turned = {name: upright(stack, said, "top") for name, stack in stacks.items()}
+    stack = turned["projections"]
+    found = line_integrals(culprit, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
+    if "mask" not in turned:
+        return found
+    return replace(found, mask=united(found.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
+
+
+def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
+    """The files that match a pattern, in natural order of their names."""
+    pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
+    below, last = PurePosixPath(pattern).parent, PurePosixPath(pattern).name
+    if "*" in str(below) or "**" in last:
+        raise InputError(frames.name(name), repr(pattern), "a pattern for files of one folder")
+    found = []
+    if (folder.root / below).is_dir():
+        names = [str(below / path.name) for path in (folder.root / below).iterdir() if path.match(last)]
+        found = in_natural_order([folder.file(text, frames.name(name)) for text in names])
+    if not found:
+        raise InputError(frames.name(name), f"no file that matches {pattern!r}", "at least one TIFF")
+    return found
+
+
+def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
+    """The scanner that the file describes; its panel has as many pixels as the images."""
+    content = dict(scanner.values)
+    content["detector"] = {"rows": panel[0], "columns": panel[1], **scanner.table("detector").values}
+    described = scanner_from(path, content)
+    if described.geometry.detector_shape != panel:
+        found = f"{described.geometry.detector_shape} rows and columns"
+        raise InputError(f"{path} [detector]", found, f"the images' {panel}", "leave both out")
+    return described
+
+
+def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTiming:
+    exposure_s = timing.number("exposure_s") if timing.has("exposure_s") else None
+    readout_s = timing.number("readout_s") if timing.has("readout_s") else None
+    if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
+        readout_s = scanner.readout_ratio * exposure_s
+    written = [timing.name(key) for key in ("exposure_s", "readout_s") if timing.has(key)]
+    return StoredTiming(
+        exposure_s=exposure_s,
+        readout_s=readout_s,
+        frame_time_s=timing.length("frame_time_s") if timing.has("frame_time_s") else None,
+        start_s=timing.numbers("start_s") if timing.has("start_s") else None,
+        axis=scanner.readout_axis,
+        direction=scanner.readout_direction,
+        pulse=scanner.pulse,
+        angle_at=angles.word("at", ANGLE_AT, default="start"),
+        written=(*written, *([angles.name("at")] if angles.has("at") else [])),
+    )
+
+
+def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
+    """(F,) as stored: a list, a file of one angle a line, or the first with the last or a step."""
+    given = [key for key in _ANGLES if angles.has(key)]
+    if len(given) != 1:
+        raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
+    if angles.has("unit") and not angles.has("file"):
+        raise InputError(angles.name("unit"), "no file beside it", "the unit of a file of angles", "leave it out")
+    if angles.has("file"):
+        unit = angles.word("unit", tuple(_TO_RAD), default="deg")
+        path = folder.file(angles.get("file"), angles.name("file"))
+        return _TO_RAD[unit] * read_numbers(path, frames, "angles")
+    if angles.has("values_deg"):
+        return np.deg2rad(angles.numbers("values_deg", frames))
+    first = angles.number("first_deg", 0.0)
+    if angles.has("step_deg"):
+        return np.deg2rad(first + np.arange(frames) * angles.number("step_deg"))
+    return np.deg2rad(np.linspace(first, angles.number("last_deg"), frames))
+
+
+def _mask(stack: np.ndarray, shape: tuple[int, ...], culprit: str) -> np.ndarray:
+    """Bad pixels (v, u) or (F, v, u) from images whose non-zero pixels are bad."""
+    if stack.shape == (1, *shape[1:]):
+        return stack[0] != 0
+    if stack.shape != shape:
+        raise InputError(culprit, f"shape {stack.shape}", f"one image of {shape[1:]}, or one a frame")
+    return stack != 0

@@ -1,0 +1,59 @@
+"""What importers of HDF5 share: numeric frames of any type, optional numbers with units, the sense of angles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.io.hdf5.datasets import read_length, read_values
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Hdf5Source]:
+    """``open_hdf5``, for files whose root or names are damaged as well.
+
+    h5py has a KeyError for the one, and hands out names that are no text as bytes, which no path can be joined with.
+    """
+    try:
+        with open_hdf5(path) as source:
+            yield source
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
+        ) from error
+
+
+def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:
+    """Frames (F, v, u) in their own type; with ``panel``, all of that shape, and one alone may come as (v, u)."""
+    dataset, culprit = source.dataset(address), source.name(address)
+    if dataset.dtype.kind not in "iuf":
+        raise InputError(culprit, f"type {dataset.dtype}", "real numbers")
+    if panel is not None and dataset.shape == panel:
+        return read_values(source, address, dataset)[None]
+    if dataset.ndim != 3 or min(dataset.shape) < 1:
+        expected = "three axes (frame, v, u), none of them empty"
+        raise InputError(culprit, f"shape {dataset.shape}", expected)
+    if panel is not None and dataset.shape[1:] != panel:
+        expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
+        raise InputError(culprit, f"shape {dataset.shape}", expected)
+    return read_values(source, address, dataset)
+
+
+def optional_length(source: Hdf5Source, *addresses: str, quantity: Quantity = LENGTH) -> float | None:
+    """The first of some datasets that is there, as a number above 0 in the package's unit."""
+    for address in addresses:
+        if source.find(address) is not None:
+            return read_length(source, address, quantity)
+    return None
+
+
+def gantry_sign(options: ImportOptions, custom: str) -> float:
+    """+1 where stored angles are the gantry's, −1 where they are the sample's."""
+    return 1.0 if (options.rotates or custom) == "gantry" else -1.0

@@ -1,0 +1,129 @@
+"""MetaImage (.mha, .mhd), volumes and stacks of projections: a text, then voxels, raw or deflated, here or beside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.reading.bounded import read_raw
+from phyradgs_cl.importers.reading.folder import SafeFolder, regular_file
+from phyradgs_cl.importers.reading.voxels import Voxels
+
+SUFFIXES = (".mha", ".mhd")
+_MOST_HEADER_BYTES = 1 << 16
+_TYPES = {
+    **{"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4"},
+    **{
+        "MET_UINT": "u4",
+        "MET_LONG_LONG": "i8",
+        "MET_ULONG_LONG": "u8",
+        "MET_FLOAT": "f4",
+        "MET_DOUBLE": "f8",
+    },
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MetaStack:
+    """Frames (F, v, u) as stored, and where pixels are: place (2,) of pixel (0, 0) and steps (2,), all (u, v) in mm."""
+
+    frames: np.ndarray
+    origin_mm: np.ndarray
+    step_u_mm: np.ndarray
+    step_v_mm: np.ndarray
+
+
+def read_meta_stack(path: Path) -> MetaStack:
+    """A stack of projections, third axis the frames, which must lie on top of each other."""
+    image = read_meta_image(path)
+    step = image.steps_mm
+    if np.abs(step[:2, 2]).max() + np.abs(step[2, :2]).max() > 1e-9 * np.abs(step).max():
+        found = str(step.tolist())[:80]
+        raise InputError(f"{path} TransformMatrix", found, "axes of a stack: columns, rows, frames")
+    return MetaStack(image.values, image.origin_mm[:2], step[0, :2], step[1, :2])
+
+
+def read_meta_image(path: Path) -> Voxels:
+    """An image of three axes."""
+    header, start = _header(path)
+    culprit = str(path)
+    if header.get("NDims") != "3":
+        raise InputError(f"{culprit} NDims", header.get("NDims", "nothing"), "3 axes")
+    if header.get("ElementNumberOfChannels", "1") != "1":
+        raise InputError(f"{culprit} ElementNumberOfChannels", header["ElementNumberOfChannels"], "1")
+    shape = tuple(int(n) for n in _numbers(culprit, header, "DimSize", 3)[::-1])
+    word = header.get("ElementType", "nothing")
+    if word not in _TYPES:
+        raise InputError(f"{culprit} ElementType", word[:40], ", ".join(_TYPES))
+    big = _first(header, "BinaryDataByteOrderMSB", "ElementByteOrderMSB") in ("True", "true", "1")
+    dtype = np.dtype(_TYPES[word]).newbyteorder(">" if big else "<")
+    values = _voxels(path, header, start, shape, dtype)
+    spacing = _numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
+    if spacing.min() <= 0:
+        raise InputError(f"{culprit} ElementSpacing", str(spacing.tolist()), "lengths above 0")
+    places = [key for key in ("Offset", "Position", "Origin") if key in header]
+    origin = _numbers(culprit, header, places[0] if places else "Offset", 3, "0 0 0")
+    steps = spacing[:, None] * _axes(culprit, header)
+    return Voxels(values, steps, origin, header.get("Comment", ""))
+
+
+def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
+    """(3, 3): row i is the direction of axis i."""
+    keys = [key for key in ("TransformMatrix", "Rotation", "Orientation") if key in header]
+    key = keys[0] if keys else "TransformMatrix"
+    axes = _numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+        raise InputError(f"{culprit} {key}", str(axes.tolist())[:80], "three directions at right angles")
+    return axes
+
+
+def _header(path: Path) -> tuple[dict[str, str], int]:
+    """Keys and values, and where the data begin."""
+    regular_file(path, str(path))
+    with open(path, "rb") as file:
+        text = file.read(_MOST_HEADER_BYTES)
+    header: dict[str, str] = {}
+    position = 0
+    while (end := text.find(b"\n", position)) >= 0:
+        key, sign, value = text[position:end].decode("latin-1").partition("=")
+        if not sign:
+            break
+        header[key.strip()] = value.strip()
+        position = end + 1
+        if key.strip() == "ElementDataFile":
+            return header, position
+    raise InputError(str(path), "no ElementDataFile in its header", "a MetaImage (.mha or .mhd)")
+
+
+def _voxels(
+    path: Path, header: dict[str, str], start: int, shape: tuple[int, ...], dtype: np.dtype
+) -> np.ndarray:
+    data_path, name = path, header["ElementDataFile"]
+    if name != "LOCAL":
+        if name.split(" ")[0] == "LIST" or "%" in name:
+            raise InputError(f"{path} ElementDataFile", name[:60], "LOCAL or one file name")
+        data_path, start = SafeFolder(path.parent).file(name, f"{path} ElementDataFile"), 0
+    if header.get("HeaderSize", "0") not in ("0", "-1"):
+        raise InputError(f"{path} HeaderSize", header["HeaderSize"][:20], "0")
+    packed = header.get("CompressedData", "False").lower() in ("true", "1")
+    return read_raw(data_path, start, shape, dtype, packed)
+
+
+def _first(header: dict[str, str], *keys: str) -> str:
+    return next((header[key] for key in keys if key in header), "False")
+
+
+def _numbers(
+    culprit: str, header: dict[str, str], key: str, count: int, default: str | None = None
+) -> np.ndarray:
+    text = header.get(key, default)
+    try:
+        values = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count or not np.all(np.abs(values) <= 1e12):
+        raise InputError(f"{culprit} {key}", (text or "nothing")[:60], f"{count} numbers")
+    return values

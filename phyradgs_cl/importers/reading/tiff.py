@@ -1,0 +1,188 @@
+"""Grey TIFF images, plain or deflated, one a file or many in one, of a size that the file can hold."""
+
+from __future__ import annotations
+
+import logging
+import math
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.reading.bounded import check_room
+from phyradgs_cl.importers.reading.folder import regular_file
+
+SUFFIXES = (".tif", ".tiff")
+_MOST_EXPANSION = 1200  # of a compressed image: deflate reaches 1032
+_MOST_PAGES = 100_000
+_PLAIN, _DEFLATED = 1, (8, 32946)
+_FREE_BYTES, _BLOCK_BYTES = 16 << 20, 16 << 20
+_BESIDE = 5  # bytes per pixel that follow: a line integral in float32, and whether it is masked
+_ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What a file promises: so many images (v, u) of one shape and type."""
+
+    images: int
+    shape: tuple[int, int]
+    dtype: np.dtype
+
+
+def read_tiffs(paths: list[Path]) -> np.ndarray:
+    """Frames (F, v, u) in the files' own type, row 0 as stored; every image of every file, in order.
+
+    All headers are read before any pixel, so that the frames are unpacked into one array of a known size.
+    """
+    headers = [_header(path) for path in paths]
+    first = headers[0]
+    for path, header in zip(paths, headers, strict=True):
+        if (header.shape, header.dtype) != (first.shape, first.dtype):
+            expected = f"{first.shape} {first.dtype} as in {paths[0].name}"
+            raise InputError(str(path), f"{header.shape} {header.dtype}", expected)
+    frames = sum(header.images for header in headers)
+    check_room(str(paths[0]), frames * math.prod(first.shape) * (first.dtype.itemsize + _BESIDE))
+    stack = np.empty((frames, *first.shape), first.dtype)
+    at = 0
+    for path in paths:
+        with _opened(path) as tiff:
+            for page in tiff.pages:
+                images = math.prod(page.shape[:-2])
+                _decode(path, page, stack[at : at + images])
+                at += images
+    return stack
+
+
+def _header(path: Path) -> _Header:
+    """What one file holds, with every page checked against the bytes that there are."""
+    with _opened(path) as tiff:
+        images = pages = total_bytes = 0
+        for page in tiff.pages:
+            if pages >= _MOST_PAGES:
+                raise InputError(str(path), f"more than {_MOST_PAGES} pages", "fewer pages")
+            _check_page(path, page, total_bytes)
+            if pages == 0:
+                shape, dtype = page.shape[-2:], page.dtype
+            if (page.shape[-2:], page.dtype) != (shape, dtype):
+                raise InputError(str(path), "pages of several sizes or types", "one for all frames")
+            pages, images = pages + 1, images + math.prod(page.shape[:-2])
+            total_bytes = images * math.prod(shape) * dtype.itemsize
+        behind = int((tiff.imagej_metadata or {}).get("images", 0)) if tiff.is_imagej else 0
+    if not pages:
+        raise InputError(str(path), "no page", "at least one image")
+    if behind > images:  # what ImageJ writes beyond 4 GB
+        found, expected = f"{behind} images and {images} of them in its directory", "a directory of all images"
+        raise InputError(str(path), found, expected, "save it as BigTIFF, or as one file per image")
+    return _Header(images, shape, dtype)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A TIFF; whatever the library stumbles over in the body comes out as an InputError."""
+    regular_file(path, str(path))
+    tifffile = _library()
+    try:
+        with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
+            yield tiff
+    except (InputError, MemoryError):
+        raise
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable TIFF") from error
+    except Exception as error:  # damage shows as anything
+        found = f"a TIFF that cannot be read ({type(error).__name__}: {str(error)[:80]})"
+        raise InputError(str(path), found, "grey images, uncompressed or deflated") from error
+
+
+def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
+    """Voxel sizes (x, y, z) mm and the origin's place (x, y, z) in voxels, where a stack states them; and its "Info".
+
+    Of ImageJ's own stacks, and of BigTIFF in which tifffile keeps the same words as JSON. Call ``read_pages`` first.
+    """
+    tifffile = _library()
+    try:
+        with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
+            facts = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
+            per_mm = [np.divide(*tiff.pages[0].tags[f"{axis}Resolution"].value) for axis in "XY"]
+        sizes = np.array([1 / per_mm[0], 1 / per_mm[1], float(facts["spacing"])])
+        if facts.get("unit") != "mm" or not np.all(np.isfinite(sizes) & (sizes > 0)):
+            return None, None, ""
+        origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])
+        return sizes, origin if np.isfinite(origin).all() else None, str(facts.get("Info", ""))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, tifffile.TiffFileError):
+        return None, None, ""
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keeps a library from logging a line for every damaged tag: one error says it all."""
+    logger = logging.getLogger(name)
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+def _check_page(path: Path, page: Any, before_bytes: int) -> None:
+    """What a page needs is compared with what is there before anything is decoded; one page may be a stack (n, v, u)."""
+    shape, dtype = page.shape, page.dtype
+    grey = len(shape) == 2 or (len(shape) == 3 and page.axes.endswith("YX"))
+    if not grey or min(shape) < 1 or dtype is None or dtype.kind not in "iuf":
+        found = f"a page of shape {shape}, type {dtype}"
+        raise InputError(str(path), found, "grey images (rows, columns), or a stack of them")
+    tag = page.tags.get(_ORIENTATION)
+    if tag is not None and tag.value != 1:
+        expected = "1 (row 0 at the top, column 0 on the left)"
+        raise InputError(f"{path} tag Orientation", str(tag.value), expected, "turn the images")
+    if page.compression not in (_PLAIN, *_DEFLATED):
+        found = f"a page with compression {int(page.compression)}"
+        raise InputError(str(path), found, "plain or deflated images", "save them uncompressed")
+    needed = math.prod(shape) * dtype.itemsize
+    size, here = path.stat().st_size, sum(page.databytecounts)
+    most = 1 if page.compression == _PLAIN else _MOST_EXPANSION
+    if needed > here * most or needed + before_bytes > size * most or _chunk(page) > 4 * needed + _FREE_BYTES:
+        found = f"a page of shape {shape}, {needed} bytes, in {min(here, size)} bytes of data"
+        raise InputError(str(path), found, "a size that the file can hold", "copy the file again")
+
+
+def _chunk(page: Any) -> int:
+    """Bytes of a strip or tile."""
+    return math.prod(page.chunks) * page.dtype.itemsize
+
+
+def _decode(path: Path, page: Any, into: np.ndarray) -> None:
+    """Unpack a page into frames (n, v, u)."""
+    if page.compression in _DEFLATED:
+        _check_inflation(path, page, _chunk(page))
+    page.asarray(maxworkers=1, out=into.reshape(page.shape))
+
+
+def _check_inflation(path: Path, page: Any, most: int) -> None:
+    """The library unpacks a strip to its end; one that has more in it than its pixels is refused before that."""
+    with open(path, "rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            packed, machine, left = file.read(count), zlib.decompressobj(), most
+            while packed and left >= 0:
+                left -= len(machine.decompress(packed, _BLOCK_BYTES))
+                packed = machine.unconsumed_tail
+            if left < 0:
+                found = f"a strip of more than {most} bytes"
+                raise InputError(str(path), found, "as many as its pixels take")
+
+
+def _library() -> ModuleType:
+    try:
+        import tifffile
+    except ImportError as error:
+        remedy = "pip install 'phyradgs-cl[formats]'"
+        raise InputError("tifffile", "not installed", "the package that reads TIFF", remedy) from error
+    return tifffile

@@ -1,0 +1,1 @@
+"""Scan files: schema, reading part by part, writing."""

@@ -1,0 +1,159 @@
+"""The detector's part of a scan file: frames, keys, geometry, shutter and mask, all but the pixels."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import ConeGeometry, Shutter
+from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hdf5.datasets import (
+    in_unit,
+    read_array,
+    read_attribute,
+    read_integers,
+    read_length,
+    read_number,
+    read_values,
+    read_word,
+)
+from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5.units import LENGTH, TIME
+from phyradgs_cl.io.scan import schema
+
+KNOWN = schema.KNOWN_NAMES
+
+
+def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
+    """The frames' dataset (F, v, u), unread, and what it holds."""
+    address = f"{entry}/{schema.DETECTOR}/data"
+    data, culprit = source.dataset(address, KNOWN), source.name(address)
+    if data.ndim != 3 or min(data.shape) < 1:
+        raise InputError(culprit, f"shape {data.shape}", "three axes (frame, v, u), none of them empty")
+    if (data.dtype.kind, data.dtype.itemsize) not in (("f", 4), ("u", 2)):
+        raise InputError(culprit, f"type {data.dtype}", "float32 or uint16", "convert the frames")
+    quantity = read_attribute(source, address, "quantity")
+    if quantity is None:
+        remedy = "add the attribute to the dataset"
+        raise InputError(
+            f"{culprit} @quantity", "no attribute", "one of " + ", ".join(schema.QUANTITIES), remedy
+        )
+    checks.one_of(f"{culprit} @quantity", quantity, schema.QUANTITIES)
+    if quantity != "counts" and data.dtype.kind == "u":
+        raise InputError(
+            culprit, f"{quantity} as {data.dtype}", "float32", "store float32, or counts as uint16"
+        )
+    return data, quantity
+
+
+def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
+    """What each stored frame is (F,): at least one of them a projection."""
+    address = f"{entry}/{schema.DETECTOR}/image_key"
+    image_key = read_integers(source, address, (frames,), KNOWN)
+    wrong = ~np.isin(image_key, (schema.PROJECTION, schema.FLAT, schema.DARK, schema.INVALID))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        expected = "0 projection, 1 flat, 2 dark or 3 invalid"
+        raise InputError(source.name(address), f"{image_key[at]} at index {at}", expected)
+    if not np.any(image_key == schema.PROJECTION):
+        raise InputError(
+            source.name(address), "no projection", "at least one 0", "mark the projections with 0"
+        )
+    return image_key
+
+
+def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int]) -> ConeGeometry:
+    """The circular geometry that the distances, pitches and offset describe."""
+    detector, address = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
+    to_axis_mm = abs(read_number(source, address, LENGTH, KNOWN))  # NeXus gives it a minus sign
+    if to_axis_mm == 0:
+        raise InputError(source.name(address), "0", "a length other than 0", "correct the value")
+    pitch_v_mm = read_length(source, f"{detector}/y_pixel_size", LENGTH, KNOWN)
+    pitch_u_mm = read_length(source, f"{detector}/x_pixel_size", LENGTH, KNOWN)
+    to_detector_mm = to_axis_mm + read_length(source, f"{detector}/distance", LENGTH, KNOWN)
+    offset = f"{entry}/{schema.EXTRA}/detector_offset"
+    offset_mm = (0.0, 0.0)
+    if source.optional(offset, KNOWN) is not None:
+        offset_mm = tuple(read_array(source, offset, (2,), LENGTH, KNOWN).tolist())
+    return ConeGeometry(to_axis_mm, to_detector_mm, detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
+
+
+def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
+    """Exposure and readout; what a rolling readout needs is required only where the gantry moves."""
+    exposure_s = _read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
+    needed = moving and exposure_s > 0
+    readout_s = _read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
+    axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
+    rolling = needed and readout_s > 0  # only then does it matter which line comes first
+    word, way = "rows", 1
+    if rolling or source.optional(axis, KNOWN) is not None:
+        word = read_word(source, axis, AXES, KNOWN)
+    if rolling or source.optional(direction, KNOWN) is not None:
+        number = read_number(source, direction, known=KNOWN)
+        checks.one_of(source.name(direction), number, (1, -1))
+        way = int(number)
+    pulse_s = _read_pulse(source, entry, exposure_s + readout_s)
+    return Shutter(exposure_s, readout_s, word, way, pulse_s)
+
+
+def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, float] | None:
+    """When the beam is on (start, length) in s after a frame's start, or None: always."""
+    start, length = f"{entry}/{schema.EXTRA}/pulse_start", f"{entry}/{schema.EXTRA}/pulse_length"
+    if source.optional(start, KNOWN) is None and source.optional(length, KNOWN) is None:
+        return None
+    start_s = read_number(source, start, TIME, KNOWN)
+    length_s = read_length(source, length, TIME, KNOWN)
+    if start_s >= span_s or start_s + length_s <= 0:
+        found = f"a pulse from {start_s:g} to {start_s + length_s:g} s"
+        expected = f"one that meets the frame's window, 0 to {span_s:g} s"
+        raise InputError(source.name(start), found, expected, "correct the pulse, or remove both datasets")
+    return start_s, length_s
+
+
+def _read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
+    """One time in s for all projections, stored once or for every frame; 0 where it may be missing."""
+    dataset = source.dataset(address, KNOWN) if needed else source.optional(address, KNOWN)
+    if dataset is None:
+        return 0.0
+    culprit = source.name(address)
+    if dataset.shape not in ((), (1,), used.shape):
+        raise InputError(culprit, f"shape {dataset.shape}", f"one number or shape {used.shape}")
+    values = read_values(source, address, dataset).astype(np.float64).reshape(-1)
+    values = values if values.shape != used.shape else values[used]
+    checks.finite(culprit, values)
+    values = in_unit(source, address, values, TIME)
+    if values.min() < 0:
+        raise InputError(culprit, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
+    if np.ptp(values) > 1e-6 * values.max():
+        raise InputError(
+            culprit, f"{values.min():.6g} to {values.max():.6g} s", "one time for all projections"
+        )
+    return float(values[0])
+
+
+def read_starts(
+    source: Hdf5Source, entry: str, used: np.ndarray, shutter: Shutter, moving: bool
+) -> np.ndarray:
+    """Opening times (frames,) of the projections; evenly spaced where nothing moves and none are stored."""
+    address = f"{entry}/{schema.DETECTOR}/frame_start_time"
+    if not moving and source.optional(address, KNOWN) is None:
+        return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
+    return read_array(source, address, used.shape, TIME, KNOWN)[used]
+
+
+def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:
+    """Shape of the pixel mask, unread, or None without one."""
+    address = f"{entry}/{schema.DETECTOR}/pixel_mask"
+    mask = source.optional(address, KNOWN)
+    if mask is None:
+        return None
+    if mask.shape not in (data_shape, data_shape[1:]):
+        expected = f"{data_shape[1:]} (v, u) or {data_shape} (frame, v, u)"
+        raise InputError(source.name(address), f"shape {mask.shape}", expected)
+    if mask.dtype.kind not in "biu":
+        raise InputError(
+            source.name(address), f"type {mask.dtype}", "whole numbers", "non-zero marks a bad pixel"
+        )
+    return mask.shape

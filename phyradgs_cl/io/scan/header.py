@@ -1,0 +1,187 @@
+"""Everything in a scan file except its large arrays, checked in full before those are read."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_word
+from phyradgs_cl.io.hdf5.facts import read_facts
+from phyradgs_cl.io.hdf5.grid import default_grid, read_grid
+from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.detector import (
+    check_mask,
+    read_data_kind,
+    read_geometry,
+    read_image_key,
+    read_shutter,
+    read_starts,
+)
+from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
+
+_log = logging.getLogger(__name__)
+KNOWN = schema.KNOWN_NAMES
+
+
+@dataclass(frozen=True, eq=False)
+class ScanHeader:
+    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
+
+    ``entry`` is the NXtomo group's address, image_key (F,) runs over all stored frames, ``mask_shape`` and
+    ``has_reference`` tell which optional arrays the file has.
+    """
+
+    scan: Scan
+    entry: str
+    image_key: np.ndarray
+    quantity: str
+    data_type: str
+    mask_shape: tuple[int, ...] | None
+    has_reference: bool
+    has_grid: bool
+
+    @property
+    def data_address(self) -> str:
+        """Where the frames are stored."""
+        return f"{self.entry}/{schema.DETECTOR}/data"
+
+    @property
+    def mask_address(self) -> str:
+        """Where the pixel mask is stored, if there is one."""
+        return f"{self.entry}/{schema.DETECTOR}/pixel_mask"
+
+    @property
+    def reference_address(self) -> str:
+        """Where the ground truth is stored, if there is one."""
+        return f"{self.entry}/{schema.REFERENCE}/volume"
+
+
+def read_header(source: Hdf5Source) -> ScanHeader:
+    """Read and check everything but pixels, mask and reference; InputError names what is wrong."""
+    entry = find_entry(source)
+    data, quantity = read_data_kind(source, entry)
+    image_key = read_image_key(source, entry, len(data))
+    used = image_key == schema.PROJECTION
+    geometry = read_geometry(source, entry, (data.shape[1], data.shape[2]))
+    moving = has_motion(source, entry)
+    shutter = read_shutter(source, entry, used, moving)
+    is_fly = moving and shutter.exposure_s > 0
+    start_s = read_starts(source, entry, used, shutter, moving)
+    shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
+    trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
+    grid, has_grid = _read_or_derive_grid(source, entry, geometry)
+    scan = Scan(
+        projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])),
+        geometry=geometry,
+        trajectory=trajectory,
+        shutter=shutter,
+        frame_start_s=start_s,
+        grid=grid,
+        is_fly=is_fly,
+        detector_model=_read_model(source, entry),
+        title=_optional_word(source, f"{entry}/title", "cone-beam scan"),
+        provenance=_read_provenance(source, entry),
+        lag=_read_lag(source, entry),
+        saturation=_read_saturation(source, entry),
+    )
+    scan.check_timing()
+    mask_shape = check_mask(source, entry, data.shape)
+    has_reference = _check_reference(source, entry, grid)
+    if not has_grid:
+        _warn_of_grid(source, entry, grid)
+    _warn_of_ignored(source, entry)
+    return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, has_grid)
+
+
+def find_entry(source: Hdf5Source) -> str:
+    """Address of the NXtomo entry: the root's @default, /entry, or the only NXentry."""
+    default = read_attribute(source, "/", "default")
+    for name in (default, "entry"):
+        if name and isinstance(source.find(f"/{name.strip('/')}"), h5py.Group):
+            return f"/{name.strip('/')}"
+    entries = [name for name in source.root_groups() if read_attribute(source, name, "NX_class") == "NXentry"]
+    if len(entries) == 1:
+        return entries[0]
+    found = f"{len(entries)} NXentry groups" if entries else "no NXentry group"
+    raise InputError(source.name("/entry"), found, "a group 'entry'", source.near_miss("/", "entry", ()))
+
+
+def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry) -> tuple[Grid, bool]:
+    address = f"{entry}/{schema.GRID}"
+    if source.optional_group(address, KNOWN) is not None:
+        return read_grid(source, address), True
+    try:
+        grid = default_grid(geometry)
+    except InputError as error:
+        remedy = "correct the geometry, or store the grid"
+        raise InputError(
+            source.name(address), "no grid, and none that follows", error.expected, remedy
+        ) from error
+    return grid, False
+
+
+def _warn_of_grid(source: Hdf5Source, entry: str, grid: Grid) -> None:
+    where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
+    _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
+
+
+def _read_model(source: Hdf5Source, entry: str) -> str:
+    address = f"{entry}/{schema.EXTRA}/detector_model"
+    if source.optional(address, KNOWN) is None:
+        return "log"
+    return read_word(source, address, DETECTOR_MODELS, KNOWN)
+
+
+def _read_lag(source: Hdf5Source, entry: str) -> float:
+    address = f"{entry}/{schema.EXTRA}/lag"
+    if source.optional(address, KNOWN) is None:
+        return 0.0
+    lag = read_number(source, address, known=KNOWN)
+    checks.within(source.name(address), lag, 0, LARGEST_LAG)
+    return lag
+
+
+def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
+    level, share = (f"{entry}/{schema.EXTRA}/saturation_{name}" for name in ("level", "share"))
+    if source.optional(level, KNOWN) is None and source.optional(share, KNOWN) is None:
+        return None
+    found = Saturation(read_number(source, level, known=KNOWN), read_number(source, share, known=KNOWN))
+    checks.within(source.name(share), found.share, 0, 1)
+    return found
+
+
+def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
+    address = f"{entry}/{schema.EXTRA}/provenance"
+    if source.optional(address, KNOWN) is None:
+        return {}
+    return read_facts(source.name(address), read_word(source, address), {})
+
+
+def _optional_word(source: Hdf5Source, address: str, default: str) -> str:
+    return (read_word(source, address) if source.find(address) is not None else "") or default
+
+
+def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
+    if source.optional_group(f"{entry}/{schema.REFERENCE}", KNOWN) is None:
+        return False
+    address = f"{entry}/{schema.REFERENCE}/volume"
+    volume = source.dataset(address, KNOWN)
+    if volume.shape != grid.shape:
+        remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
+        raise InputError(source.name(address), f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
+    return True
+
+
+def _warn_of_ignored(source: Hdf5Source, entry: str) -> None:
+    for address in (f"{entry}/{name}" for name in schema.IGNORED):
+        if source.find(address) is not None:
+            _log.warning("%s: not read by this package", source.name(address))

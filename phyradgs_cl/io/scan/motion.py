@@ -1,0 +1,164 @@
+"""Where θ(t) comes from in a scan file: pose table, encoder table, or each frame's own two angles."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import h5py
+import numpy as np
+
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    EncoderTable,
+    FrameSweeps,
+    PoseTable,
+    Scan,
+    SpeedRamp,
+)
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hdf5.datasets import new_group, read_array, read_attribute, write_number
+from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
+from phyradgs_cl.io.scan import schema
+
+_log = logging.getLogger(__name__)
+_RAMP_ERROR_RAD = 1e-9
+_MOST_RAMP_SAMPLES = 500_000
+_SUSPECT_RAD = math.radians(5.0)
+
+
+def has_motion(source: Hdf5Source, entry: str) -> bool:
+    """Whether the file says how the gantry moved during an exposure."""
+    end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end", schema.KNOWN_NAMES)
+    groups = (schema.KINEMATICS, schema.POSES)
+    found = [source.optional_group(f"{entry}/{group}", schema.KNOWN_NAMES) for group in groups]
+    return end is not None or any(group is not None for group in found)
+
+
+def read_trajectory(
+    source: Hdf5Source,
+    entry: str,
+    geometry: ConeGeometry,
+    used: np.ndarray,
+    start_s: np.ndarray,
+    exposure_s: float,
+) -> CircularOrbit | PoseTable:
+    """The trajectory of the frames that the mask ``used`` (F,) selects and that open at ``start_s``."""
+    first_rad = read_angles(source, entry, "rotation_angle", used)
+    poses, kinematics = f"{entry}/{schema.POSES}", f"{entry}/{schema.KINEMATICS}"
+    if source.optional_group(poses, schema.KNOWN_NAMES) is not None:
+        time_s = _read_table_times(source, f"{poses}/time_s")
+        table_mm = read_array(source, f"{poses}/pose", (len(time_s), 12), LENGTH, schema.KNOWN_NAMES)
+        return PoseTable(time_s, table_mm, source.name(f"{poses}/pose"))
+    if source.optional_group(kinematics, schema.KNOWN_NAMES) is not None:
+        time_s = _read_table_times(source, f"{kinematics}/time_s")
+        address = f"{kinematics}/angle_deg"
+        angle_rad = read_array(source, address, (len(time_s),), ANGLE, schema.KNOWN_NAMES)
+        angle_rad = angle_rad * _sense(source, address, absent=1.0)
+        _warn_if_apart(source, address, np.interp(start_s, time_s, angle_rad), first_rad)
+        return CircularOrbit(geometry, EncoderTable(time_s, angle_rad, source.name(f"{kinematics}/time_s")))
+    last_rad = first_rad
+    if exposure_s > 0 and source.find(f"{entry}/{schema.SAMPLE}/rotation_angle_end") is not None:
+        last_rad = read_angles(source, entry, "rotation_angle_end", used)
+    return CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first_rad, last_rad))
+
+
+def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
+    """Gantry angles in radians of the used frames, from rotation_angle or rotation_angle_end."""
+    address = f"{entry}/{schema.SAMPLE}/{name}"
+    angle_rad = read_array(source, address, used.shape, ANGLE, schema.KNOWN_NAMES)[used]
+    # The end angle turns as the start angle does, unless it says so itself.
+    start = f"{entry}/{schema.SAMPLE}/rotation_angle"
+    return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
+
+
+def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
+    """Write rotation angles and tables; row i of the (F,) arrays describes projection ``frame_of[i]``."""
+    first_rad, last_rad = _exposure_angles(scan)
+    sample = entry[schema.SAMPLE]
+    write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
+    if scan.is_fly and scan.shutter.exposure_s > 0:
+        last_deg = np.rad2deg(last_rad)[frame_of]
+        write_number(sample, "rotation_angle_end", last_deg, "degree", rotates="gantry")
+    if isinstance(scan.trajectory, PoseTable):
+        _write_poses(entry, scan.trajectory, 0.0 if scan.is_fly else scan.shutter.middle_s)
+    elif scan.is_fly and isinstance(scan.trajectory.kinematics, (EncoderTable, SpeedRamp)):
+        _write_kinematics(entry, *_angle_table(scan))
+
+
+def _write_poses(entry: h5py.Group, table: PoseTable, earlier_s: float) -> None:
+    """A stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts."""
+    group = new_group(entry[schema.EXTRA], "poses", "NXcollection")
+    write_number(group, "time_s", table.time_s - earlier_s, "s")
+    write_number(group, "pose", table.table, "mm")
+
+
+def _write_kinematics(entry: h5py.Group, time_s: np.ndarray, angle_rad: np.ndarray) -> None:
+    group = new_group(entry[schema.EXTRA], "kinematics", "NXcollection")
+    write_number(group, "time_s", time_s, "s")
+    write_number(group, "angle_deg", np.rad2deg(angle_rad), "degree", rotates="gantry")
+
+
+def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """Gantry angles (F,) as each exposure starts and ends; both at mid-window if the gantry stands."""
+    shutter = scan.shutter
+    offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
+    pairs = np.array(
+        [_angles(scan, frame, start_s + offsets_s) for frame, start_s in enumerate(scan.frame_start_s)]
+    )
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
+    if isinstance(scan.trajectory, PoseTable):  # the source's azimuth: only other programs read it
+        pose = scan.trajectory.pose(frame, time_s)
+        return np.unwrap(np.arctan2(pose[:, 1], pose[:, 0]))
+    return scan.trajectory.angle_rad(frame, time_s)
+
+
+def _angle_table(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """The encoder's table, or a speed ramp sampled until straight pieces follow it to a nanoradian."""
+    kinematics = scan.trajectory.kinematics  # type: ignore[union-attr]
+    if isinstance(kinematics, EncoderTable):
+        return kinematics.time_s, kinematics.angle_rad_table
+    first_s, last_s = (
+        float(np.min(scan.frame_start_s)),
+        float(np.max(scan.frame_start_s)) + scan.shutter.span_s,
+    )
+    step_s = math.sqrt(8 * _RAMP_ERROR_RAD / max(abs(kinematics.acceleration_rad_per_s2), 1e-12))
+    samples = min(_MOST_RAMP_SAMPLES, max(2, math.ceil((last_s - first_s) / step_s) + 1))
+    time_s = np.linspace(first_s, last_s, samples)
+    return time_s, kinematics.angle_rad(0, time_s)
+
+
+def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
+    time_s = read_array(source, address, (None,), TIME, schema.KNOWN_NAMES)
+    if len(time_s) < 2:
+        raise InputError(source.name(address), f"{len(time_s)} samples", "at least 2")
+    if np.any(np.diff(time_s) <= 0):
+        at = int(np.argmax(np.diff(time_s) <= 0)) + 1
+        found = f"times that do not increase at index {at}"
+        raise InputError(source.name(address), found, "strictly increasing times", "sort the table by time")
+    return time_s
+
+
+def _sense(source: Hdf5Source, address: str, absent: float) -> float:
+    """+1 where the angle is the gantry's, −1 where it is the sample's."""
+    rotates = read_attribute(source, address, "rotates")
+    if rotates is None:
+        return absent
+    if rotates not in schema.ROTATES:
+        raise InputError(f"{source.name(address)} @rotates", repr(rotates), "'gantry' or 'sample'")
+    return 1.0 if rotates == "gantry" else -1.0
+
+
+def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
+    """The table wins, but a wrong sense of rotation should not pass in silence."""
+    apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
+    if apart_rad.max() > _SUSPECT_RAD:
+        worst_deg = math.degrees(apart_rad.max())
+        _log.warning(
+            "%s: up to %.3g° from rotation_angle; the table is used", source.name(address), worst_deg
+        )

@@ -1,0 +1,210 @@
+"""Scan files: a NeXus NXtomo entry in HDF5, read into a Scan of line integrals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hashing import sha256_of
+from phyradgs_cl.io.hdf5.datasets import in_unit, read_values
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+from phyradgs_cl.io.hdf5.units import ATTENUATION
+from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.header import ScanHeader, read_header
+
+LARGEST_LINE_INTEGRAL = 1e6
+# (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, bad pixels.
+ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
+
+
+def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
+    """Read a scan file; the frames become line integrals by ``to_attenuation``.
+
+    Everything but the pixels is checked before the pixels are read. Flat, dark and invalid frames are
+    gone from the result; pixels that the file or the conversion calls bad are in its ``pixel_mask``.
+    Pixels that are not finite must be masked.
+
+    Args:
+        path: the HDF5 file.
+        to_attenuation: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P
+            projections and a mask (v, u) or (P, v, u) of unusable values, or None.
+
+    Returns:
+        The scan, with projections (P, v, u) float32 and a bool ``pixel_mask`` or None.
+
+    Raises:
+        InputError: the file is missing, damaged or incomplete; its culprit is "FILE:/hdf5/path".
+    """
+    with open_hdf5(path) as source:
+        header = read_header(source)
+        mask = _read_mask(source, header)
+        reference = _read_reference(source, header)
+        data = _read_frames(source, header, mask)
+    projections, bad = _convert(source.name(header.data_address), header, data, to_attenuation)
+    used = header.image_key == schema.PROJECTION
+    kept = mask[used] if mask is not None and mask.ndim == 3 else mask
+    return replace(header.scan, projections=projections, pixel_mask=_united(kept, bad), reference=reference)
+
+
+def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
+    """Facts about a scan file, for people: checked as for reading, but without touching the pixels.
+
+    sha256: of the file, where it is known already.
+    """
+    with open_hdf5(path) as source:
+        header = read_header(source)
+    scan, key = header.scan, header.image_key
+    counts = {
+        name: int(np.count_nonzero(key == number))
+        for number, name in enumerate(("projections", "flats", "darks", "invalid"))
+    }
+    return {
+        "title": scan.title,
+        **counts,
+        "data": f"{header.data_type} {header.quantity}",
+        "fly_scan": scan.is_fly,
+        "trajectory": _trajectory_word(scan),
+        **_geometry_facts(scan),
+        **_timing_facts(scan),
+        "detector_model": scan.detector_model,
+        **_panel_facts(scan),
+        "pixel_mask": header.mask_shape is not None,
+        "grid_shape": scan.grid.shape,
+        "grid_voxel_size_mm": scan.grid.voxel_size_mm,
+        "grid_stored": header.has_grid,
+        "reference": header.has_reference,
+        "sha256": sha256 or sha256_of(path),
+    }
+
+
+def _geometry_facts(scan: Scan) -> dict[str, object]:
+    geometry = scan.geometry
+    return {
+        "source_to_axis_mm": geometry.source_to_axis_mm,
+        "source_to_detector_mm": geometry.source_to_detector_mm,
+        "detector_shape": geometry.detector_shape,
+        "pixel_size_mm": geometry.pixel_size_mm,
+        "detector_offset_mm": geometry.detector_offset_mm,
+    }
+
+
+def _timing_facts(scan: Scan) -> dict[str, object]:
+    """Exposure, readout, and the arcs of the first frame where the gantry has an angle."""
+    shutter = scan.shutter
+    facts: dict[str, object] = {
+        "exposure_s": shutter.exposure_s,
+        "readout_s": shutter.readout_s,
+        "readout_axis": shutter.axis,
+        "readout_direction": shutter.direction,
+        "scan_s": float(np.ptp(scan.frame_start_s)) + shutter.span_s,
+    }
+    if isinstance(scan.trajectory, CircularOrbit):
+        orbit, last = scan.trajectory, scan.frames - 1
+        ends = [
+            float(orbit.angle_rad(frame, scan.frame_start_s[frame : frame + 1])[0]) for frame in (0, last)
+        ]
+        facts["first_angle_deg"], facts["last_angle_deg"] = np.rad2deg(ends).tolist()
+    if scan.is_fly and isinstance(scan.trajectory, CircularOrbit):
+        marks_s = scan.frame_start_s[0] + np.array([0.0, shutter.exposure_s, shutter.span_s])
+        first, closed, done = np.rad2deg(scan.trajectory.angle_rad(0, marks_s)).tolist()
+        facts["exposure_arc_deg"], facts["span_arc_deg"] = closed - first, done - first
+    return facts
+
+
+def _panel_facts(scan: Scan) -> dict[str, object]:
+    """Pulse and lag, where there are any."""
+    facts: dict[str, object] = {}
+    if scan.shutter.pulse_s is not None:
+        facts["pulse_start_s"], facts["pulse_length_s"] = scan.shutter.pulse_s
+        facts["dark_lines"] = int(np.count_nonzero(scan.shutter.lit_share(scan.lines) == 0))
+    if scan.lag > 0:
+        facts["lag"] = scan.lag
+    return facts
+
+
+def _trajectory_word(scan: Scan) -> str:
+    if isinstance(scan.trajectory, PoseTable):
+        return "pose table"
+    if isinstance(scan.trajectory.kinematics, EncoderTable):
+        return "encoder table"
+    return "constant speed in each frame" if scan.is_fly else "one angle a frame"
+
+
+def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
+    """Bad pixels, bool (v, u) or (F, v, u)."""
+    if header.mask_shape is None:
+        return None
+    address = header.mask_address
+    mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
+    used = mask if mask.ndim == 2 else mask[header.image_key == schema.PROJECTION]
+    if used.all():
+        remedy = "non-zero means: do not use"
+        raise InputError(source.name(address), "every pixel masked", "at least one zero", remedy)
+    return mask
+
+
+def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
+    """The ground truth (z, y, x) float32 in 1/mm."""
+    if not header.has_reference:
+        return None
+    address = header.reference_address
+    values = read_values(source, address, source.dataset(address))
+    checks.finite(source.name(address), values)
+    if values.max() <= 0:
+        found, expected = (
+            f"no voxel above 0 (the largest is {values.max() + 0.0:g})",
+            "a truth to compare with",
+        )
+        raise InputError(source.name(address), found, expected, "take the reference out of the file")
+    return in_unit(source, address, values, ATTENUATION).astype(np.float32)
+
+
+def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None) -> np.ndarray:
+    """All stored frames (F, v, u); every value of a frame in use is finite unless it is masked."""
+    data = read_values(source, header.data_address, source.dataset(header.data_address))
+    if data.dtype.kind == "f":
+        for frame in np.flatnonzero(header.image_key != schema.INVALID):
+            bad = ~np.isfinite(data[frame])
+            if mask is not None:
+                bad &= ~(mask if mask.ndim == 2 else mask[frame])
+            if bad.any():
+                row, column = np.unravel_index(int(np.argmax(bad)), bad.shape)
+                found = (
+                    f"NaN or infinity in frame {frame} at ({row}, {column}), {int(bad.sum())} in this frame"
+                )
+                remedy = "set them, or mark them in pixel_mask"
+                raise InputError(source.name(header.data_address), found, "finite values", remedy)
+    return data
+
+
+def _convert(
+    culprit: str, header: ScanHeader, data: np.ndarray, to_attenuation: ToAttenuation
+) -> tuple[np.ndarray, np.ndarray | None]:
+    valid = header.image_key != schema.INVALID
+    if not valid.all():
+        data = data[valid]
+    try:
+        projections, bad = to_attenuation(data, header.image_key[valid], header.quantity)
+    except InputError as error:
+        raise InputError(f"{culprit} ({error.culprit})", error.found, error.expected, error.remedy) from error
+    if projections.shape != header.scan.projections.shape:
+        raise InputError(culprit, f"line integrals {projections.shape}", str(header.scan.projections.shape))
+    checks.finite(culprit, projections)
+    largest = float(np.abs(projections).max())
+    if largest > LARGEST_LINE_INTEGRAL:
+        expected = f"at most {LARGEST_LINE_INTEGRAL:g}: nothing shines through more than some tens"
+        raise InputError(culprit, f"a line integral of size {largest:.6g}", expected, "check the quantity")
+    return np.ascontiguousarray(projections, dtype=np.float32), bad
+
+
+def _united(mask: np.ndarray | None, bad: np.ndarray | None) -> np.ndarray | None:
+    """Union of two masks, each (v, u) or (P, v, u) or None; a mask that marks nothing adds nothing."""
+    if bad is None or not np.any(bad):
+        return mask
+    return np.asarray(bad, bool) if mask is None else mask | np.asarray(bad, bool)

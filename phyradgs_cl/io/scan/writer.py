@@ -1,0 +1,157 @@
+"""Writing scan files: the NXtomo entry of scan_schema, as other programs read it too."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import PoseTable, Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.hdf5.datasets import new_group, write_number
+from phyradgs_cl.io.hdf5.grid import write_grid
+from phyradgs_cl.io.hdf5.new import new_hdf5
+from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.motion import write_motion
+from phyradgs_cl.text import plain_text
+
+_log = logging.getLogger(__name__)
+
+
+def write_scan(
+    path: str | Path,
+    scan: Scan,
+    *,
+    data: np.ndarray | None = None,
+    image_key: np.ndarray | None = None,
+    quantity: str = "attenuation",
+) -> None:
+    """Write a scan file, whole or not at all.
+
+    Args:
+        path: the HDF5 file; one that exists is replaced.
+        scan: geometry, timing, masks, reference, and the line integrals unless ``data`` is given.
+        data: (F, v, u) float32 or uint16 raw frames, flats and darks included, in place of them.
+        image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid; it has as many 0 as ``scan`` has frames.
+        quantity: what ``data`` holds: "attenuation", "transmission" or "counts".
+
+    Raises:
+        InputError: arguments that do not fit each other, or a scan that the format cannot express.
+        OutputError: the file cannot be written.
+    """
+    frames, key = _checked_frames(scan, data, image_key, quantity)
+    _check_expressible(scan)
+    with written_beside(path) as temporary, new_hdf5(temporary) as file:
+        file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
+        entry = new_group(file, "entry", "NXentry")
+        entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"
+        entry["definition"], entry["title"] = "NXtomo", plain_text(scan.title)
+        new_group(entry, schema.SAMPLE, "NXsample")["name"] = plain_text(scan.title)
+        # Frames between projections (flats, darks) are filed under the projection before them.
+        frame_of = np.clip(np.cumsum(key == schema.PROJECTION) - 1, 0, None)
+        _write_instrument(entry, scan, frames, key, quantity, frame_of)
+        _write_extra(entry, scan)
+        write_motion(entry, scan, frame_of)
+        _write_links(entry)
+
+
+def _checked_frames(
+    scan: Scan, data: np.ndarray | None, image_key: np.ndarray | None, quantity: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """What to store: frames (F, v, u) float32 or uint16, and their keys (F,)."""
+    checks.one_of("quantity", quantity, schema.QUANTITIES)
+    if data is None:
+        if quantity != "attenuation" or image_key is not None:
+            raise InputError(
+                "data", "None", "raw frames with an image_key", "pass the frames of this quantity"
+            )
+        data = scan.projections
+    key = np.zeros(len(data), np.int64) if image_key is None else np.asarray(image_key)
+    frames = data if data.dtype == np.uint16 else data.astype(np.float32, copy=False)
+    checks.shape("data", frames, (None, *scan.geometry.detector_shape))
+    checks.shape("image_key", key, (len(frames),))
+    if int(np.count_nonzero(key == schema.PROJECTION)) != scan.frames or not np.isin(key, range(4)).all():
+        expected = f"keys 0 to 3, {scan.frames} of them 0 (the scan's frames)"
+        raise InputError("image_key", f"{np.count_nonzero(key == schema.PROJECTION)} projections", expected)
+    if frames.dtype == np.uint16 and quantity != "counts":
+        raise InputError("data", f"{quantity} as uint16", "float32", "only counts may be whole numbers")
+    return frames, key
+
+
+def _check_expressible(scan: Scan) -> None:
+    """In a file a scan is a fly-scan only with an exposure."""
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:
+        remedy = "give the exposure its real length"
+        raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
+
+
+def _write_instrument(
+    entry: h5py.Group, scan: Scan, frames: np.ndarray, key: np.ndarray, quantity: str, frame_of: np.ndarray
+) -> None:
+    geometry, instrument = scan.geometry, new_group(entry, "instrument", "NXinstrument")
+    source = new_group(instrument, "source", "NXsource")
+    write_number(source, "distance", -geometry.source_to_axis_mm, "mm")
+    detector = new_group(instrument, "detector", "NXdetector")
+    detector.create_dataset("data", data=frames).attrs.update(quantity=quantity, interpretation="image")
+    write_number(detector, "image_key", key.astype(np.int32))
+    pitch_v_mm, pitch_u_mm = geometry.pixel_size_mm
+    write_number(detector, "x_pixel_size", pitch_u_mm, "mm")
+    write_number(detector, "y_pixel_size", pitch_v_mm, "mm")
+    write_number(detector, "distance", geometry.source_to_detector_mm - geometry.source_to_axis_mm, "mm")
+    exposure_s, readout_s = _stored_durations(scan)
+    if exposure_s + readout_s < scan.shutter.span_s:
+        _log.warning("a stop-and-shoot scan with a pose table is stored without exposure and readout times")
+    write_number(detector, "count_time", exposure_s, "s")
+    write_number(detector, "detector_readout_time", readout_s, "s")
+    write_number(detector, "frame_start_time", np.asarray(scan.frame_start_s, np.float64)[frame_of], "s")
+    if scan.pixel_mask is not None:
+        mask = np.asarray(scan.pixel_mask) != 0
+        mask = (mask if mask.ndim == 2 else mask[frame_of]).astype(np.uint8)
+        detector.create_dataset("pixel_mask", data=mask, compression="gzip", shuffle=True)
+
+
+def _stored_durations(scan: Scan) -> tuple[float, float]:
+    """Exposure and readout in s, as stored; 0 for a gantry that stops along a pose table, or it would read as moving."""
+    if not scan.is_fly and isinstance(scan.trajectory, PoseTable):
+        return 0.0, 0.0
+    return scan.shutter.exposure_s, scan.shutter.readout_s
+
+
+def _write_extra(entry: h5py.Group, scan: Scan) -> None:
+    extra = new_group(entry, schema.EXTRA, "NXcollection")
+    extra["readout_axis"] = scan.shutter.axis
+    write_number(extra, "readout_direction", scan.shutter.direction)
+    write_number(extra, "detector_offset", scan.geometry.detector_offset_mm, "mm")
+    extra["detector_model"] = scan.detector_model
+    if scan.lag > 0:
+        write_number(extra, "lag", scan.lag)
+    if scan.saturation is not None:
+        write_number(extra, "saturation_level", scan.saturation.level)
+        write_number(extra, "saturation_share", scan.saturation.share)
+    if scan.shutter.pulse_s is not None and _stored_durations(scan)[0] > 0:
+        start_s, length_s = scan.shutter.pulse_s
+        write_number(extra, "pulse_start", start_s, "s")
+        write_number(extra, "pulse_length", length_s, "s")
+    if scan.provenance:
+        extra["provenance"] = json.dumps(scan.provenance, default=str)
+    write_grid(extra, scan.grid)
+    if scan.reference is not None:
+        volume = np.asarray(scan.reference, np.float32)
+        group = new_group(extra, "reference", "NXcollection")
+        dataset = group.create_dataset("volume", data=volume, compression="gzip", shuffle=True)
+        dataset.attrs["units"] = "1/mm"
+
+
+def _write_links(entry: h5py.Group) -> None:
+    """The NXdata group that viewers open first."""
+    group = new_group(entry, "data", "NXdata")
+    group.attrs["signal"] = "data"
+    group.attrs["axes"] = ["rotation_angle", ".", "."]
+    group["data"] = h5py.SoftLink(f"/entry/{schema.DETECTOR}/data")
+    group["image_key"] = h5py.SoftLink(f"/entry/{schema.DETECTOR}/image_key")
+    group["rotation_angle"] = h5py.SoftLink(f"/entry/{schema.SAMPLE}/rotation_angle")

@@ -1,0 +1,157 @@
+"""Scanner descriptions: a small TOML file with a geometry, a volume and how the panel reads out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition.scan import LARGEST_LAG
+from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.volume import MOST_VOXELS
+from phyradgs_cl.io.hdf5.grid import default_grid
+from phyradgs_cl.io.hdf5.units import LENGTH
+from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
+from phyradgs_cl.text import near_miss
+
+_TABLES: dict[str, tuple[str, ...]] = {
+    "source": ("to_axis_mm", "to_detector_mm"),
+    "detector": (
+        *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"),
+        "lag",
+    ),
+    "beam": ("pulse_start", "pulse_length"),
+    "volume": ("shape", "size_mm", "offset_mm"),
+    "readout": ("axis", "direction", "ratio"),
+}
+_WORDS = ("title",)
+MOST_LINES = 65_536
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """A scanner: where things stand, what volume it images, and how its panel is read by default.
+
+    ``readout_ratio`` is T_ro/T_exp, or None if the file leaves it to the protocol. ``pulse`` is when the beam is on
+    in a frame (start, length; shares of the exposure), None always; ``lag`` the panel's λ (detector/lag.py).
+    """
+
+    name: str
+    geometry: ConeGeometry
+    grid: Grid
+    readout_axis: str = "rows"
+    readout_direction: int = 1
+    readout_ratio: float | None = None
+    pulse: tuple[float, float] | None = None
+    lag: float = 0.0
+
+
+def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
+    """A scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml.
+
+    Raises:
+        InputError: no such scanner, not TOML, unknown, missing or wrong keys: "FILE [table] key".
+    """
+    path = _located(str(name_or_path), data_dir)
+    return scanner_from(path, read_toml(path))
+
+
+def with_detector_count(geometry: ConeGeometry, rows: int, columns: int) -> ConeGeometry:
+    """The same panel, equally large and in the same place, with another number of pixels."""
+    if min(rows, columns) < 1:
+        raise InputError("detector count", f"{rows} × {columns}", "at least 1 row and 1 column")
+    (nv, nu), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
+    pitch_mm = (pitch_v * nv / rows, pitch_u * nu / columns)
+    return replace(geometry, detector_shape=(rows, columns), pixel_size_mm=pitch_mm)
+
+
+def _located(name: str, data_dir: Path) -> Path:
+    if name.endswith(".toml") or "/" in name or "\\" in name:
+        return Path(name)
+    names = sorted(path.stem for path in Path(data_dir).glob("*.toml") if _describes_scanner(path))
+    if name not in names:
+        remedy = near_miss(name, names, "or give the path of a .toml file")
+        raise InputError("scanner", repr(name), f"one of {', '.join(names)}" if names else "a path", remedy)
+    return Path(data_dir) / f"{name}.toml"
+
+
+def _describes_scanner(path: Path) -> bool:
+    """Whether a TOML file has what every scanner has; other files may lie beside the scanners."""
+    try:
+        return "source" in read_toml(path)
+    except InputError:
+        return False
+
+
+def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
+    """The scanner that a TOML file's content describes; ``path`` names it in messages."""
+    refuse_unknown(str(path), content, (*_TABLES, *_WORDS), "a table")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in _TABLES.items()}
+    geometry = _geometry(tables["source"], tables["detector"])
+    readout = tables["readout"]
+    direction = readout.number("direction", 1)
+    checks.one_of(readout.name("direction"), direction, (1, -1))
+    return Scanner(
+        path.stem,
+        geometry,
+        _grid(tables["volume"]) if "volume" in content else default_grid(geometry),
+        readout.word("axis", AXES, default=AXES[0]),
+        int(direction),
+        readout.number("ratio", lowest=0.0, highest=LENGTH.largest) if readout.has("ratio") else None,
+        _pulse(tables["beam"]) if "beam" in content else None,
+        tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG),
+    )
+
+
+def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
+    to_axis_mm, to_detector_mm = _length(source, "to_axis_mm"), _length(source, "to_detector_mm")
+    if to_detector_mm <= to_axis_mm:
+        expected = f"more than to_axis_mm ({to_axis_mm:g})"
+        raise InputError(source.name("to_detector_mm"), f"{to_detector_mm:g}", expected)
+    return ConeGeometry(
+        to_axis_mm,
+        to_detector_mm,
+        (detector.count("rows", MOST_LINES), detector.count("columns", MOST_LINES)),
+        (_length(detector, "pixel_size_v_mm"), _length(detector, "pixel_size_u_mm")),
+        (_position(detector, "offset_v_mm"), _position(detector, "offset_u_mm")),
+    )
+
+
+def _length(table: Fields, key: str) -> float:
+    if (value := table.number(key, highest=LENGTH.largest)) < 1 / LENGTH.largest:
+        raise InputError(table.name(key), f"{value:g}", "a length above 0")
+    return value
+
+
+def _position(table: Fields, key: str) -> float:
+    return table.number(key, 0.0, -LENGTH.largest, LENGTH.largest)
+
+
+def _pulse(beam: Fields) -> tuple[float, float]:
+    start, length = (beam.number(key, highest=LENGTH.largest) for key in ("pulse_start", "pulse_length"))
+    if length <= 0:
+        raise InputError(beam.name("pulse_length"), f"{length:g}", "a share of the exposure above 0")
+    return start, length
+
+
+def _grid(volume: Fields) -> Grid:
+    shape, size_mm = _triple(volume, "shape"), _triple(volume, "size_mm")
+    offset_mm = _triple(volume, "offset_mm") if volume.has("offset_mm") else (0.0, 0.0, 0.0)
+    if any(n < 1 or n != int(n) for n in shape):
+        raise InputError(volume.name("shape"), str(list(shape)), "three counts of at least 1 (z, y, x)")
+    if math.prod(shape) > MOST_VOXELS:
+        raise InputError(volume.name("shape"), checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
+    if min(size_mm) < 1 / LENGTH.largest:
+        raise InputError(volume.name("size_mm"), str(list(size_mm)), "three lengths above 0 (z, y, x)")
+    voxel_mm = tuple(side / n for side, n in zip(size_mm, shape, strict=True))
+    return Grid(tuple(int(n) for n in shape), voxel_mm, offset_mm)
+
+
+def _triple(volume: Fields, key: str) -> tuple[float, float, float]:
+    """Three numbers (z, y, x)."""
+    z, y, x = volume.numbers(key, 3, LENGTH.largest).tolist()
+    return z, y, x

@@ -1,0 +1,312 @@
+"""Volume files: a reconstruction with its grid, its history and its Gaussians, as an NXdata in HDF5; bare volumes too."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.io.hashing import sha256_of
+from phyradgs_cl.io.hdf5.datasets import in_unit, new_group, read_array, read_values, read_word, write_number
+from phyradgs_cl.io.hdf5.facts import PROVENANCE, Schema, read_facts
+from phyradgs_cl.io.hdf5.grid import read_grid, write_grid
+from phyradgs_cl.io.hdf5.new import new_hdf5
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+from phyradgs_cl.io.hdf5.units import ATTENUATION, LENGTH
+from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.text import plain_text
+
+_DATA = "/entry/reconstruction"
+_VOLUME, _BARE = f"{_DATA}/volume", "/volume"
+_AXES = ("z", "y", "x")
+_GAUSSIANS = "/entry/gaussians"
+_CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
+_AXIS_TOLERANCE = 1e-3  # of a voxel: what axes stored in float32 need
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredVolume:
+    """A volume file: volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what is kept beside it.
+
+    ``provenance``: facts of the kinds that ``facts.PROVENANCE`` states. ``gaussians`` float32 in mm and 1/mm. ``metrics``:
+    numbers by name. None where there are none.
+    """
+
+    volume: np.ndarray
+    grid: Grid
+    provenance: dict[str, object]
+    gaussians: Gaussians | None = None
+    metrics: dict[str, object] | None = None
+
+
+class LoadedVolume(NamedTuple):
+    """Volume (nz, ny, nx) float32, and its grid where the file has axes in mm."""
+
+    volume: np.ndarray
+    grid: Grid | None
+
+
+def write_volume(
+    path: str | Path,
+    volume: np.ndarray,
+    grid: Grid,
+    provenance: Mapping[str, object],
+    gaussians: Gaussians | None = None,
+    metrics: Mapping[str, object] | None = None,
+) -> None:
+    """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all.
+
+    ``provenance`` and ``metrics`` are stored as JSON, plain values also as attributes; the parameters of ``gaussians``
+    as float32 datasets of their names.
+
+    Raises:
+        InputError: a volume that is not finite or does not fit its grid.
+        OutputError: the file cannot be written.
+    """
+    checks.shape("volume", volume, grid.shape)
+    checks.finite("volume", volume)
+    with written_beside(path) as temporary, new_hdf5(temporary) as file:
+        file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
+        entry = new_group(file, "entry", "NXentry")
+        entry.attrs["default"] = "reconstruction"
+        _write_data(entry, np.asarray(volume, np.float32), grid)
+        write_grid(entry, grid)
+        _write_facts(entry, "provenance", provenance)
+        if metrics is not None:
+            _write_facts(entry, "metrics", metrics)
+        if gaussians is not None:
+            group = new_group(entry, "gaussians", "NXcollection")
+            for name in _CLOUD:
+                group.create_dataset(name, data=np.asarray(getattr(gaussians, name), np.float32))
+
+
+def read_volume(path: str | Path) -> StoredVolume:
+    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning.
+
+    A run that was interrupted is a warning too.
+    """
+    with open_hdf5(path) as source:
+        volume, grid = _read_voxels(source)
+        return StoredVolume(volume, grid, read_provenance(source), _read_gaussians(source), _read_metrics(source))
+
+
+def load_volume(path: str | Path) -> LoadedVolume:
+    """Read a 3D volume of any origin.
+
+    Either a dataset `/volume` (z, y, x) at the root (integers are divided by their type's maximum,
+    floats stay as they are; no grid), or the voxels of a volume file. Negative values are allowed: real reconstructions
+    have them.
+
+    Raises:
+        InputError: no such file, not HDF5, no such dataset, not 3D, empty, not numbers, NaN or infinity, larger than
+            the file can hold, kept in another file, axes that do not fit; names the file and the dataset.
+    """
+    with open_hdf5(path) as source:
+        if isinstance(source.find(_BARE), h5py.Dataset):
+            return LoadedVolume(_read_bare(source), None)
+        if not isinstance(source.find(_VOLUME), h5py.Dataset):
+            found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
+            raise InputError(str(path), found, f"a 3D dataset {_BARE} or {_VOLUME}")
+        read_provenance(source)
+        return LoadedVolume(*_read_voxels(source))
+
+
+def load_attenuation(
+    path: str | Path, *, warn: bool = True, load: Callable[[str | Path], LoadedVolume] = load_volume
+) -> LoadedVolume:
+    """What ``load`` reads, for a volume that rays are to be sent through.
+
+    Where a tenth as much lies below 0 as above, that is worth a warning: noise about 0 in air has less.
+
+    Raises:
+        InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units.
+    """
+    loaded = load(path)
+    volume = loaded.volume
+    positive = float(np.sum(volume, where=volume > 0, dtype=np.float64))
+    negative = float(-np.sum(volume, where=volume < 0, dtype=np.float64))
+    found = f"values from {volume.min():g} to {volume.max():g}"
+    expected = "attenuation: 0 in air, above 0 in matter"
+    remedy = "of Hounsfield units it is µ(water) (1 + HU / 1000)"
+    if positive <= negative:
+        raise InputError(f"volume of {path}", found, expected, remedy)
+    if warn and negative > 0.1 * positive:
+        share = f"{100 * negative / positive:.0f} % as much below 0 as above"
+        log.warning("volume of %s: %s, %s; expected %s; %s", path, found, share, expected, remedy)
+    return loaded
+
+
+def volume_summary(path: str | Path) -> dict[str, object]:
+    """Facts about a volume file, for people, without reading the voxels."""
+    with open_hdf5(path) as source:
+        _, grid = _checked(source)
+        means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None
+        return {
+            "shape": grid.shape,
+            "voxel_size_mm": grid.voxel_size_mm,
+            "offset_mm": grid.offset_mm,
+            "provenance": read_provenance(source),
+            "metrics": _read_metrics(source),
+            "gaussians": means.shape[0] if means is not None and means.ndim else 0,
+            "sha256": sha256_of(path),
+        }
+
+
+def file_kind(path: str | Path) -> str:
+    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume).
+
+    Raises:
+        InputError: not readable, or none of the three.
+    """
+    with open_hdf5(path) as source:
+        if isinstance(source.find(_DATA), h5py.Group):
+            return "volume"
+        if isinstance(source.find(_BARE), h5py.Dataset):
+            return "plain-volume"
+        if any(source.find(f"{group}/instrument") is not None for group in source.root_groups()):
+            return "scan"
+        members = ", ".join(sorted(source.file)) or "nothing"
+    expected = "a scan (/entry/instrument), a volume (/entry/reconstruction) or a dataset /volume"
+    raise InputError(f"{path}:/", f"members: {members}", expected, "check the path")
+
+
+def read_provenance(source: Hdf5Source) -> dict[str, object]:
+    """How a volume came about; says once if its run was interrupted."""
+    provenance = _read_facts(source, "provenance", PROVENANCE) or {}
+    if where := interruption(provenance):
+        of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"
+        _say_once(source.path, f"interrupted at iteration {where['interrupted_at']}{of}")
+    return provenance
+
+
+def interruption(provenance: Mapping[str, object]) -> dict[str, int | None]:
+    """``interrupted_at`` and ``iterations_asked`` of a run that was interrupted; nothing of one that was not."""
+    at, options = provenance.get("interrupted_at"), provenance.get("options")
+    if type(at) is not int:  # a truth is an int too
+        return {}
+    asked = options.get("iterations") if isinstance(options, Mapping) else None
+    return {"interrupted_at": at, "iterations_asked": asked if type(asked) is int else None}
+
+
+@cache
+def _say_once(path: Path, text: str) -> None:
+    log.warning("%s: %s", path, text)
+
+
+def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:
+    group = new_group(entry, "reconstruction", "NXdata")
+    group.attrs["signal"], group.attrs["axes"] = "volume", list(_AXES)
+    group["title"] = "attenuation (1/mm)"
+    dataset = group.create_dataset("volume", data=volume)
+    dataset.attrs.update(units="1/mm", long_name="attenuation (1/mm)", interpretation="image")
+    for name, centres_mm in zip(_AXES, grid.axes_mm(), strict=True):
+        write_number(group, name, centres_mm, "mm", long_name=f"{name} (mm)")
+
+
+def _write_facts(entry: h5py.Group, name: str, facts: Mapping[str, object]) -> None:
+    group = new_group(entry, name, "NXcollection")
+    group["json"] = json.dumps(dict(facts), default=_plain)
+    for key, value in facts.items():
+        value = value.item() if isinstance(value, np.generic) else value
+        fits = isinstance(value, (bool, float)) or (isinstance(value, int) and abs(value) < 2**63)
+        if fits or (isinstance(value, str) and len(value) < 1000):
+            group.attrs[plain_text(str(key))] = plain_text(value) if isinstance(value, str) else value
+
+
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)
+
+
+def _checked(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
+    """The volume's dataset, unread, and its grid; they fit each other."""
+    dataset = source.dataset(_VOLUME, ("title", *_AXES))
+    if dataset.ndim != 3 or min(dataset.shape) < 1:
+        raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", "three axes (z, y, x), none empty")
+    stored = source.optional_group("/entry/grid", ("reconstruction", "provenance", "metrics", "gaussians"))
+    grid = read_grid(source, "/entry/grid") if stored is not None else _grid_of_axes(source, dataset.shape)
+    if grid.shape != dataset.shape:
+        raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", f"the grid's {grid.shape}")
+    return dataset, grid
+
+
+def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
+    steps_mm: list[float | None] = []
+    centres_mm = []
+    for name, count in zip(_AXES, shape, strict=True):
+        axis_mm = read_array(source, f"{_DATA}/{name}", (count,), LENGTH, ("volume", "title", *_AXES))
+        step_mm = float((axis_mm[-1] - axis_mm[0]) / max(count - 1, 1))
+        even_mm = axis_mm[0] + np.arange(count) * step_mm
+        if count > 1 and (step_mm <= 0 or np.abs(axis_mm - even_mm).max() > _AXIS_TOLERANCE * step_mm):
+            expected = "even steps in mm, or a group /entry/grid"
+            raise InputError(source.name(f"{_DATA}/{name}"), "values that do not rise evenly", expected)
+        steps_mm.append(step_mm if count > 1 else None)
+        centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
+    known = [step for step in steps_mm if step is not None]  # one voxel has no spacing of its own
+    usual = known[0] if known else 1.0
+    return Grid(tuple(shape), tuple(usual if s is None else s for s in steps_mm), tuple(centres_mm))
+
+
+def _read_voxels(source: Hdf5Source) -> tuple[np.ndarray, Grid]:
+    dataset, grid = _checked(source)
+    values = read_values(source, _VOLUME, dataset)
+    checks.finite(source.name(_VOLUME), values)
+    return in_unit(source, _VOLUME, values, ATTENUATION).astype(np.float32), grid
+
+
+def _read_bare(source: Hdf5Source) -> np.ndarray:
+    dataset, culprit = source.dataset(_BARE), source.name(_BARE)
+    if dataset.ndim != 3 or 0 in dataset.shape:
+        raise InputError(culprit, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
+    raw = read_values(source, _BARE, dataset)
+    if raw.dtype.kind in "iu":
+        return (raw / np.float32(np.iinfo(raw.dtype).max)).astype(np.float32)
+    with np.errstate(over="ignore"):
+        volume = raw.astype(np.float32)  # float64 beyond float32's range becomes infinite: caught below
+    bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))
+    if bad:
+        found = f"{bad} voxels that are NaN, infinite or too large"
+        raise InputError(culprit, found, "finite float32 values")
+    return volume
+
+
+def _read_facts(source: Hdf5Source, name: str, schema: Schema) -> dict[str, object] | None:
+    address = f"/entry/{name}/json"
+    if source.optional_group(f"/entry/{name}") is None:
+        return None
+    return read_facts(source.name(address), read_word(source, address), schema)
+
+
+def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:
+    """Numbers by name: what is no number is left out."""
+    metrics = _read_facts(source, "metrics", {})
+    if metrics is None:
+        return None
+    wrong = [name for name, value in metrics.items() if isinstance(value, str | bool | dict | list)]
+    if wrong:
+        log.warning("%s: %s: no numbers, left out", source.name("/entry/metrics"), checks.shown(wrong))
+    return {name: value for name, value in metrics.items() if name not in wrong}
+
+
+def _read_gaussians(source: Hdf5Source) -> Gaussians | None:
+    if source.optional_group(_GAUSSIANS) is None:
+        return None
+    arrays: dict[str, np.ndarray] = {}
+    for name, rest in _CLOUD.items():
+        address = f"{_GAUSSIANS}/{name}"
+        dataset = source.dataset(address, _CLOUD)
+        checks.shape(source.name(address), dataset, (len(arrays.get("mean", ())) if arrays else None, *rest))
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite for everybody who reads on
+            arrays[name] = read_values(source, address, dataset).astype(np.float32)
+        checks.finite(source.name(address), arrays[name])
+    return Gaussians(**arrays)

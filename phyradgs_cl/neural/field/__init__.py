@@ -1,0 +1,1 @@
+"""The field: encoding, networks, voxels of a grid."""

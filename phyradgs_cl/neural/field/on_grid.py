@@ -1,0 +1,87 @@
+"""The field that is fitted: positions in the volume's cube to attenuation, over all of a grid's voxels where asked."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import nn
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural.arrays import to_array, to_tensor
+from phyradgs_cl.neural.field.attenuation_network import AttenuationNetwork
+from phyradgs_cl.neural.field.hash_encoding import HashEncoding
+
+_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # of a volume's axes z, y, x
+
+
+class NeuralField(nn.Module):
+    """Attenuation (P,) of positions (P, 3) x y z, in [−1, 1] along the longest side of the volume.
+
+    ``segment``: neighbours among the positions that belong together; 1 where every position stands for itself.
+    """
+
+    def __init__(self, encoding: HashEncoding, network: AttenuationNetwork, segment: int = 1) -> None:
+        super().__init__()
+        self.encoding, self.network, self.segment = encoding, network, segment
+
+    def forward(self, positions: torch.Tensor) -> torch.Tensor:
+        return self.network(self.encoding(((positions + 1) / 2).clamp(0, 1)))
+
+
+def voxel_values(
+    field: NeuralField, grid: Grid, device: torch.device, points_at_once: int, points: int = 1
+) -> np.ndarray:
+    """The field in all voxels (nz, ny, nx) float32; ``grid`` in units of half the longest side, centred.
+
+    A voxel is the mean over ``points``³ points, the centres of its equal parts. They are asked brick by brick. Where
+    positions belong together, a point has no value of its own: it is the mean of three, in segments along x, y and z.
+    """
+    orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
+    values = np.zeros(grid.shape, np.float32)
+    for order in orders:
+        shape, size = (tuple(of[axis] for axis in order) for of in (grid.shape, grid.voxel_size_mm))
+        part = _in_rows(field, Grid(shape, size), order, device, points_at_once, points)
+        values += part.transpose(np.argsort(order))
+    return values / np.float32(len(orders))
+
+
+@torch.no_grad()
+def _in_rows(
+    field: NeuralField,
+    grid: Grid,
+    order: tuple[int, int, int],
+    device: torch.device,
+    points_at_once: int,
+    points: int,
+) -> np.ndarray:
+    """The voxels of a grid whose axes are z, y, x in another ``order``, with segments along its last.
+
+    A row's last segment is filled up beyond its end.
+    """
+    fine = _divided(grid, points)
+    slow, middle, fast = fine.axes_mm()
+    filled = -(-fast.size // field.segment) * field.segment
+    fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
+    slows, middles, fasts = grid.shape
+    rows = np.empty((slows, middles, points, points, 2))  # rows of points, row of voxels by row of voxels
+    rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
+    rows = rows.reshape(slows * middles, points**2, 2)
+    values = np.empty((slows * middles, fasts), np.float32)
+    at_once = max(points_at_once // (filled * points**2), 1)
+    for start in range(0, len(rows), at_once):
+        part = rows[start : start + at_once].reshape(-1, 2)
+        positions = np.empty((len(part), filled, 3), np.float32)
+        places = (part[:, :1], part[:, 1:], fast)
+        for axis, place in zip(order, places, strict=True):
+            positions[..., 2 - axis] = place
+        brick = to_array(field(to_tensor(positions.reshape(-1, 3), device))).reshape(len(part), filled)
+        brick = brick[:, : fasts * points].reshape(-1, points**2, fasts, points)
+        values[start : start + at_once] = brick.mean((1, 3))
+    return values.reshape(grid.shape)
+
+
+def _divided(grid: Grid, points: int) -> Grid:
+    """The same box with every voxel cut into ``points`` along each side."""
+    (nz, ny, nx), (dz, dy, dx) = grid.shape, grid.voxel_size_mm
+    counts = (points * nz, points * ny, points * nx)
+    return Grid(counts, (dz / points, dy / points, dx / points), grid.offset_mm)

@@ -1,0 +1,1 @@
+"""The rays of a pixel over its exposure, and their integrals."""

@@ -1,0 +1,107 @@
+"""The device memory of ray-driven operators: a volume, whole or a brick at a time, and the frames of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from phyradgs_cl.operators.bricks import Brick, cut, whole
+from phyradgs_cl.operators.rays.launches import RayLayout, owner_steps
+from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+_FRAMES_SHARE = 0.25  # of the room, for frames beside a brick
+
+
+class RayMemory:
+    """Buffers for frames of ``layout`` and its volume, planned when they are first needed.
+
+    A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. ``upright``: it
+    is wanted turned as well, where both fit. Operators may share one, in turns: each call writes what it reads.
+    """
+
+    def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, upright: bool = False) -> None:
+        self.rt, self.layout, self.most_frames = rt, layout, most_frames
+        self._columns_bytes = 4 * columns_floats(layout.grid) if upright else 0
+        self._columns: DeviceArray | None = None
+        self._bricks: list[Brick] = []
+        self._batch = 0
+        self._volume: DeviceArray | None = None
+        self._frames: DeviceArray | None = None
+        self._padded: dict[tuple[int, int, int], np.ndarray] = {}
+
+    def plan(self, share: float = 1.0) -> list[Brick]:
+        """The bricks. A share below 1 plans anew, for so much of the room."""
+        if not self._bricks or share < 1:
+            self._volume = self._frames = self._columns = None
+            self._padded.clear()
+            self._bricks, self._batch = self._planned(share)
+        return self._bricks
+
+    def _planned(self, share: float) -> tuple[list[Brick], int]:
+        layout, room = self.layout, self.rt.room()
+        each_bytes = 4 * (layout.frames_floats(1) - layout.frames_floats(0))
+
+        def batch(free_bytes: int) -> int:
+            fitting = (min(free_bytes, room.largest_bytes) - 4 * layout.frames_floats(0)) // each_bytes
+            return max(1, min(self.most_frames, fitting))
+
+        everything = whole(layout.grid.shape)
+        volume_bytes = 4 * layout.of(everything).volume_floats
+        if share == 1 and room.holds(volume_bytes, 4 * layout.frames_floats(1)):
+            if not room.holds(volume_bytes, 4 * layout.frames_floats(1), self._columns_bytes):
+                self._columns_bytes = 0
+            return [everything], batch(room.free_bytes - volume_bytes - self._columns_bytes)
+        self._columns_bytes = 0
+        steps = owner_steps(self.rt)
+        smallest = tuple(
+            min(n, step) for n, step in zip(layout.grid.shape, (*steps, layout.grid.shape[2]), strict=True)
+        )
+        beside = room.free_bytes - 4 * layout.of(whole(smallest)).volume_floats
+        frames = batch(min(int(_FRAMES_SHARE * share * room.free_bytes), beside))
+
+        def needs(shape: tuple[int, int, int]) -> tuple[int, int]:
+            return 4 * layout.of(whole(shape)).volume_floats, 4 * layout.frames_floats(frames)
+
+        return cut(layout.grid.shape, steps, needs, room, share), frames
+
+    def batches(self, count: int) -> Iterator[slice]:
+        """Runs of frames that fit beside each other."""
+        self.plan()
+        for start in range(0, count, self._batch):
+            yield slice(start, min(start + self._batch, count))
+
+    def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
+        """Memory for a brick, whatever is in it."""
+        if self._volume is None:
+            largest = self._bricks[0]
+            self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
+        layout = self.layout.of(brick)
+        return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
+
+    def write_volume(self, volume: np.ndarray, brick: Brick) -> tuple[RayLayout, DeviceArray]:
+        """A brick of a volume (z, y, x) on the device; its padded floats are kept, fresh pages cost more than the copy."""
+        layout, on_device = self.volume(brick)
+        if brick.shape not in self._padded:
+            self._padded = {brick.shape: np.zeros(layout.volume_floats, np.float32)}
+        padded = self._padded[brick.shape]
+        layout.inside(padded)[...] = volume[brick.box]
+        self.rt.write(on_device, padded)
+        return layout, on_device
+
+    def turned(self, layout: RayLayout, volume: DeviceArray) -> DeviceArray | None:
+        """A whole volume with z along a row, where there is room for that."""
+        if not self._columns_bytes:
+            return None
+        if self._columns is None:
+            self._columns = self.rt.zeros(self._columns_bytes // 4)
+        turn_volume(self.rt, layout, volume, self._columns)
+        return self._columns
+
+    def frames(self, count: int) -> DeviceArray:
+        """Memory for ``count`` frames of one batch, whatever was in it."""
+        if self._frames is None:
+            self._frames = self.rt.zeros(self.layout.frames_floats(self._batch))
+        floats = self.layout.frames_floats(count)
+        return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)

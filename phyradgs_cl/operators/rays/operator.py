@@ -1,0 +1,189 @@
+"""The system matrix of a whole scan: all frames under one motion model, as one linear operator and its transpose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from typing import Protocol as Interface
+
+import numpy as np
+
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.rays.cell_layers import averaged, layered
+from phyradgs_cl.operators.rays.launches import RayCells, RayLayout, launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.memory import RayMemory
+from phyradgs_cl.operators.rays.upright import launch_upright, upright_block
+from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
+
+
+class LinearOperator(Interface):
+    """What the iterative methods need to know of a scanner: A, Aᵀ, and A restricted to some frames."""
+
+    volume_shape: tuple[int, int, int]
+    frames_shape: tuple[int, int, int]
+
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
+        ...
+
+    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
+        ...
+
+    def subset(self, frames: Sequence[int]) -> LinearOperator:
+        """The rows of A that belong to these frames, in this order."""
+        ...
+
+
+class RayOperator:
+    """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
+
+    detector_shape (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis.
+    Tables are uploaded once and shared with every subset, and so are the device's volume and frames: use an operator
+    and its subsets one at a time, and operators that were given one ``memory``. Each call is one launch, or as few as
+    memory allows: a volume that does not fit is taken brick by brick (docs/large.md).
+
+    Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector.
+    """
+
+    def __init__(
+        self,
+        rt: Runtime,
+        grid: Grid,
+        detector_shape: tuple[int, int],
+        tables: Sequence[TimeCells],
+        *,
+        memory: RayMemory | None = None,
+    ) -> None:
+        _check_tables(tables, detector_shape)
+        self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
+        self.volume_shape = grid.shape
+        self._readout = tables[0].readout
+        layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
+        # a GPU's work-items are pixels, whose loads the general kernel has side by side
+        self._upright = 0 if rt.pixel_items else upright_block(grid, tables, layout.width, rt.lanes)
+        self.memory = memory or RayMemory(rt, layout, len(tables), upright=self._upright > 0)
+        self._tables = list(tables)
+        self._cells = RayCells.upload(rt, grid, self._tables)
+        self._choose(np.arange(len(tables)))
+
+    @property
+    def tables(self) -> list[TimeCells]:
+        """The cells of each frame."""
+        return [self._tables[f] for f in self._chosen]
+
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
+        return self.project(volume, "log")
+
+    def intensity_gap(self, volume: np.ndarray) -> np.ndarray:
+        """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
+
+        Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
+        to what an intensity detector measured of about x, it is what a log detector would have measured.
+        """
+        return self.project(volume, "gap")
+
+    def project(self, volume: np.ndarray, average: str) -> np.ndarray:
+        """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""
+        _check_shape("volume", volume, self.volume_shape)
+        return with_smaller_bricks(
+            "ray-driven projector", lambda share: self._project(volume, average, share)
+        )
+
+    def _project(self, volume: np.ndarray, average: str, share: float) -> np.ndarray:
+        bricks = self.memory.plan(share)
+        if average != "log" and len(bricks) > 1:
+            return self._project_layers(volume, average)
+        result = np.empty(self.frames_shape, np.float32)
+        for part in self.memory.batches(len(self._chosen)):
+            listed = self._listed(part)
+            frames = self.memory.frames(listed.size)
+            for k, brick in enumerate(bricks):
+                if k + part.start == 0 or len(bricks) > 1:
+                    layout, on_device = self.memory.write_volume(volume, brick)
+                    columns = self._turned(layout, on_device, average)
+                if columns is not None:
+                    launch_upright(self.rt, layout, self._cells, listed, columns, frames, self._upright)
+                    continue
+                launch_forward(
+                    self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
+                )
+            by_line = unpad_rows(self.rt.download(frames), layout.frames_shape(listed.size))
+            result[part] = self._readout.frames(by_line)
+        return result
+
+    def _turned(self, layout: RayLayout, volume: DeviceArray, average: str) -> DeviceArray | None:
+        """The volume for the kernel of upright rays; None where that does not apply."""
+        return self.memory.turned(layout, volume) if self._upright and average == "log" else None
+
+    def _project_layers(self, volume: np.ndarray, average: str) -> np.ndarray:
+        """Averages that need a whole ray at a time, where no brick has one: every layer of cells by itself."""
+        ones, weights = layered(self.tables)
+        like = (self.rt, self.grid, self.detector_shape)
+        return averaged(
+            [RayOperator(*like, tables, memory=self.memory).forward(volume) for tables in ones],
+            weights,
+            average,
+        )
+
+    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+        """Aᵀ y; frames (F, rows, columns), result (nz, ny, nx) float32."""
+        _check_shape("frames", frames, self.frames_shape)
+        return with_smaller_bricks("ray-driven backprojector", lambda share: self._adjoint(frames, share))
+
+    def _adjoint(self, frames: np.ndarray, share: float) -> np.ndarray:
+        bricks = self.memory.plan(share)
+        parts = list(self.memory.batches(len(self._chosen)))
+        result = np.empty(self.volume_shape, np.float32)
+        for k, brick in enumerate(bricks):
+            layout, on_device = self.memory.volume(brick)
+            for part in parts:
+                listed = self._listed(part)
+                by_line = self.memory.frames(listed.size)
+                if k == 0 or len(parts) > 1:
+                    self.rt.write(by_line, pad_rows(self._readout.frames(frames[part])))
+                add = part.start > 0
+                launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
+            result[brick.box] = layout.inside(self.rt.download(on_device))
+        return result
+
+    def subset(self, frames: Sequence[int]) -> RayOperator:
+        """The same operator on some of the frames, in this order; cheap, but worth keeping if it is used again."""
+        chosen = self._chosen[np.asarray(frames, np.int64)]
+        if chosen.size == 0:
+            raise InputError("subset", "no frames", "at least one frame")
+        part = copy(self)
+        part._choose(chosen)
+        return part
+
+    def _choose(self, chosen: np.ndarray) -> None:
+        self._chosen = chosen
+        self.frames_shape = (len(chosen), *self.detector_shape)
+        self._lists: dict[tuple[int, int], DeviceArray] = {}
+
+    def _listed(self, part: slice) -> DeviceArray:
+        """The indices of some of the chosen frames on the device."""
+        key = part.start, part.stop
+        if key not in self._lists:
+            self._lists[key] = self.rt.upload(self._chosen[part], np.int32)
+        return self._lists[key]
+
+
+def _check_tables(tables: Sequence[TimeCells], detector_shape: tuple[int, int]) -> None:
+    if not tables:
+        raise InputError("tables", "no frames", "the time cells of at least one frame")
+    axis = tables[0].axis
+    lines, _ = tables[0].readout.shape(detector_shape)
+    for frame, table in enumerate(tables):
+        if (table.axis, table.lines) != (axis, lines):
+            found = f"{table.lines} {table.axis} in frame {frame}"
+            raise InputError("tables", found, f"{lines} {axis} in every frame")
+
+
+def _check_shape(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+    if values.shape != shape:
+        raise InputError(name, f"shape {values.shape}", f"shape {shape}")

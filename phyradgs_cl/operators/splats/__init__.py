@@ -1,0 +1,1 @@
+"""Gaussians to frames and to voxels, with their adjoints."""

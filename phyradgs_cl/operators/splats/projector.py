@@ -1,0 +1,267 @@
+"""Splat projector: Gaussians to one merged frame over all its time cells, and its adjoint.
+
+This is the paper's *multi-pose batch rendering* (section 2.3). All M×N micro-views of a frame go through one
+launch an operator: ``splat_prepare`` sees every Gaussian from every pose, ``splat_forward`` does micro-view
+accumulation and strip concatenation (Eq. 3) straight into the merged frame, ``splat_backward`` and
+``splat_chain`` are the adjoint. No micro-view is ever stored. A detector that adds photons instead of line integrals
+needs the cells of a line one by one: they are drawn into a few layers then, which ``Layers`` merges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.operators.splats.binning import TileLists
+from phyradgs_cl.operators.splats.layers import Layers
+from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians
+from phyradgs_cl.operators.splats.work import UNSEEN, Work, moving_work, still_work
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
+
+RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
+SUM_FLOATS = 16
+DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
+DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
+PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
+_BAND_LINES = 8
+_TILE = 16
+_BACKWARD_GROUP = 32
+
+
+def path_limits(time_error: float) -> tuple[float, float, float]:
+    """Longest paths within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
+
+    The rules' remainders for exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3 and 15, are path²/24,
+    path⁴/1440 and path⁶/134400 of the peak. Twice ``time_error`` in the worst pixel leaves some half of it RMS.
+    Longer paths take the closed form, whose moments lose digits below 0.7.
+    """
+    worst = 2 * time_error
+    one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
+    return one, two, max(three, 0.7)
+
+
+@dataclass(frozen=True)
+class _Kernels:
+    """The four passes; cells without motion get code without it."""
+
+    prepare: Kernel
+    forward: Kernel
+    backward: Kernel
+    chain: Kernel
+
+    @classmethod
+    def declare(cls, rt: Runtime, **options: bool) -> _Kernels:
+        by_pixel = rt.pixel_items
+        defines = {"IMAGE_GUARD": GUARD, **options}
+        forward = "splat_forward_pixels" if by_pixel else "splat_forward_rows"
+        backward = "splat_backward_group" if by_pixel else "splat_backward_rows"
+        return cls(
+            prepare=rt.kernel("splat_prepare", "splat_prepare", **defines),
+            forward=rt.kernel("splat_forward", forward, BLOCK_PIXEL=by_pixel, **defines),
+            backward=rt.kernel("splat_backward", backward, GROUP=_BACKWARD_GROUP if by_pixel else 1, **defines),
+            chain=rt.kernel("splat_chain", "splat_chain", **defines),
+        )
+
+
+class SplatProjector:
+    """Renders frames of ``lines`` lines by ``width`` pixels (the readout axis is the lines').
+
+    ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the
+    Mahalanobis radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` bounds what the rules
+    leave by which cells with motion average a splat over time (relative, RMS). ``pixel_footprint`` adds a pixel's
+    variance to that of every splat, mass kept: what pixels with an area see. ``intensity_unit``: the line integral
+    that is 1 in the image, where a detector averages intensities over a line's cells; None averages line integrals.
+    """
+
+    def __init__(
+        self,
+        rt: Runtime,
+        lines: int,
+        width: int,
+        *,
+        affine: bool = False,
+        cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+        time_error: float = DEFAULT_TIME_ERROR,
+        pixel_footprint: bool = False,
+        intensity_unit: float | None = None,
+    ) -> None:
+        self.rt, self.lines, self.width = rt, lines, width
+        self.pitch = pitch_of(width)
+        self.cutoff2 = np.float32(cutoff_sigma**2)
+        self.path_limits = np.array([*path_limits(time_error), 0], np.float32)
+        self.by_pixel = rt.pixel_items
+        self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
+        tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
+        self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
+        self.image = padded_zeros(rt, lines, width)
+        self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
+        self._records = rt.empty(1)
+        self._seen = rt.empty(1, np.uint8)
+        self._sums = rt.empty(1)
+        self._extents = rt.empty(1, np.int32)
+        options = {"AFFINE": affine, "FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
+        self._kernels = {moving: _Kernels.declare(rt, MOVING=moving, **options) for moving in (False, True)}
+
+    # --- device to device: the reconstruction's loop --------------------------------------------------
+
+    def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
+        """The merged frame in the padded layout; valid until the next call."""
+        self.draw(gaussians, cells)
+        return self.merge(cells)
+
+    def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
+        """The frame before its layers are merged: what several clouds' frames can be added up in, flat, padded."""
+        self.prepare(gaussians, cells)
+        self.lists.build(self._extents, gaussians.count, gaussians.stride)
+        rt = self.rt
+        drawn = self.image if self._layers is None else self._layers.images(cells)
+        items = (self.pitch, self.lines) if self.by_pixel else self.lists.total
+        rt.launch(
+            self._kernels[cells.moving].forward,
+            items,
+            self._records,
+            self._seen,
+            cells.cells,
+            cells.line_cells,
+            cells.line_times,
+            np.int32(cells.time_pitch),
+            self.path_limits,
+            self.lists.starts,
+            self.lists.entries,
+            np.int32(cells.count),
+            np.int32(self.lines),
+            np.int32(self.width),
+            np.int32(self.pitch),
+            np.int32(self.tile_w),
+            np.int32(self.tile_h),
+            np.int32(-(-self.width // self.tile_w)),
+            self.cutoff2,
+            np.int32(cells.layers),
+            drawn,
+            group=16 if self.by_pixel else 1,
+        )
+        return drawn
+
+    def merge(self, cells: DeviceCells) -> DeviceArray:
+        """The merged frame of what was drawn last; valid until the next call."""
+        if self._layers is not None:
+            self._layers.merge(cells, self.image)
+        return self.image
+
+    def backward(
+        self, gaussians: DeviceGaussians, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
+    ) -> None:
+        """Writes dL/dparameters into ``gradients`` (13, stride), rows as cl/common/gradient.h says.
+
+        Uses what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells.
+        """
+        rt = self.rt
+        group = _BACKWARD_GROUP if self.by_pixel else 1
+        by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
+        kernels = self._kernels[cells.moving]
+        rt.launch(
+            kernels.backward,
+            gaussians.count * group,
+            self._records,
+            self._seen,
+            cells.cells,
+            cells.line_times,
+            np.int32(cells.time_pitch),
+            self.path_limits,
+            by_images,
+            np.int32(gaussians.count),
+            np.int32(cells.count),
+            np.int32(self.lines),
+            np.int32(self.pitch),
+            self.cutoff2,
+            self._sums,
+            group=group if group > 1 else 16,
+        )
+        rt.launch(
+            kernels.chain,
+            gaussians.stride // rt.lanes,
+            gaussians.rows,
+            cells.cells,
+            cells.matrices,
+            self._records,
+            self._seen,
+            self._sums,
+            np.int32(cells.count),
+            np.int32(gaussians.count),
+            np.int32(gaussians.stride),
+            np.float32(self.width / 2),
+            np.float32(self.lines / 2),
+            gradients,
+            group=rt.group(),
+        )
+
+    def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
+        """Of the last ``forward``: Gaussian–pixel pairs in the spans that are walked, pairs that were evaluated (whole
+        vectors), and Gaussian–cell footprints.
+        """
+        work = self.work(gaussians, cells)
+        return work.pairs, work.evaluated, work.footprints
+
+    def work(self, gaussians: DeviceGaussians, cells: DeviceCells) -> Work:
+        """What the last ``forward`` of these Gaussians and cells had to do."""
+        shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
+        size = int(np.prod(shape))
+        records = self.rt.download(DeviceArray(self._records.buffer, (size,), np.dtype(np.float32)))
+        seen = self.rt.download(DeviceArray(self._seen.buffer, shape[:2], np.dtype(np.uint8)))
+        records = np.where(seen[..., None], records.reshape(shape), UNSEEN[: shape[2]])[: gaussians.count]
+        if not cells.moving:
+            return still_work(records, self.rt.lanes)
+        times = self.rt.download(cells.line_times)
+        return moving_work(records, times, self.path_limits, self.rt.lanes, bool(self.cutoff2 > 0))
+
+    def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
+        """Sees every Gaussian from every pose: what ``draw`` begins with, and ``backward`` needs."""
+        rt = self.rt
+        footprints = gaussians.stride * cells.count
+        if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
+            self._records = rt.empty(1)  # the old goes before the new comes
+            self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
+        if self._seen.size < footprints:
+            self._seen = rt.empty(1, np.uint8)
+            self._seen = rt.empty(footprints, np.uint8)
+        if self._sums.size < footprints * SUM_FLOATS:
+            self._sums = rt.empty(1)
+            self._sums = rt.empty(footprints * SUM_FLOATS)
+        if self._extents.size < 6 * gaussians.stride:
+            self._extents = rt.empty(6 * gaussians.stride, np.int32)
+        rt.launch(
+            self._kernels[cells.moving].prepare,
+            gaussians.stride // rt.lanes,
+            gaussians.rows,
+            cells.cells,
+            cells.matrices,
+            cells.cell_lines,
+            cells.line_times,
+            np.int32(cells.time_pitch),
+            np.int32(cells.count),
+            np.int32(gaussians.count),
+            np.int32(gaussians.stride),
+            np.int32(self.width),
+            self.cutoff2,
+            self._records,
+            self._seen,
+            self._extents,
+            group=rt.group(),
+        )
+
+    # --- arrays to arrays -----------------------------------------------------------------------------
+
+    def project(self, rows: np.ndarray, cells: DeviceCells) -> np.ndarray:
+        """Parameter rows (11, G) to a frame (lines, width) float32."""
+        image = self.forward(DeviceGaussians.upload(self.rt, rows), cells)
+        return unpad_rows(self.rt.download(image), (self.lines, self.width))
+
+    def project_adjoint(self, rows: np.ndarray, cells: DeviceCells, by_image: np.ndarray) -> np.ndarray:
+        """dL/drows (11, G) for parameter rows (11, G) and dL/dframe (lines, width)."""
+        gaussians = DeviceGaussians.upload(self.rt, rows)
+        self.forward(gaussians, cells)
+        gradients = self.rt.zeros((13, gaussians.stride))
+        self.backward(gaussians, cells, self.rt.upload(pad_rows(by_image)), gradients)
+        return self.rt.download(gradients)[:11, : gaussians.count]

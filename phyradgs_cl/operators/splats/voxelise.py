@@ -1,0 +1,209 @@
+"""Voxeliser: Gaussians to a voxel grid, and its adjoint."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.bricks import Shape, cut
+from phyradgs_cl.operators.splats.binning import TileLists
+from phyradgs_cl.operators.splats.layout import DeviceGaussians, split_coefficients
+from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA
+from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
+
+RECORD_FLOATS = 20
+SUM_FLOATS = 16
+_TILE_ROWS = 8
+_DEFAULT_BRICK_BYTES = 1 << 28
+
+
+class Voxeliser:
+    """Evaluates the field of Gaussians at the voxel centres of a grid of fixed ``shape`` (z, y, x)."""
+
+    def __init__(
+        self, rt: Runtime, shape: tuple[int, int, int], *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA
+    ) -> None:
+        self.rt, self.shape = rt, shape
+        nz, ny, nx = shape
+        self.pitch = pitch_of(nx)
+        self.cutoff2 = np.float32(cutoff_sigma**2)
+        self.by_pixel = rt.pixel_items
+        self.lists = TileLists(rt, *_tiles(rt, shape))
+        self.tile = self.lists.tile
+        self._shape4 = np.array([nx, ny, nz, 0], np.int32)
+        self.volume = padded_zeros(rt, nz * ny, nx)
+        self._records = rt.empty(1)
+        self._sums = rt.empty(1)
+        self._extents = rt.empty(1, np.int32)
+        self._prepare = rt.kernel("voxel_prepare", "voxel_prepare", IMAGE_GUARD=GUARD)
+        self._forward = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=self.by_pixel, IMAGE_GUARD=GUARD)
+        self._backward = rt.kernel("voxel_backward", "voxel_backward", IMAGE_GUARD=GUARD)
+        self._chain = rt.kernel("voxel_backward", "voxel_chain", IMAGE_GUARD=GUARD)
+
+    def forward(
+        self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
+    ) -> DeviceArray:
+        """The field on the voxels [start, start + shape) of ``grid``, in the padded layout, until the next call.
+
+        Lengths in the Gaussians' unit; ``start`` runs z, y, x. A part has the same bits as the whole.
+        """
+        rt = self.rt
+        self.prepare(gaussians, grid, start)
+        self.lists.build(self._extents, gaussians.count, gaussians.stride)
+        nz, ny, _ = self.shape
+        rt.launch(
+            self._forward,
+            (self.pitch, ny, nz) if self.by_pixel else self.lists.total,
+            self._records,
+            self.lists.starts,
+            self.lists.entries,
+            self._shape4,
+            np.int32(self.pitch),
+            self.tile,
+            self.lists.tiles,
+            self.cutoff2,
+            self.volume,
+            group=16 if self.by_pixel else 1,
+        )
+        return self.volume
+
+    def backward(
+        self,
+        gaussians: DeviceGaussians,
+        grid: Grid,
+        by_volume: DeviceArray,
+        gradients: DeviceArray,
+        *,
+        add: bool,
+        weight: float = 1.0,
+    ) -> None:
+        """``weight`` × dL/dparameters into (or, with ``add``, onto) ``gradients`` (13, stride); after ``forward``."""
+        rt = self.rt
+        if self._sums.size < gaussians.stride * SUM_FLOATS:
+            self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
+        rt.launch(
+            self._backward,
+            gaussians.count,
+            self._records,
+            by_volume,
+            self._shape4,
+            np.int32(self.pitch),
+            np.int32(gaussians.count),
+            self.cutoff2,
+            self._sums,
+            group=rt.group(on_cpu=16),
+        )
+        rt.launch(
+            self._chain,
+            gaussians.stride // rt.lanes,
+            gaussians.rows,
+            self._sums,
+            _pitch4(grid),
+            np.int32(gaussians.stride),
+            np.int32(add),
+            np.float32(weight),
+            gradients,
+            group=rt.group(),
+        )
+
+    def prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
+        """What ``forward`` begins with, and ``backward`` needs."""
+        rt, stride = self.rt, gaussians.stride
+        if self._records.size < stride * RECORD_FLOATS:
+            self._records = rt.empty(stride * RECORD_FLOATS)
+            self._extents = rt.empty(6 * stride, np.int32)
+        rt.launch(
+            self._prepare,
+            stride // rt.lanes,
+            gaussians.rows,
+            split_coefficients(rt, index_matrix(grid)),
+            _pitch4(grid),
+            np.array([*start[::-1], 0], np.int32),
+            self._shape4,
+            np.int32(gaussians.count),
+            np.int32(stride),
+            self.cutoff2,
+            self._records,
+            self._extents,
+            group=rt.group(),
+        )
+
+    def voxelise(self, rows: np.ndarray, grid: Grid) -> np.ndarray:
+        """Parameter rows (11, G) to the volume (z, y, x) float32."""
+        volume = self.forward(DeviceGaussians.upload(self.rt, rows), grid)
+        return unpad_rows(self.rt.download(volume), self.shape)
+
+    def voxelise_adjoint(self, rows: np.ndarray, grid: Grid, by_volume: np.ndarray) -> np.ndarray:
+        """dL/drows (11, G) for dL/dvolume (z, y, x)."""
+        gaussians = DeviceGaussians.upload(self.rt, rows)
+        self.forward(gaussians, grid)
+        gradients = self.rt.zeros((13, gaussians.stride))
+        self.backward(gaussians, grid, self.rt.upload(pad_rows(by_volume)), gradients, add=False)
+        return self.rt.download(gradients)[:11, : gaussians.count]
+
+
+def voxelise(
+    rt: Runtime,
+    rows: np.ndarray,
+    grid: Grid,
+    *,
+    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+    brick_bytes: int = _DEFAULT_BRICK_BYTES,
+) -> np.ndarray:
+    """The whole grid (z, y, x) float32, brick by brick: the device holds ``brick_bytes`` of voxels at a time, or less
+    where memory is short. Bricks have the bits of the whole.
+    """
+
+    def attempt(share: float) -> np.ndarray:
+        gaussians = DeviceGaussians.upload(rt, rows)
+        return _in_bricks(rt, gaussians, grid, cutoff_sigma, brick_bytes, share)
+
+    return with_smaller_bricks("voxeliser", attempt)
+
+
+def _in_bricks(
+    rt: Runtime, gaussians: DeviceGaussians, grid: Grid, cutoff_sigma: float, brick_bytes: int, share: float
+) -> np.ndarray:
+    nx, records_bytes = grid.shape[2], 4 * gaussians.stride * (RECORD_FLOATS + 6)
+
+    def needs(shape: Shape) -> tuple[int, ...]:
+        nz, ny, _ = shape
+        voxels_bytes = 4 * (2 * GUARD + nz * ny * pitch_of(nx))
+        if voxels_bytes > brick_bytes and nz * ny > 1:
+            return (room.free_bytes + 1,)  # more than was asked for
+        lists_bytes = TileLists.bytes(int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
+        entries_bytes = lists_bytes  # how many there are is known when they are counted
+        return voxels_bytes, lists_bytes, entries_bytes, records_bytes
+
+    room = rt.room()
+    volume = np.empty(grid.shape, np.float32)
+    made: Voxeliser | None = None
+    for brick in cut(grid.shape, (1, 1), needs, room, share):
+        if made is None or made.shape != brick.shape:
+            made = None  # before the next one takes its memory
+            made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
+        part = made.forward(gaussians, grid, brick.start)
+        volume[brick.box] = unpad_rows(rt.download(part), brick.shape)
+    return volume
+
+
+def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
+    """Size of a tile, and number of tiles of a volume (z, y, x), both along x, y, z."""
+    nz, ny, nx = shape
+    tile_x = 16 if rt.pixel_items else pitch_of(nx)
+    tile = (tile_x, _TILE_ROWS, _TILE_ROWS)
+    return tile, (-(-nx // tile_x), -(-ny // _TILE_ROWS), -(-nz // _TILE_ROWS))
+
+
+def index_matrix(grid: Grid) -> np.ndarray:
+    """Rows (12,) that turn a world point (x, y, z) into voxel indices along x, y, z."""
+    matrix = np.zeros((3, 4))
+    for row, (first, d) in enumerate(zip(grid.first_centre_mm[::-1], grid.voxel_size_mm[::-1], strict=True)):
+        matrix[row, row], matrix[row, 3] = 1 / d, -first / d
+    return matrix.ravel()
+
+
+def _pitch4(grid: Grid) -> np.ndarray:
+    dz, dy, dx = grid.voxel_size_mm
+    return np.array([dx, dy, dz, 0], np.float32)

@@ -1,0 +1,107 @@
+"""The views of an FDK reconstruction: where each pixel's ray starts, and what it counts before filtering."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.fdk import weights
+from phyradgs_cl.reconstructors.fdk.arc import Arc
+
+log = logging.getLogger(__name__)
+
+_DISPLACED = 0.1  # of the fan: less may be a misaligned panel that still sees the whole object
+RayWeight = Callable[[int], np.ndarray]
+
+
+def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
+    """Poses that broadcast to (F, rows, columns, 12)."""
+    if pose.ndim == 2:
+        return pose[:, None, None]
+    return pose[:, :, None] if axis == "rows" else pose[:, None]
+
+
+def view_angles(by_pixel: np.ndarray) -> np.ndarray:
+    """Each view's gantry angle (F,): the mean of its lines' angles, radians."""
+    angle_rad = weights.source_angle(by_pixel)
+    first = angle_rad[:, :1, :1]
+    turned = np.mod(angle_rad - first + np.pi, 2 * np.pi) - np.pi
+    return (first + turned.mean(axis=(1, 2), keepdims=True))[:, 0, 0]
+
+
+def ray_weight(canonical: np.ndarray, shape: tuple[int, int], arc: Arc, fan: weights.Fan) -> RayWeight:
+    """A function from a view's index to the weights (rows, columns) of its pixels before filtering, 1/mm."""
+    rows, columns = np.arange(shape[0]), np.arange(shape[1])
+
+    def geometry(view: int) -> tuple[np.ndarray, np.ndarray]:
+        pose = canonical[view]
+        rays = weights.pixel_rays(pose, rows, columns)
+        pitch_mm = np.linalg.norm(pose[..., 6:9], axis=-1)
+        return weights.ray_measure(pose, rays) / pitch_mm, _redundancy_angle(pose, rays, arc)
+
+    first = geometry(0)
+    if arc.is_full and len(canonical) == 1:
+        constant = _redundancy(0, first[1], arc, fan) * first[0]
+        return lambda view: constant
+
+    def weight(view: int) -> np.ndarray:
+        measure, angle_rad = first if len(canonical) == 1 else geometry(view)
+        return _redundancy(view, angle_rad, arc, fan) * measure
+
+    return weight
+
+
+def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) -> np.ndarray | float:
+    if not arc.is_full:
+        return weights.short_scan_weight(float(arc.progress_rad[view]), angle_rad, arc.coverage_rad)
+    return weights.displaced_weight(angle_rad, fan) if fan.is_displaced else 1.0
+
+
+def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc) -> np.ndarray:
+    """The fan angle (rows, columns) by which a ray finds its opposite.
+
+    Where columns are read out one after the other, the arc of a short scan begins at another angle for every column,
+    and a ray's opposite lies on another column: their lags behind the frame, whose own angle is 0 here, add up.
+    """
+    angle_rad = weights.fan_angle(pose, rays)
+    if arc.is_full or pose.shape[1] == 1:
+        return angle_rad
+    return angle_rad + weights.source_angle(pose)
+
+
+def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray:
+    """The poses of frames with ``missing`` columns added at their two ends."""
+    if missing == (0, 0):
+        return pose
+    if pose.ndim == 3 and axis == "columns":
+        pose = np.pad(pose, ((0, 0), missing, (0, 0)), mode="edge")
+    moved = pose.copy()
+    moved[..., 3:6] -= missing[0] * pose[..., 6:9]
+    return moved
+
+
+def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid) -> None:
+    if np.unique(arc.progress_rad).size == 1:
+        log.warning("FDK: all views are from one angle: the volume is a single backprojection")
+        return
+    if arc.is_full and not fan.sees_axis:
+        log.warning(
+            "FDK: the detector does not see the rotation axis; the middle of the volume is not measured"
+        )
+    if arc.is_full:
+        return
+    if abs(fan.low_rad + fan.high_rad) > _DISPLACED * (fan.high_rad - fan.low_rad):
+        log.warning("FDK: a displaced detector needs a full turn; one side of the volume is not measured")
+    _, y_mm, x_mm = grid.axes_mm()
+    radius_mm = np.hypot(np.abs(x_mm).max(), np.abs(y_mm).max())
+    source_mm = float(np.hypot(canonical[..., 0], canonical[..., 1]).min())
+    needed_rad = np.pi + 2 * min(fan.half_rad, float(np.arcsin(min(radius_mm / source_mm, 1.0))))
+    if arc.coverage_rad < needed_rad - 1e-6:
+        log.warning(
+            "FDK: the views cover %.1f°, complete data need %.1f° (half a turn and the fan)",
+            np.rad2deg(arc.coverage_rad),
+            np.rad2deg(needed_rad),
+        )

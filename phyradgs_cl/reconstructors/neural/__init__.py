@@ -1,0 +1,1 @@
+"""Methods that fit a neural field, on PyTorch."""

@@ -1,0 +1,126 @@
+"""Neural fields: scan and options to trainer, and the trainer to the loop.
+
+The one place where the scan, the field and its training meet; PyTorch is imported when a run begins.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural import NeuralOptions, require_torch
+from phyradgs_cl.reconstructors.checkpoint import check_array, count_of, restore_generator
+from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.result import (
+    ProgressReport,
+    Reconstruction,
+    State,
+    option_facts,
+    state_arrays,
+)
+from phyradgs_cl.reconstructors.splats.start import internal_scale
+from phyradgs_cl.runtime import Runtime
+
+if TYPE_CHECKING:
+    from phyradgs_cl.neural.trainer import Trainer
+
+
+def reconstruct_neural(
+    scan: Scan,
+    options: NeuralOptions,
+    rt: Runtime,
+    seed: int,
+    report: ProgressReport,
+    method: str,
+    resume: State | None,
+) -> Reconstruction:
+    """Runs a neural method; the public doors are ``naf`` and ``sax_nerf``.
+
+    ``rt`` makes the FDK volume that sets the unit of attenuation; the rest is PyTorch's. ``resume`` continues an
+    interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed.
+    """
+    require_torch(f"--method {method}")
+    from phyradgs_cl.neural.field.start import first_field
+    from phyradgs_cl.neural.torch_device import torch_device
+    from phyradgs_cl.neural.trainer import Trainer
+
+    started = time.perf_counter()
+    device = torch_device(options.torch_device)
+    scale = internal_scale(static_fdk(rt, scan), scan.grid)
+    field = first_field(options, max(scan.grid.shape), seed)
+    trainer = Trainer(scan, options, field, device, scale.density_per_mm, seed)
+    loop = Loop(_Passes(trainer, options.iterations), rt.ranks, report, started)
+    loop.run(resume)
+    facts: dict[str, object] = {
+        "method": method,
+        "options": option_facts(options),
+        "seed": seed,
+        "unit_length_mm": scale.length_mm,
+        "unit_density_per_mm": scale.density_per_mm,
+        "detector_model": trainer.model,
+        "parameters": trainer.parameters,
+        "levels": options.levels_for(max(scan.grid.shape)),
+        "samples": trainer.samples,
+        "times": trainer.times,
+        "iterations": trainer.passes,
+        "torch_device": str(device),
+        "torch_version": _torch_version(),
+        "seconds": loop.seconds,
+        "interrupted_at": loop.interrupted_at,
+    }
+    volume = trainer.volume(scan.grid)
+    state = loop.state_if_interrupted()
+    return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
+
+
+class _Passes:
+    """A trainer, ``Stepwise`` for the loop: a step is a frame, an iteration a pass over all of them."""
+
+    quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
+
+    def __init__(self, trainer: Trainer, iterations: int) -> None:
+        self.trainer, self.iterations = trainer, iterations
+
+    @property
+    def iteration(self) -> int:
+        return self.trainer.passes
+
+    def step(self) -> None:
+        self.trainer.step()
+
+    def measures(self) -> dict[str, float]:
+        return {"loss": float(np.mean(self.trainer.losses))}
+
+    def state(self) -> dict[str, np.ndarray]:
+        return self.trainer.state()
+
+    def restore(self, state: State) -> None:
+        trainer, frames = self.trainer, self.trainer.scan.frames
+        names = ("parameters", "moments", "queue", "losses")
+        parameters, moments, queue, losses = state_arrays(state, names)
+        check_array("parameters", parameters, (trainer.parameters,), np.float32)
+        check_array("moments", moments, (2, trainer.parameters), np.float32)
+        steps = count_of(state, "steps", self.iterations * frames)
+        check_array("queue", queue, (frames - steps % frames,), np.int64)
+        if not 0 <= queue.min() <= queue.max() < frames:
+            found, expected = f"{queue.min()} to {queue.max()}", f"frames from 0 to {frames - 1}"
+            raise InputError("checkpoint, array queue", found, expected, "start without --resume")
+        check_array("losses", losses, (steps % frames or min(steps, frames),), np.float64)
+        restore_generator(trainer.rng, state)
+        trainer.steps, trainer.queue, trainer.losses = steps, queue.tolist(), losses.tolist()
+        trainer.restore(parameters, moments, count_of(state, "updates", steps))
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return self.trainer.volume(self.trainer.scan.grid), self.trainer.scan.grid
+
+
+def _torch_version() -> str:
+    from importlib.metadata import version
+
+    return version("torch")

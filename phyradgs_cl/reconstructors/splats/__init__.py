@@ -1,0 +1,1 @@
+"""Methods that fit Gaussians: their start, one training step, the run around it."""

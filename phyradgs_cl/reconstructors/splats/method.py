@@ -1,0 +1,108 @@
+"""The engine under ``phyradgs`` and ``r2``: radiative Gaussians optimised against a scan's frames.
+
+The one place where scan, operators, objective and optimiser meet. Inside, lengths are divided by half the
+volume's longest side and densities by a reference (FDK's 99.9th percentile), so that rates, thresholds and SSIM's
+constants mean the same for every scan; both are undone on the way out.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Exact, Scan
+from phyradgs_cl.operators.splats.projector import PAIR_KERNELS
+from phyradgs_cl.operators.splats.work import Work
+from phyradgs_cl.optim import Population
+from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
+from phyradgs_cl.reconstructors.splats.frames import Scale
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
+from phyradgs_cl.runtime import Runtime
+
+REPORT_EVERY, LEAST_RECORDED = 50, 20
+
+
+def record_interval(iterations: int) -> int:
+    """Iterations from line to line of the record: as for reports, but fewer in short runs, to show how they went."""
+    return max(1, min(REPORT_EVERY, iterations // LEAST_RECORDED))
+
+
+def reconstruct_splats(
+    scan: Scan,
+    options: SplatOptions,
+    rt: Runtime,
+    seed: int,
+    report: ProgressReport,
+    method: str,
+    resume: State | None,
+) -> Reconstruction:
+    """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``.
+
+    ``resume`` continues an interrupted run of the same scan and options from its state.
+    """
+    started = time.perf_counter()
+    # a volume that one rank alone has on its host
+    scale, population, rng = rt.ranks.tell(_start(rt, scan, options, seed) if rt.ranks.rank == 0 else None)
+    first_count = population.count
+    run = SplatRun(rt, scan, options, scale, population, rng)
+    loop = Loop(run, rt.ranks, report, started, record_interval(options.iterations), REPORT_EVERY)
+    loop.run(resume)
+    cloud = run.present_cloud()
+    volume = run.present_volume()[0]
+    facts = {
+        "method": method,
+        "options": option_facts(options),
+        "seed": seed,
+        "unit_length_mm": scale.length_mm,
+        "unit_density_per_mm": scale.density_per_mm,
+        "gaussians_asked": options.gaussians_for(run.grid),
+        "gaussians_first": first_count,
+        "gaussians": cloud.count,
+        "seconds": loop.seconds,
+        "density_control_seconds": run.control_seconds,
+        "density_control_rounds": run.control_rounds,
+        "interrupted_at": loop.interrupted_at,
+        "detector_model": "log" if run.frames.intensity_unit is None else "intensity",
+        "batch": run.batch,
+        "ranks": rt.ranks.size,
+    }
+    if isinstance(options.motion, Exact):
+        facts |= time_facts(run)
+    if rt.profile:
+        facts["evaluated_pairs"] = evaluated_pairs(run)
+    cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
+    return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
+
+
+def _start(
+    rt: Runtime, scan: Scan, options: SplatOptions, seed: int
+) -> tuple[Scale, Population, np.random.Generator]:
+    """Internal units, the first cloud, and the generator from which it was drawn, all from an FDK volume."""
+    fdk = static_fdk(rt, scan)
+    scale = internal_scale(fdk, scan.grid)
+    rng = np.random.default_rng(seed)
+    grid = scan.grid.scaled(1 / scale.length_mm)
+    return scale, first_population(fdk / scale.density_per_mm, grid, options, rng), rng
+
+
+def time_facts(run: SplatRun) -> dict[str, object]:
+    """How the motion ``exact`` averaged over time: the largest K of a frame, and the share of pairs by rule."""
+    return {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}
+
+
+def evaluated_pairs(run: SplatRun) -> dict[str, int]:
+    """Gaussian–pixel pairs that a launch evaluates, of the last cloud in the first frame, by kernel."""
+    evaluated = _first_frame_work(run).evaluated
+    return dict.fromkeys(PAIR_KERNELS, evaluated)
+
+
+def _first_frame_work(run: SplatRun) -> Work:
+    gaussians, cells, projector = run.cloud.gaussians, run.frames.cells(0), run.frame_step.projector
+    run.cloud.activate(run.adam)
+    projector.prepare(gaussians, cells)
+    return projector.work(gaussians, cells)

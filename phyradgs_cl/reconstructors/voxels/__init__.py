@@ -1,0 +1,1 @@
+"""Methods that fit voxels, a file each, around one system of operators."""

@@ -1,0 +1,146 @@
+"""The iterative voxel methods between scan and loop: options, system, convergence, facts.
+
+A method is a class with ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+from typing import Protocol as Interface
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition.motion import STILL, check_motion
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.checkpoint import check_like, count_of
+from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
+from phyradgs_cl.reconstructors.voxels.system import System, norm
+from phyradgs_cl.runtime import Runtime
+
+MOST_ITERATIONS = 1_000_000
+
+
+@dataclass(frozen=True)
+class IterativeOptions:
+    """What every iterative method can be told.
+
+    motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
+    nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by
+    less than this share of its norm; 0 runs all iterations. detector_model: what is averaged over a line's times, line
+    integrals (log) or intensity, or what the scan says.
+    """
+
+    transmission_weights: ClassVar[bool] = False
+    """Weigh pixels by their transmission; methods that can have an option of this name."""
+
+    MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
+
+    motion: Motion = Static()
+    iterations: int = 20
+    nonnegative: bool = True
+    tolerance: float = 0.0
+    detector_model: str = "scan"
+
+    def __post_init__(self) -> None:
+        checks.within("iterations", self.iterations, 0, MOST_ITERATIONS)
+        checks.within("tolerance", self.tolerance, 0, 1)
+        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
+        check_motion(self.motion, self.MOTIONS)
+
+
+class Algorithm(Interface):
+    """One iterative method on one system."""
+
+    volume: np.ndarray
+    """The present estimate (nz, ny, nx) float32, 1/mm; a new array after every step."""
+    finished: str | None
+    """Why the method stops by itself, else None."""
+
+    def step(self) -> float:
+        """One iteration; the norm of p − A x as far as the method knows it (see its own docstring)."""
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What ``restore`` needs to go on with the next iteration."""
+        ...
+
+    def restore(self, state: State) -> None: ...
+
+
+def run_iterations(
+    method: str,
+    make: Callable[[System], Algorithm],
+    scan: Scan,
+    options: IterativeOptions,
+    rt: Runtime,
+    report: ProgressReport,
+    resume: State | None,
+) -> Reconstruction:
+    """Builds the scan's system, runs the method on it, and returns volume, record and facts.
+
+    The record has a line an iteration: residual ‖p − A x‖/‖p‖, change ‖x − x'‖/‖x‖, seconds since the start.
+    """
+    started = time.perf_counter()
+    system = System.of_scan(rt, scan, options.motion, options.detector_model)
+    if options.transmission_weights:
+        system = system.trusting_light()
+    run = _Iterations(make(system), options, scan.grid, norm(system.measured) or 1.0)
+    loop = Loop(run, rt.ranks, report, started)
+    loop.run(resume)
+    facts: dict[str, object] = {
+        "method": method,
+        "options": option_facts(options),
+        "detector_model": "log" if system.intensity is None else "intensity",
+        "iterations": run.iteration,
+        "stopped_by": loop.stopped_by,
+        "seconds": loop.seconds,
+        "interrupted_at": loop.interrupted_at,
+        "ranks": rt.ranks.size,
+    }
+    volume, state = run.algorithm.volume, loop.state_if_interrupted()
+    return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
+
+
+class _Iterations:
+    """An algorithm with its convergence, ``Stepwise`` for the loop."""
+
+    quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
+
+    def __init__(
+        self, algorithm: Algorithm, options: IterativeOptions, grid: Grid, measured_norm: float
+    ) -> None:
+        self.algorithm, self.options, self.grid, self.measured_norm = algorithm, options, grid, measured_norm
+        self.iteration, self.iterations = 0, options.iterations
+        self.residual, self.change = 0.0, 0.0
+
+    @property
+    def finished(self) -> str | None:
+        return self.algorithm.finished or ("tolerance" if self.change < self.options.tolerance else None)
+
+    def step(self) -> None:
+        before = self.algorithm.volume
+        self.residual = self.algorithm.step() / self.measured_norm
+        self.iteration += 1
+        size = norm(self.algorithm.volume)
+        self.change = norm(self.algorithm.volume - before) / size if size else 0.0
+
+    def measures(self) -> dict[str, float]:
+        return {"residual": self.residual, "change": self.change}
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {**self.algorithm.state(), "iteration": np.array(self.iteration)}
+
+    def restore(self, state: State) -> None:
+        check_like(state, self.algorithm.state())
+        self.iteration = count_of(state, "iteration", self.iterations)
+        self.algorithm.restore(state)
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return self.algorithm.volume, self.grid

@@ -1,0 +1,143 @@
+"""SART and OS-SART: the volume is corrected after every frame, or every few frames.
+
+Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.result import (
+    ProgressReport,
+    Reconstruction,
+    State,
+    ignore_progress,
+    state_arrays,
+)
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.voxels.system import System, norm, reciprocal, row_weights
+from phyradgs_cl.runtime import Runtime
+
+ORDERS = ("spread", "random", "ordered")
+_WEIGHT_CACHE_BYTES = 1 << 29
+
+
+@dataclass(frozen=True)
+class SartOptions(IterativeOptions):
+    """relaxation: λ, the share of each correction that is taken; relaxation_reduction: its factor an iteration.
+
+    frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
+    (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
+    transmission_weights: rays count by the light that came through, W = t/(A 1) and V = 1/(Aᵀ t).
+    """
+
+    relaxation: float = 1.0
+    relaxation_reduction: float = 0.999
+    frames_per_subset: int = 1
+    order: str = "spread"
+    transmission_weights: bool = False  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.within("relaxation", self.relaxation, 1e-6, 2)
+        checks.within("relaxation_reduction", self.relaxation_reduction, 1e-6, 1)
+        checks.within("frames_per_subset", self.frames_per_subset, 1, 1_000_000)
+        checks.one_of("order", self.order, ORDERS)
+
+
+OS_SART = SartOptions(frames_per_subset=10)
+
+
+def sart(
+    scan: Scan,
+    options: SartOptions,
+    rt: Runtime,
+    *,
+    seed: int = 0,
+    report: ProgressReport = ignore_progress,
+    resume: State | None = None,
+) -> Reconstruction:
+    """The SART volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
+    return run_iterations("sart", lambda s: Sart(s, options, seed), scan, options, rt, report, resume)
+
+
+def os_sart(
+    scan: Scan,
+    options: SartOptions,
+    rt: Runtime,
+    *,
+    seed: int = 0,
+    report: ProgressReport = ignore_progress,
+    resume: State | None = None,
+) -> Reconstruction:
+    """The same with several frames a correction."""
+    return run_iterations("os-sart", lambda s: Sart(s, options, seed), scan, options, rt, report, resume)
+
+
+class Sart:
+    """x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i, W = 1/(Aᵢ 1), V = 1/(Aᵢᵀ 1); Jᵢᵀ and Iᵢ(x) in the intensity model.
+
+    The residual that is reported is the pass's own: of every subset just before its correction.
+    """
+
+    def __init__(self, system: System, options: SartOptions, seed: int) -> None:
+        self.options, self.seed = options, seed
+        self.volume = np.zeros(system.operator.volume_shape, np.float32)
+        self.relaxation = options.relaxation
+        self.finished: str | None = None
+        self.iteration = 0
+        order = spread_order(system.frames) if options.order == "spread" else list(range(system.frames))
+        size = options.frames_per_subset
+        groups = [order[i : i + size] for i in range(0, len(order), size)]
+        self.subsets = [system.subset(group) for group in groups]
+        self._row_weights = [row_weights(subset) for subset in self.subsets]
+        kept = max(_WEIGHT_CACHE_BYTES // self.volume.nbytes, 1)
+        self._column_weights = [reciprocal(subset.column_sums()) for subset in self.subsets[:kept]]
+
+    def step(self) -> float:
+        volume, squares = self.volume.copy(), 0.0
+        for index in self._pass():
+            subset = self.subsets[index]
+            residual = subset.residual(volume)
+            squares += norm(residual) ** 2
+            update = subset.back(self._row_weights[index] * residual)
+            volume += np.float32(self.relaxation) * self._columns(index) * update
+            if self.options.nonnegative:
+                np.maximum(volume, 0, out=volume)
+        self.volume = volume
+        self.relaxation *= self.options.relaxation_reduction
+        self.iteration += 1
+        return float(np.sqrt(squares))
+
+    def _pass(self) -> list[int]:
+        count = len(self.subsets)
+        if self.options.order != "random":
+            return list(range(count))
+        return np.random.default_rng([self.seed, self.iteration]).permutation(count).tolist()
+
+    def _columns(self, index: int) -> np.ndarray:
+        """Column weights; those that the cache has no room for are made anew."""
+        if index < len(self._column_weights):
+            return self._column_weights[index]
+        return reciprocal(self.subsets[index].column_sums())
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {
+            "volume": self.volume,
+            "relaxation": np.array(self.relaxation),
+            "pass": np.array(self.iteration),
+        }
+
+    def restore(self, state: State) -> None:
+        self.volume, relaxation, iteration = state_arrays(state, ["volume", "relaxation", "pass"])
+        self.relaxation, self.iteration = float(relaxation), int(iteration)
+
+
+def spread_order(count: int) -> list[int]:
+    """0 … count−1 in steps near the golden section of count, so that each is far from the few before it."""
+    step = next(s for s in range(max(round(0.618 * count), 1), 2 * count + 1) if np.gcd(s, count) == 1)
+    return [(i * step) % count for i in range(count)]

@@ -1,0 +1,47 @@
+"""How a run converged: a chart for each quantity of its record that changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from phyradgs_cl.report.charts.axes import Axes, svg
+from phyradgs_cl.report.facts import label, number
+from phyradgs_cl.report.markup import Markup, joined
+
+MOST_CHARTS = 3
+_MOST_POINTS = 600
+_LOG_FROM = 20.0  # largest over smallest value
+Record = Sequence[Mapping[str, float]]
+
+
+def convergence_charts(record: Record) -> list[tuple[str, Markup]]:
+    """(caption, drawing) of the quantities in a convergence record over iterations; none of an empty record."""
+    names = [key for line in record for key in line if key not in ("iteration", "seconds")]
+    charts = []
+    for name in dict.fromkeys(names):
+        points = [(line.get("iteration", k + 1), line[name]) for k, line in enumerate(record) if name in line]
+        values = [value for _, value in points]
+        if len(points) > 1 and max(values) > min(values):
+            charts.append((_caption(name, points), _chart(name, points)))
+    return charts[:MOST_CHARTS]
+
+
+def _caption(name: str, points: list[tuple[float, float]]) -> str:
+    (_, first), (last, value) = points[0], points[-1]
+    return f"{label(name).capitalize()}: from {number(first)} to {number(value)} at iteration {number(last)}."
+
+
+def _chart(name: str, points: list[tuple[float, float]]) -> Markup:
+    points = points[:: -(-len(points) // _MOST_POINTS)] + [points[-1]]
+    values = [value for _, value in points]
+    low, high = min(values), max(values)
+    log = low > 0 and high / low > _LOG_FROM
+    bottom = low if log else (0.0 if 0 <= low < 0.5 * high else low)
+    axes = Axes((min(0.0, points[0][0]), points[-1][0]), (bottom, high), log)
+    drawn = joined(
+        axes.frame("iteration", label(name)),
+        axes.polyline(points, "curve"),
+        axes.dot(*points[-1], "mark", 3.5),
+        axes.text(points[-1][0], points[-1][1], number(points[-1][1]), shift=(-6, -9), class_="end strong"),
+    )
+    return svg(drawn, f"Convergence: {label(name)} over iterations", _caption(name, points))

@@ -1,0 +1,1 @@
+"""Slices and projections as PNG, and how the page looks through them."""

@@ -1,0 +1,121 @@
+"""A picture of a volume's three middle slices, for a look at a run that is under way."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError, PhyradgsError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import check_writable, partial_path, written_beside
+from phyradgs_cl.reconstructors import Progress, ProgressReport
+from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, upright
+
+_GAP = 4  # pixels between slices
+_SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
+_PERCENTILE = 99.9  # a few hot voxels would make the rest dark
+log = logging.getLogger(__name__)
+
+
+def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
+    """Writes a grey PNG of the middle slices, axial, coronal and sagittal from left to right, whole or not at all.
+
+    Args:
+        volume: (nz, ny, nx) in 1/mm; y (axial) and z (the others) point up, x, x and y to the right.
+        grid: its grid; slices have their true proportions.
+        path: file to write.
+
+    Raises:
+        InputError: a volume that does not fit its grid, NaN or infinity.
+        OutputError: the file cannot be written.
+    """
+    checks.shape("volume", volume, grid.shape)
+    checks.finite("volume", volume)
+    picture = png_bytes(preview_image(volume, grid))
+    with written_beside(path) as temporary:
+        temporary.write_bytes(picture)
+
+
+def check_preview(path: Path, *others: Path) -> None:
+    """Raises InputError or OutputError now if the picture could not be written, or would replace one of ``others``."""
+    if path.suffix.lower() != ".png":
+        raise InputError("--preview", str(path), "a file name that ends in .png")
+    if {one.resolve() for one in (path, partial_path(path))} & {other.resolve() for other in others}:
+        raise InputError("--preview", f"{path}, which the run needs", "another file to write")
+    check_writable(path)
+
+
+class Preview:
+    """A report of a running method that keeps a picture of the present volume, at most one every ``every_s`` seconds.
+
+    It lies at ``io.partial_path`` of ``path`` until the run has come to its end. A picture that cannot be written ends no
+    run: it is a warning, once.
+    """
+
+    def __init__(self, path: Path, report: ProgressReport, every_s: float = 5.0) -> None:
+        self.path, self.partial, self.report, self.every_s = path, partial_path(path), report, every_s
+        self._last_s = -math.inf
+        self._failed = False
+
+    def __call__(self, progress: Progress) -> None:
+        self.report(progress)
+        if progress.volume is None or time.monotonic() - self._last_s < self.every_s:
+            return
+        self._write(*progress.volume(), self.partial)
+        self._last_s = time.monotonic()
+
+    def finish(self, volume: NDArray[np.floating], grid: Grid) -> None:
+        """The picture of the result, under its own name."""
+        self._write(volume, grid, self.path)
+        with suppress(OSError):
+            self.partial.unlink()
+
+    def _write(self, volume: NDArray[np.floating], grid: Grid, path: Path) -> None:
+        try:
+            write_preview(volume, grid, path)
+        except PhyradgsError as error:
+            if not self._failed:
+                log.warning("no preview: %s", error)
+            self._failed = True
+
+
+def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:
+    """The picture (rows, columns) uint8, row 0 at the top; the slices stand side by side on one ground line."""
+    low, high = grey_range(volume)
+    per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
+    slices = []
+    for axis in range(3):
+        image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
+        size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
+        slices.append(upright(_resampled(image, [max(1, round(side * per_mm)) for side in size_mm])))
+    height, width = max(s.shape[0] for s in slices), sum(s.shape[1] for s in slices) + 2 * _GAP
+    picture = np.zeros((height, width), np.uint8)
+    left = 0
+    for image in slices:
+        picture[height - image.shape[0] :, left : left + image.shape[1]] = image
+        left += image.shape[1] + _GAP
+    return picture
+
+
+def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
+    """From 0 (or below, where there is no more than that) to a high percentile: what black and white stand for."""
+    high = float(np.percentile(volume, _PERCENTILE))
+    if high > 0:
+        return 0.0, high
+    low, high = float(volume.min()), float(volume.max())
+    return low, high if high > low else low + 1.0
+
+
+def _resampled(image: NDArray[np.uint8], shape: list[int]) -> NDArray[np.uint8]:
+    """The nearest pixel's value at every place: voxels stay visible as such."""
+    rows, columns = (
+        ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(shape, image.shape, strict=True)
+    )
+    return image[rows[:, None], columns]

@@ -1,0 +1,129 @@
+"""The slices that a page can show: every one of a small volume, evenly chosen ones of a large one."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, upright
+from phyradgs_cl.report.pictures.preview import grey_range
+
+LONGEST_EDGE = 192  # pixels of a slice in the page
+BUDGET_PIXELS = 16_000_000  # of all slices together: some 20 MB of page at worst, of pure noise
+# Plane, axis of the array that is cut, and the world axes to the right and up in the picture.
+PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
+_ROOM = 0.25  # of the window, on either side of it
+Volume = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Window:
+    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps of a page's slices span.
+
+    All in 1/mm. ``beyond``: whether there are smaller, and larger values than those.
+    """
+
+    low: float
+    high: float
+    least: float
+    most: float
+    beyond: tuple[bool, bool]
+
+    @classmethod
+    def of(cls, low: float, high: float, *volumes: Volume) -> Window:
+        """Room on both sides for streaks and overshoots, as far as there are any."""
+        room = _ROOM * (high - low)
+        lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
+        least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))
+        return cls(low, high, least, most, (lowest < least, highest > most))
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one an index.
+
+    first_mm, step_mm: centre of slice 0 and the way to the next. size_mm: (width, height) of a slice. still: the result's
+    middle slice as it is seen without a script, a PNG.
+    """
+
+    name: str
+    axis: str
+    right: str
+    up: str
+    count: int
+    indices: list[int]
+    first_mm: float
+    step_mm: float
+    size_mm: tuple[float, float]
+    layers: dict[str, list[str]]
+    still: bytes
+
+    def position_mm(self, k: int) -> float:
+        """Where the ``k``-th of the slices in the page is."""
+        return self.first_mm + self.indices[k] * self.step_mm
+
+
+def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
+    """A window a layer; the truth's range serves both where there is one, so that a wrong gain shows."""
+    if reference is None or not float(reference.max()) > 0:
+        return {"result": Window.of(*grey_range(volume), volume)}
+    grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
+    size = np.abs(volume - reference)
+    limit = float(np.percentile(size, 99.9)) or grey.high
+    return {"result": grey, "truth": grey, "difference": Window.of(-limit, limit, size, -size)}
+
+
+def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window]) -> list[Plane]:
+    """The three orientations of a volume (nz, ny, nx), a layer for each of the windows."""
+    layers: dict[str, Volume] = {"result": volume}
+    if reference is not None and "truth" in windows:
+        layers |= {"truth": reference, "difference": volume - reference}
+    kept = _kept_slices(volume.shape, len(layers))
+    planes = []
+    for (name, axis, letter, right, up), count in zip(PLANES, kept, strict=True):
+        indices = np.unique(np.linspace(0, volume.shape[axis] - 1, count).round().astype(int)).tolist()
+        place = grid.first_centre_mm[axis], grid.voxel_size_mm[axis]
+        height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
+        pictures = {
+            key: [_base64(_picture(v, axis, i, windows[key].least, windows[key].most)) for i in indices]
+            for key, v in layers.items()
+        }
+        first = windows["result"]
+        still = _picture(volume, axis, indices[len(indices) // 2], first.low, first.high)
+        size_mm, slices = (width_mm, height_mm), volume.shape[axis]
+        planes.append(Plane(name, letter, right, up, slices, indices, *place, size_mm, pictures, still))
+    return planes
+
+
+def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
+    """How many slices along every axis: all, or equal shares of the budget."""
+    seen = [min(n, LONGEST_EDGE) for n in shape]
+    pixels = [int(np.prod(seen)) // seen[axis] for axis in range(3)]
+    most = max(1, BUDGET_PIXELS // (layers * sum(pixels)))
+    return [min(n, most) for n in shape]
+
+
+def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
+    """A slice as a grey PNG, black ``low`` and white ``high``."""
+    return png_bytes(upright(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
+
+
+def _base64(png: bytes) -> str:
+    return base64.b64encode(png).decode("ascii")
+
+
+def _reduced(image: Volume) -> Volume:
+    """Means over blocks of pixels where an image (rows, columns) is longer than a page shows."""
+    for axis in (0, 1):
+        edge = image.shape[axis]
+        if edge > LONGEST_EDGE:
+            starts = (np.arange(LONGEST_EDGE) * edge) // LONGEST_EDGE
+            sums = np.add.reduceat(image.astype(np.float64), starts, axis=axis)
+            lengths = np.diff([*starts, edge])
+            image = sums / (lengths[:, None] if axis == 0 else lengths)
+    return image

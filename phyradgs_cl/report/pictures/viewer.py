@@ -1,0 +1,132 @@
+"""The part of a page in which one walks through the volume, with keyboard, mouse or finger."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping
+
+from phyradgs_cl.report.facts import number
+from phyradgs_cl.report.markup import Markup, element, joined, json_block
+from phyradgs_cl.report.pictures.png import data_uri, diverging
+from phyradgs_cl.report.pictures.slices import Plane, Window
+
+_LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
+_MOST_ZOOM = 8
+_BAR = 0.3  # of a picture's width, at most
+_HELP = (
+    "Arrow keys, Page Up and Down, Home and End move a slider, the wheel the slice under the pointer, with Ctrl the zoom; "
+    "a click in a picture, or dragging, moves the other two there."
+)
+
+
+def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
+    """Three pictures with a slider each, a choice of layers where there is a truth, window and zoom, and their data."""
+    sliders = [
+        _slider("black", "Black", 0, 255, 0, ""),
+        _slider("white", "White", 0, 255, 255, ""),
+        _slider("zoom", "Zoom", 1, _MOST_ZOOM, 1, "1×", 0.5),
+        element("button", "Reset", type="button", id="reset"),
+    ]
+    choice = _choice(list(windows)) if len(windows) > 1 else None
+    figures = element("div", *(_figure(plane) for plane in planes), class_="slices")
+    first = windows["result"]
+    legend = f"Black is {number(first.low, first.high)}, white {number(first.high)} 1/mm."
+    return joined(
+        element("div", choice, *sliders, class_="tools"),
+        figures,
+        element("p", element("output", legend, id="reading"), class_="note"),
+        element("p", _HELP, class_="note help"),
+        json_block("slice-data", _data(planes, windows)),
+    )
+
+
+def _slider(name: str, words: str, low: float, high: float, value: float, told: str, step: float = 1) -> Markup:
+    """A range with its label and an output of what it says."""
+    control = element(
+        "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-told"
+    )
+    label = element("label", words, for_=name)
+    return element("span", label, control, element("output", told, id=f"{name}-told", for_=name))
+
+
+def _figure(plane: Plane) -> Markup:
+    """One orientation: picture, cross lines, where the slice is, slider."""
+    middle, name = len(plane.indices) // 2, f"{plane.name.capitalize()} slice"
+    slider_id, place_id = f"slider-{plane.name}", f"place-{plane.name}"
+    slider = element(
+        "input",
+        type="range",
+        id=slider_id,
+        min=0,
+        max=len(plane.indices) - 1,
+        step=1,
+        value=middle,
+        aria_describedby=place_id,
+    )
+    caption = element(
+        "figcaption",
+        element("label", f"{name} ({plane.axis})", for_=slider_id),
+        element("output", _place(plane, middle), id=place_id, for_=slider_id),
+    )
+    return element("figure", _picture(plane, name), caption, slider, id=f"plane-{plane.name}")
+
+
+def _picture(plane: Plane, name: str) -> Markup:
+    """The slice under its cross lines, the names of the directions at its edges, and a bar of a round length."""
+    width_mm, height_mm = plane.size_mm
+    image = element(
+        "img",
+        src=data_uri(plane.still),
+        alt=f"{name} of the volume, {plane.right} to the right, {plane.up} up",
+        style=f"aspect-ratio: {width_mm:.6g} / {height_mm:.6g}",
+        draggable="false",
+    )
+    lines = (element("i", class_=way, aria_hidden="true") for way in ("across", "upwards"))
+    sheet = element("div", image, element("canvas", aria_hidden="true"), class_="sheet")
+    ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
+    marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
+    bar_mm = _round_length(_BAR * width_mm)
+    bar = element("span", f"{number(bar_mm)} mm", class_="bar", style=f"width: {100 * bar_mm / width_mm:.6g}%")
+    return element("div", sheet, *lines, *marks, bar, class_="picture")
+
+
+def _round_length(most: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten up to ``most``."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))
+
+
+def _place(plane: Plane, k: int) -> str:
+    """Where a slice is; the page's script says it in the same words."""
+    where = number(plane.position_mm(k), plane.step_mm)
+    return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
+
+
+def _choice(layers: list[str]) -> Markup:
+    def one(layer: str) -> Markup:
+        button = element(
+            "input", type="radio", name="layer", id=f"layer-{layer}", value=layer, checked=layer == "result"
+        )
+        return element("label", button, _LAYER_NAMES[layer])
+
+    return element("fieldset", element("legend", "Show"), *(one(layer) for layer in layers), class_="choice")
+
+
+def _data(planes: list[Plane], windows: Mapping[str, Window]) -> dict[str, object]:
+    """What the script needs: slices and where they are, windows with the decimals that 256 steps deserve, colours."""
+    layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
+    colours = base64.b64encode(diverging().tobytes()).decode("ascii") if "difference" in windows else None
+    return {"planes": {plane.name: _plane_data(plane) for plane in planes}, "windows": layers, "colours": colours}
+
+
+def _plane_data(plane: Plane) -> dict[str, object]:
+    places = [_place(plane, k) for k in range(len(plane.indices))]
+    kept = ("axis", "right", "up", "count", "indices", "first_mm", "step_mm", "layers")
+    facts = {name: getattr(plane, name) for name in kept}
+    return {**facts, "width_mm": plane.size_mm[0], "decimals": _decimals(plane.step_mm) + 1, "places": places}
+
+
+def _decimals(step: float) -> int:
+    """As many as show a step, and JavaScript writes."""
+    return int(min(20, max(0, math.ceil(-math.log10(step))))) if step > 0 else 0
