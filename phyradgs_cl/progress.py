@@ -43,8 +43,11 @@ class Ticker:
         every_s = _TERMINAL_EVERY_S if self.is_terminal else _ELSEWHERE_EVERY_S
         if done < total and now - self.last < every_s:
             return
-        self.last = now
-        line = f"{self.noun} {done}/{total}{more}{self._rate(done, total, now)}"
+        self.tell(f"{self.noun} {done}/{total}{more}{self._rate(done, total, now)}")
+
+    def tell(self, line: str) -> None:
+        """Says ``line`` at once, in the place of what was said before."""
+        self.last = time.monotonic()
         _say(f"\r\x1b[K{line}" if self.is_terminal else line, ends_line=not self.is_terminal)
         self.is_open = self.is_terminal
 

@@ -15,6 +15,7 @@ _DISPLACED = 0.1  # of the panel's width: from here a panel is shifted on purpos
 _NOISES = 4.0
 _OPAQUE = 30.0  # line integral: nothing comes through
 _FRAMES = 0.1  # of all: how many may touch a border
+NO_OBJECT, OPAQUE = "no object", "opaque"  # units of findings after which line integrals mean nothing
 _QUESTION = "coverage"
 
 
@@ -35,11 +36,11 @@ def check_coverage(scan: Scan) -> Finding:
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
         advice = "was the object in the beam? Are the values line integrals, larger where more is in the way?"
-        return Finding(_QUESTION, SUSPICIOUS, largest, noise, "line integral", text, advice)
+        return Finding(_QUESTION, SUSPICIOUS, largest, noise, NO_OBJECT, text, advice)
     if largest > _OPAQUE:
         text = f"line integrals reach {largest:.3g}: one photon in {math.exp(min(largest, 700)):.1g} comes through"
         advice = "are these counts, or transmission? Say which: import --quantity, or quantity of the data"
-        return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, "line integral", text, advice)
+        return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, OPAQUE, text, advice)
     threshold = max(_LARGEST_SHARE * largest, noise)
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     allowed = _cut_on_purpose(scan)

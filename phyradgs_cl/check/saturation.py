@@ -13,6 +13,10 @@ from phyradgs_cl.detector import counts_to_attenuation
 _SHARE = 1e-3  # of the pixels at one end
 _TOUCHING = 0.5  # of those, with all four neighbours at the same end
 _ZERO = 1e-6  # line integral
+_CLIFF = 0.75  # of the brightest transmission, from a pixel to the next
+_CLIFFS = 5e-4  # of the pixels
+_FIXED = 0.6  # of the frames: what stands still that long is a dead pixel
+OVERFLOW = "overflow"  # unit of a finding after which line integrals mean nothing
 _QUESTION = "saturation"
 
 
@@ -48,6 +52,11 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         advice = "the detector is saturated there: lower the exposure, or mask these pixels"
         return Finding(_QUESTION, SUSPICIOUS, counts.at_ceiling, _SHARE, "share of pixels", text, advice)
     p = np.asarray(scan.projections)
+    cliffs = _cliffs(p, scan.pixel_mask)
+    if cliffs > _CLIFFS:
+        text = f"from a pixel to the next {100 * cliffs:.3g} % go from brightest to darkest"
+        advice = "did counts overflow (65,536 becomes 0)? Read the frames as unsigned, or lower the exposure"
+        return Finding(_QUESTION, SUSPICIOUS, cliffs, _CLIFFS, OVERFLOW, text, advice)
     masked = (
         np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)
     )
@@ -65,6 +74,18 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         "largest": "no light comes through there: raise the exposure, or mask these pixels",
     }[name]
     return Finding(_QUESTION, SUSPICIOUS, share, _SHARE, "share of pixels", text, advice)
+
+
+def _cliffs(p: np.ndarray, mask: np.ndarray | None) -> float:
+    """The share of pixels (F, v, u) that are as bright as any beside one that is dark, where both are not always so."""
+    if p.shape[2] < 3:
+        return 0.0
+    transmission = np.exp(-np.clip(p, -20, 20))
+    if mask is not None:
+        transmission = np.where(np.asarray(mask) == 0, transmission, np.nan)
+    brightest = float(np.nanpercentile(transmission[:: max(1, len(p) // 20)], 99))
+    jumps = np.abs(np.diff(transmission, axis=2)) > _CLIFF * brightest
+    return float((jumps & (jumps.mean(0) < _FIXED)).mean())
 
 
 def _clustered(extreme: np.ndarray) -> float:
