@@ -9,7 +9,7 @@ from phyradgs_cl.check.timing import azimuth_rad, wrapped
 
 _NORMAL_MAD = 1.4826
 _DEVIATIONS = 12.0
-_LEAST = 0.25  # of the usual mean line integral
+_LEAST = 0.75  # of the usual mean line integral
 _FEWEST = 5
 _TWICE = 0.15  # of the usual difference between neighbours
 

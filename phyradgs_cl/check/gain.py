@@ -46,7 +46,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _change(turning: np.ndarray, shape: np.ndarray, level: np.ndarray) -> tuple[float, float, float]:
-    """(change of ``level`` (F,) along ``shape`` (F,), its standard deviation, squared residual) beside ``turning`` (F, n)."""
+    """(change of ``level`` (F,) along ``shape`` (F,), its standard deviation, squared residual); ``turning`` is (F, n)."""
     design = np.column_stack([turning, shape])
     found, *_ = np.linalg.lstsq(design, level, rcond=None)
     left = level - design @ found

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.angles import check_angles
 from phyradgs_cl.check.coarse import FINE, QUICK, coarse, some_frames
 from phyradgs_cl.check.consistency import CONSISTENCY, check_consistency
-from phyradgs_cl.check.coverage import NO_OBJECT, OPAQUE, check_coverage
+from phyradgs_cl.check.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.dead_pixels import check_dead_pixels
 from phyradgs_cl.check.exposure import EXPOSURE, check_exposure
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, SUSPICIOUS, Finding, too_narrow
@@ -72,20 +72,27 @@ def check(
     add(check_timing(scan))
     add(check_angles(scan))
     saturation = add(check_saturation(scan, counts))
-    finding, dead = check_dead_pixels(scan)
-    add(finding)
-    scan = _without(scan, dead)
-    coverage = add(check_coverage(scan))
-    ruined = next((f for f in (saturation, coverage) if f.unit in (NO_OBJECT, OPAQUE, OVERFLOW)), None)
-    quick = coarse(scan, QUICK)
-    fits = None if ruined else check_consistency(rt, quick)
-    if fits is not None:
-        add(fits.finding)
-    if fits is None or not fits.is_sound:
-        cause = ruined or found[-1]
+
+    def leave_the_rest() -> CheckResult:
+        cause = found[-1]
         for name in names[len(found) :]:
             add(Finding(name, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))
         return CheckResult(found, math.nan, math.nan, False)
+
+    if saturation.unit == OVERFLOW:
+        return leave_the_rest()
+    finding, dead = check_dead_pixels(scan)
+    if finding.verdict == saturation.verdict == SUSPICIOUS:  # a pixel that is always saturated is as still as a dead one
+        finding = replace(finding, verdict=CANNOT_TELL, text="rests on saturation: suspicious", advice="")
+    add(finding)
+    scan = _without(scan, dead)
+    if add(check_coverage(scan)).unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
+        return leave_the_rest()
+    quick = coarse(scan, QUICK)
+    fits = check_consistency(rt, quick)
+    add(fits.finding)
+    if not fits.is_sound:
+        return leave_the_rest()
     quick = some_frames(quick, fits.kept)
     is_reversed, offset, centre = _turning(rt, quick, add, fits.sees_angles)
     pitch_mm = scan.geometry.pixel_size_mm[1]

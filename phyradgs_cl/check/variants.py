@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -118,7 +119,10 @@ def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
 
 
 def stretched(scan: Scan, v: float, u: float) -> Scan:
-    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel, in a box that grows alike."""
+    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel.
+
+    The box grows alike if it then fits what the panel sees better than as it is.
+    """
     rows, columns = scan.geometry.detector_shape
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
@@ -127,8 +131,11 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
         pose[..., 9:12] *= v
         return pose
 
-    size = np.array(scan.grid.voxel_size_mm) * (v, u, u)
-    grid = replace(scan.grid, voxel_size_mm=tuple(float(s) for s in size))
+    seen_mm = u * columns * scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
+    share = max(scan.grid.size_mm[1:]) / seen_mm
+    grows = abs(math.log(share * u)) < abs(math.log(share))
+    z, y, x = scan.grid.voxel_size_mm
+    grid = replace(scan.grid, voxel_size_mm=(v * z, u * y, u * x)) if grows else scan.grid
     return replace(scan, trajectory=Changed(scan.trajectory, change), grid=grid)
 
 
