@@ -65,12 +65,10 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels a frame"
         return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
     kept, notes = _without_odd(scan)
-    part = some_frames(scan, kept) if len(kept) < scan.frames else scan
-    first_kept = kept
-    unshifted, part = _best_turning(rt, part)
+    unshifted, part = _best_turning(rt, some_frames(scan, kept))
     stated = fit(system_of(rt, part))
-    kept, part, stated, more = _without_outliers(rt, part, kept, stated)
-    notes += more
+    left, part, stated, more = _without_outliers(rt, part, stated)
+    kept, unshifted, notes = kept[left], some_frames(unshifted, left), notes + more
     spread = float(np.asarray(part.projections, np.float64).var()) * part.frames
     random = _random_order(rt, part)
     share = float(np.sqrt(stated.total / max(random, 1e-30)))
@@ -81,8 +79,6 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
         verdict = SUSPICIOUS if notes else CANNOT_TELL
         finding = _finding(verdict, share, "; ".join([*notes, text]), _about(notes))
         return Consistency(finding, kept, True, False)
-    if len(kept) < unshifted.frames:
-        unshifted = some_frames(unshifted, np.flatnonzero(np.isin(first_kept, kept)))
     cause = _cause(rt, unshifted, stated, looks_closely=share > _NEEDS_LOOK)
     if cause is not None:
         finding = _finding(SUSPICIOUS, share, "; ".join([*notes, cause.text]), cause.advice)
@@ -138,11 +134,13 @@ def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan]:
     return (ways[best], other) if is_better else (scan, scan)
 
 
-def _without_outliers(
-    rt: Runtime, scan: Scan, kept: np.ndarray, stated: Fit
-) -> tuple[np.ndarray, Scan, Fit, list[str]]:
-    """Leaves out frames whose residual is far above the others', worst first, and asks what they are."""
-    left, current = np.arange(scan.frames), stated
+def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Scan, Fit, list[str]]:
+    """(frames (indices) without those whose residual is far above the others', the scan of them, its fit, what to say).
+
+    The worst goes first; where one in five would go, it is not a few frames but something that all share.
+    """
+    everything = left = np.arange(scan.frames)
+    current = stated
     out: list[int] = []
     while len(out) < _MOST_OUTLIERS * scan.frames:
         size = np.sqrt(current.squares)
@@ -152,16 +150,14 @@ def _without_outliers(
         out.append(int(left[worst]))
         left = np.delete(left, worst)
         current = fit(system_of(rt, some_frames(scan, left)))
-    if not out:
-        return kept, scan, stated, []
-    if len(out) >= _MOST_OUTLIERS * scan.frames:
-        return kept, scan, stated, []  # not a few frames: something that all share
+    if not out or len(out) >= _MOST_OUTLIERS * scan.frames:
+        return everything, scan, stated, []
     part = some_frames(scan, left)
     names = [_number(scan, f) for f in out]
     note = f"frame{'s' if len(out) > 1 else ''} {', '.join(map(str, sorted(names)))} (from 0) do not fit the others"
     if len(out) == 2 and _fit_exchanged(rt, scan, out, stated):
         note = f"frames {min(names)} and {max(names)} (from 0) fit if their order is exchanged"
-    return kept[left], part, current, [note]
+    return left, part, current, [note]
 
 
 def _fit_exchanged(rt: Runtime, scan: Scan, pair: list[int], stated: Fit) -> bool:

@@ -17,7 +17,7 @@ _OPAQUE = 30.0  # line integral: nothing comes through
 _INVERTED = 0.9  # of the largest value: from here the sides are not air but the brightest there is
 _BRIGHT = 0.05  # of the pixels: how many may be brighter than the flats
 _FRAMES = 0.1  # of all: how many may touch a border
-NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings after which line integrals mean nothing
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units: line integrals mean nothing then
 _QUESTION = "coverage"
 
 

@@ -180,7 +180,7 @@ def test_the_wrong_sign_of_readout(rt) -> None:
     """Columns that are read in the wrong order bend the object, which shows; in a wide cone."""
     geometry = ConeGeometry(3.0, 4.5, (48, 48), (0.125, 0.125))
     scene = phantom_scene(rt, "foot", geometry, Grid.cube(32, 2.0), 32, "columns", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid", views=25), axis="columns", time_samples=8)
+    options = SimulationOptions(protocol=make_protocol("rapid", views=25), readout_axis="columns", time_samples=8)
     scan = simulate(scene.source, geometry, scene.grid, options)
     other = replace(scan, shutter=replace(scan.shutter, direction=-1))
     assert verdicts(check(scan, rt))["sign of readout"] == OK
