@@ -79,7 +79,8 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
         verdict = SUSPICIOUS if notes else CANNOT_TELL
         finding = _finding(verdict, share, "; ".join([*notes, text]), _about(notes))
         return Consistency(finding, kept, True, False)
-    cause = _cause(rt, unshifted, stated, looks_closely=share > _NEEDS_LOOK)
+    most = min(_CLEAR * stated.total, _LARGEST**2 * random)
+    cause = _cause(rt, unshifted, stated, most, looks_closely=share > _NEEDS_LOOK)
     if cause is not None:
         finding = _finding(SUSPICIOUS, share, "; ".join([*notes, cause.text]), cause.advice)
         return Consistency(finding, kept, False, True)
@@ -173,9 +174,9 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
     return float(np.mean([fitted(rt, replace(scan, projections=scan.projections[o])).sum() for o in orders]))
 
 
-def _cause(rt: Runtime, scan: Scan, stated: Fit, looks_closely: bool) -> Cause | None:
-    """What explains the frames best, where its squared residual is half of the stated one's or less."""
-    best, least = None, _CLEAR * stated.total
+def _cause(rt: Runtime, scan: Scan, stated: Fit, most: float, looks_closely: bool) -> Cause | None:
+    """What explains the frames best, where its squared residual is below ``most``: of frames that then fit together."""
+    best, least = None, most
     for cause in _causes(scan, looks_closely):
         squares = fitted(rt, cause.scan())
         if squares.sum() < least and standing(stated.squares, squares) <= -_ERRORS:

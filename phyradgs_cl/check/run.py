@@ -16,7 +16,7 @@ from phyradgs_cl.check.consistency import CONSISTENCY, check_consistency
 from phyradgs_cl.check.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.dead_pixels import check_dead_pixels
 from phyradgs_cl.check.exposure import EXPOSURE, check_exposure
-from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, SUSPICIOUS, Finding, too_narrow
+from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.check.gain import GAIN, check_gain
 from phyradgs_cl.check.offset import CENTRE, Offset, best_offset, block_of, check_offset, rough_offset
 from phyradgs_cl.check.readout import READOUT, check_readout
@@ -82,8 +82,8 @@ def check(
     if saturation.unit == OVERFLOW:
         return leave_the_rest()
     finding, dead = check_dead_pixels(scan)
-    if finding.verdict == saturation.verdict == SUSPICIOUS:  # a pixel that is always saturated is as still as a dead one
-        finding = replace(finding, verdict=CANNOT_TELL, text="rests on saturation: suspicious", advice="")
+    if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as still as a dead one
+        finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
     add(finding)
     scan = _without(scan, dead)
     if add(check_coverage(scan)).unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.detector import counts_to_attenuation
 
 _SHARE = 1e-3  # of the pixels at one end
@@ -45,8 +45,8 @@ class CountReader:
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     """The share of pixels that sit, with all their neighbours, at the same extreme value; 0.1 % is suspicious.
 
-    Noise that is cut off at 0 puts single pixels there, saturation whole areas. A line integral of exactly 0 is not
-    asked: it is air in simulated and in clipped scans.
+    Noise that is cut off at 0 puts single pixels there, saturation whole areas. Areas of exactly 0 are
+    air in simulated scans, and saturation where the flats are saturated too: they cannot tell.
     """
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
         text = f"{100 * counts.at_ceiling:.3g} % of the pixels lie together at {counts.ceiling:g} counts"
@@ -70,6 +70,10 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     }
     name, (share, value) = max(ends.items(), key=lambda item: item[1][0])
     text = f"{100 * share:.3g} % of the pixels lie together at the {name} line integral, {value:.4g}"
+    zeros = _clustered((np.abs(p) < _ZERO) & ~masked)
+    if share <= _SHARE < zeros:
+        text = f"{100 * zeros:.3g} % of the pixels lie together at 0: air without noise, or flats that are clipped too"
+        return Finding(_QUESTION, CANNOT_TELL, zeros, _SHARE, "share of pixels", text, "look at the raw counts")
     if share <= _SHARE:
         return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text)
     advice = {
