@@ -51,7 +51,10 @@ def run_one(rt: Runtime, path: Path) -> dict[str, object]:
 
 
 def outcome(line: dict[str, Any]) -> str:
-    """silent or false alarm on a good scan; found, cannot tell or missed on another, and whether another cause is blamed."""
+    """silent or false alarm on a good scan; on another found, cannot tell, or missed, and whether another cause is blamed.
+
+    ``leaves no trace`` is a fault that no frame can show and about which nothing was said: neither an alarm nor a doubt.
+    """
     said = {f["question"]: f["verdict"] for f in line["findings"]}
     suspicious = {question for question, verdict in said.items() if verdict == SUSPICIOUS}
     beside = suspicious - set(line["right"])
@@ -61,7 +64,7 @@ def outcome(line: dict[str, Any]) -> str:
     if suspicious & set(line["right"]) or "error" in line:
         answer = "found"
     else:
-        answer = "cannot tell" if unsure or (line["undecidable"] and not suspicious) else "missed"
+        answer = "cannot tell" if unsure else "leaves no trace" if line["undecidable"] else "missed"
     return f"{answer}, wrong cause blamed" if beside else answer
 
 
@@ -70,6 +73,8 @@ def words(line: dict[str, Any]) -> str:
     if "error" in line:
         return f"refused: {line['error']}"
     chosen = [f for f in line["findings"] if f["verdict"] == SUSPICIOUS]
+    if not chosen and line["undecidable"]:
+        return str(line["undecidable"])
     chosen = chosen or [f for f in line["findings"] if f["verdict"] == CANNOT_TELL and f["question"] in line["right"]]
     return "; ".join(f"**{f['question']}** {f['text']}" for f in chosen).replace("|", "/")
 

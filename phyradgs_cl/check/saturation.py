@@ -85,6 +85,8 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
 
 def _cliffs(p: np.ndarray, masked: np.ndarray) -> float:
     """The share of pixels (F, v, u) that are as bright as any beside one that is dark; one or two dead ones aside."""
+    if p.shape[2] < 2:
+        return 0.0
     transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
     brightest = float(np.percentile(transmission[:: max(1, len(p) // 20)], 99))
     jumps = np.abs(np.diff(median_filter(transmission, size=(1, 1, 5)), axis=2)) > _CLIFF * brightest
