@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
 
 _NORMAL_MAD = 1.4826
 _DEVIATIONS = 12.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
-from phyradgs_cl.check.timing import exposure_arc_rad
+from phyradgs_cl.check.questions.timing import exposure_arc_rad
 from phyradgs_cl.operators.rays.operator import LinearOperator
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System

@@ -10,19 +10,26 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.angles import check_angles
 from phyradgs_cl.check.coarse import FINE, QUICK, coarse, some_frames
-from phyradgs_cl.check.consistency import CONSISTENCY, check_consistency
-from phyradgs_cl.check.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
-from phyradgs_cl.check.dead_pixels import check_dead_pixels
-from phyradgs_cl.check.exposure import EXPOSURE, check_exposure
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
-from phyradgs_cl.check.gain import GAIN, check_gain
-from phyradgs_cl.check.offset import CENTRE, Offset, best_offset, block_of, check_offset, rough_offset
-from phyradgs_cl.check.readout import READOUT, check_readout
-from phyradgs_cl.check.rotation import SIGN, check_rotation, is_clear
-from phyradgs_cl.check.saturation import OVERFLOW, CountReader, check_saturation
-from phyradgs_cl.check.timing import check_timing
+from phyradgs_cl.check.questions.angles import check_angles
+from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
+from phyradgs_cl.check.questions.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
+from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
+from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
+from phyradgs_cl.check.questions.gain import GAIN, check_gain
+from phyradgs_cl.check.questions.offset import (
+    CENTRE,
+    Offset,
+    best_offset,
+    block_of,
+    check_offset,
+    rough_offset,
+)
+from phyradgs_cl.check.questions.readout import READOUT, check_readout
+from phyradgs_cl.check.questions.rotation import SIGN, check_rotation, is_clear
+from phyradgs_cl.check.questions.saturation import OVERFLOW, CountReader, check_saturation
+from phyradgs_cl.check.questions.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared

@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.trajectory import Trajectory
-from phyradgs_cl.check.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
 
 _MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at the plane y = 0
 

@@ -11,7 +11,7 @@ import pytest
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
-from phyradgs_cl.check.exposure import check_exposure
+from phyradgs_cl.check.questions.exposure import check_exposure
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid

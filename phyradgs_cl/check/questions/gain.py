@@ -8,8 +8,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.questions.timing import azimuth_rad
 from phyradgs_cl.check.residual import fit, system_of
-from phyradgs_cl.check.timing import azimuth_rad
 from phyradgs_cl.runtime import Runtime
 
 _LARGEST = 0.015

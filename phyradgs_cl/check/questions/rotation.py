@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.offset import Offset
+from phyradgs_cl.check.questions.offset import Offset
 from phyradgs_cl.check.statistics import gain, standing
 
 _ERRORS = 4.0

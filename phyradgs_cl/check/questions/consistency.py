@@ -12,10 +12,10 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.coarse import some_frames
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.frames import alike, odd_ones
-from phyradgs_cl.check.offset import best_offset, rough_offset
+from phyradgs_cl.check.questions.offset import best_offset, rough_offset
+from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
 from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
 from phyradgs_cl.check.statistics import standing
-from phyradgs_cl.check.timing import azimuth_rad, wrapped
 from phyradgs_cl.check.variants import Path, reversed_rotation, shifted, stretched, turned, with_path
 from phyradgs_cl.runtime import Runtime
 
