@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
@@ -47,7 +48,7 @@ class EncoderTable:
     """Measured θ(t): linear between samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
 
     time_s: np.ndarray
-    angle_rad_table: np.ndarray
+    angle_rad_table: NDArray[np.float64]
     culprit: str = "encoder table"
 
     def __post_init__(self) -> None:
@@ -87,7 +88,7 @@ class FrameSweeps:
         first, last = float(self.angle_start_rad[frame]), float(self.angle_end_rad[frame])
         if self.exposure_s <= 0:
             return np.full(t.shape, first)
-        return first + (last - first) * (t - self.start_s[frame]) / self.exposure_s
+        return first + (last - first) * (t - float(self.start_s[frame])) / self.exposure_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,7 @@ class PoseTable:
     time_s: np.ndarray
     table: np.ndarray
     culprit: str = "pose table"
+    _frames: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         time_s = np.asarray(self.time_s, np.float64)
@@ -136,13 +138,13 @@ class PoseTable:
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         t = np.asarray(time_s, np.float64)
         _check_covered(self.culprit, frame, t, self.time_s)
-        frames: np.ndarray = self._frames  # type: ignore[attr-defined]
-        in_body = np.einsum("tji,tkj->tki", frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
+        in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp knows no slack
         body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
-        turns = scipy.spatial.transform.Rotation.from_matrix(frames)
+        turns = scipy.spatial.transform.Rotation.from_matrix(self._frames)
         turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
-        return np.einsum("tij,tkj->tki", turn, body).reshape(*t.shape, POSE_LENGTH)
+        turned: np.ndarray = np.einsum("tij,tkj->tki", turn, body)
+        return turned.reshape(*t.shape, POSE_LENGTH)
 
 
 def _body_frames(table: np.ndarray) -> np.ndarray:
