@@ -26,17 +26,9 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import default_grid, file_kind, read_scan, scan_summary, sha256_of, write_scan
 
-GEOMETRY = ConeGeometry(785.0, 1200.0, (3, 5), (0.6, 0.5), (1.25, -2.5))
 ANGLE_TOLERANCE_RAD = 1e-12  # degrees in the file: two roundings of angles of order 1
 LENGTH_TOLERANCE_MM = 1e-9  # that angle at 785 mm
 RAMP_TOLERANCE_MM = 2e-6  # a speed ramp is stored as straight pieces, a nanoradian off at 1200 mm
-
-
-class OwnTrajectory:
-    """Poses that the format has no fields for."""
-
-    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        return GEOMETRY.pose(0.3 + 0.1 * time_s)
 
 
 def same_poses(scan, again, tolerance_mm=LENGTH_TOLERANCE_MM) -> None:
@@ -427,8 +419,6 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path, make_scan) -> None:
             write_scan(path, scan, **arguments)
     with pytest.raises(InputError, match="exposure"):
         write_scan(path, make_scan(shutter=Shutter(0.0, 0.3)))
-    with pytest.raises(InputError, match="trajectory: found OwnTrajectory.*PoseTable"):
-        write_scan(path, make_scan(trajectory=OwnTrajectory()))
     assert list(tmp_path.iterdir()) == []
 
 
