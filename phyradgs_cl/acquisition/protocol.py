@@ -63,7 +63,8 @@ class Protocol:
         return np.arange(self.views) * self.step_deg / self.exposure_deg * self.exposure_s
 
     def angle_start_rad(self) -> np.ndarray:
-        return np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
+        start_rad: np.ndarray = np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
+        return start_rad
 
     def orbit(
         self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None

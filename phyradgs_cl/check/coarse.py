@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, Shutter
-from phyradgs_cl.check.variants import with_path
+from phyradgs_cl.check.variants import path_of, with_path
 from phyradgs_cl.fields import Grid
 
 _MOST_FRAMES = 60
@@ -66,7 +66,7 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 def some_frames(scan: Scan, chosen: np.ndarray) -> Scan:
     """The chosen frames (indices), their trajectory counting them as they were."""
-    path = with_path(scan).trajectory
+    path = path_of(scan)
     numbers = chosen if path.frames is None else path.frames[chosen]
     mask = scan.pixel_mask
     return replace(

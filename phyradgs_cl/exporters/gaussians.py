@@ -26,7 +26,7 @@ def gaussians_of(stored: StoredVolume, culprit: str) -> dict[str, np.ndarray]:
 def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
     """Four arrays by their names, no pickle."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **cloud)
+        np.savez(file, **cloud)  # type: ignore[arg-type]
 
 
 def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:

@@ -69,7 +69,7 @@ class _Views:
     def bytes(self, count: int) -> int:
         """What so many of them take on the device."""
         _, rows, width = self.frames.shape
-        return 4 * count * (2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
+        return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
     def parts(self, room: Room) -> Iterator[slice]:
         """Views that go to the device in one piece."""

@@ -30,7 +30,7 @@ class Reconstruction:
     grid: Grid
     gaussians: Gaussians | None = None
     record: list[dict[str, float]] = field(default_factory=list)
-    facts: dict[str, object] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
 
 

@@ -7,6 +7,7 @@ import time
 import warnings
 import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class Runtime:
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         try:
             self.context = cl.Context([self.device.handle])
-            self.queue = cl.CommandQueue(self.context, properties=properties)
+            self.queue = cl.CommandQueue(self.context, properties=properties)  # type: ignore[arg-type]
         except cl.Error as error:
             raise translated(error, self.ledger, "opening it") from error
         self.lanes = lanes or default_lanes(self.device)
@@ -185,7 +186,7 @@ class Runtime:
     # --- launches -----------------------------------------------------------------------------------
 
     @naming_failures()
-    def launch(self, kernel: Kernel, items: int | tuple[int, ...], *args: object, group: int = 1) -> None:
+    def launch(self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int = 1) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:

@@ -106,7 +106,7 @@ def summary(path: Path) -> dict[str, object]:
             return {"kind": "scan", **scan_summary(path)}
     if kind == "volume":
         facts = volume_summary(path)
-        provenance = dict(facts.pop("provenance", {}) or {})
+        provenance = dict(facts.pop("provenance", None) or {})
         provenance.pop("record", None)
         options = provenance.pop("options", None)
         return {"kind": "volume", **facts, **_asked_for(options), **provenance}

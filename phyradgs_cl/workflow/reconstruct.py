@@ -169,7 +169,7 @@ def _reconstructed(
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
-    return result, metrics  # type: ignore[return-value]
+    return result, metrics
 
 
 def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
@@ -217,8 +217,8 @@ def _averages(scan: Scan, options: Any) -> bool:
 def profile_report(rt: Runtime, result: Reconstruction) -> str:
     """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
     uses = rt.kernel_uses()
-    pairs = {str(name): int(n) for name, n in dict(result.facts.get("evaluated_pairs", {})).items()}  # type: ignore[call-overload]
-    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)  # type: ignore[arg-type]
+    pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
+    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)
 
 
 def _write_result(

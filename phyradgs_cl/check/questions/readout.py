@@ -34,9 +34,9 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
     """
     stated = fitted(rt, scan)
     others: dict[str, np.ndarray] = {}
-    for name, other in _others(scan).items():
+    for name, variant in _others(scan).items():
         with suppress(InputError):  # a table of poses or angles that ends before the last line would
-            others[name] = fitted(rt, other)
+            others[name] = fitted(rt, variant)
     if not others:
         text = "the tables of poses or angles end with the stated times: no other readout can be tried"
         return Finding(READOUT, CANNOT_TELL, 0.0, -_ERRORS, "standard errors", text)

@@ -141,7 +141,7 @@ def _geometry(
         behind = optional_length(source, f"{detector}/distance")
         to_detector = None if behind is None else to_axis + behind
     to_detector = needed(to_detector, "source_to_detector_mm", source.name(f"{detector}/distance"))
-    pitch = options.pixel_size_mm or tuple(_pitch(source, detector, axis) for axis in "yx")
+    pitch = options.pixel_size_mm or (_pitch(source, detector, "y"), _pitch(source, detector, "x"))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
 

@@ -64,7 +64,7 @@ def line_integrals(
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, culprit, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
-    if saturation is not None and saturation.share > 0:
+    if flat is not None and saturation is not None and saturation.share > 0:
         _mask_clipped(culprit, frames, flat, saturation, unusable)
     return LineIntegrals(integrals, compact(unusable), saturation)
 

@@ -51,18 +51,20 @@ class IntensityOperator:
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """J d: a change of the volume (nz, ny, nx) to that of the frames (F, rows, columns) float32."""
         pairs = zip(self._shares, self._operators, strict=True)
-        return np.sum([share * operator.forward(volume) for share, operator in pairs], axis=0)
+        total: np.ndarray = np.sum([share * operator.forward(volume) for share, operator in pairs], axis=0)
+        return total
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
         """Jᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         pairs = zip(self._shares, self._operators, strict=True)
-        return np.sum([operator.adjoint(share * frames) for share, operator in pairs], axis=0)
+        total: np.ndarray = np.sum([operator.adjoint(share * frames) for share, operator in pairs], axis=0)
+        return total
 
     def subset(self, frames: Sequence[int]) -> IntensityOperator:
         """The same for some of the frames, in this order, with a volume of its own for J."""
-        chosen = np.asarray(frames, np.int64)
+        chosen = list(frames)
         part = copy(self)
-        part.frames_shape = (chosen.size, *self.frames_shape[1:])
+        part.frames_shape = (len(chosen), *self.frames_shape[1:])
         part._operators = [operator.subset(chosen) for operator in self._operators]
         part._weights = [weight[chosen] for weight in self._weights]
         part._shares = part._weights

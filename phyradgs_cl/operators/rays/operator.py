@@ -22,8 +22,11 @@ from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 class LinearOperator(Interface):
     """What the iterative methods need to know of a scanner: A, Aᵀ, and A restricted to some frames."""
 
-    volume_shape: tuple[int, int, int]
-    frames_shape: tuple[int, int, int]
+    @property
+    def volume_shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]: ...
 
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""

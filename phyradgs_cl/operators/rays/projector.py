@@ -60,7 +60,7 @@ class RayProjector:
         self._check(table)
         if isinstance(volume, np.ndarray):
             operator = RayOperator(self.rt, self.grid, self._detector_shape, [table], memory=self._memory)
-            return operator.project(volume, detector_model)[0]
+            return operator.project(volume, detector_model).squeeze(0)
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
         image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]

@@ -45,7 +45,8 @@ def upright_block(grid: Grid, tables: Sequence[TimeCells], width: int, lanes: in
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
     """(C,) the least length of d00 + u eu for u in [0, width − 1]; all (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
-    return np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1)
+    length: np.ndarray = np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1)
+    return length
 
 
 def columns_floats(grid: Grid) -> int:

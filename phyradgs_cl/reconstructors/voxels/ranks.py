@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Protocol as Interface
+from typing import TypeVar
 
 import numpy as np
 
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator
 from phyradgs_cl.parallel import Communicator, exact_sum, span
+
+S = TypeVar("S", bound="SharedOperator")
 
 
 class SharedOperator:
@@ -36,7 +39,7 @@ class SharedOperator:
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
 
-    def subset(self, frames: Sequence[int]) -> SharedOperator:
+    def subset(self: S, frames: Sequence[int]) -> S:
         """The same of some of the frames, in this order, shared out anew."""
         return type(self)(self.ranks, self.whole.subset(frames))
 

@@ -42,10 +42,10 @@ class System:
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: Intensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # of one value both are the mean
-            intensity = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+            every = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+            intensity = SharedIntensity(rt.ranks, every) if rt.ranks.size > 1 else every
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
-            intensity = None if intensity is None else SharedIntensity(rt.ranks, intensity)
         if scan.pixel_mask is None:
             return cls(operator, measured, None, intensity)
         valid = np.broadcast_to(scan.pixel_mask == 0, measured.shape)
