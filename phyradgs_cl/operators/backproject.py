@@ -13,7 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
-from phyradgs_cl.operators.rays.launches import voxel_matrices
+from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import DeviceArray, Room, Runtime, with_smaller_bricks
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 

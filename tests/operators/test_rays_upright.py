@@ -13,7 +13,7 @@ from tolerances import RAYS
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
-from phyradgs_cl.operators.rays.launches import RayLayout
+from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.upright import columns_floats, upright_block
 from phyradgs_cl.operators.twins.rays import ray_frame
