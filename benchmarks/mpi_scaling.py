@@ -133,9 +133,9 @@ def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
     for name in ("add", "largest"):
         setattr(ranks, name, clock.part(getattr(ranks, name), "sending"))
     rows = [clock.step(run) for _ in range(WARM)]
-    before = ranks.exchanged_bytes
+    before = ranks.sent_bytes
     rows = [clock.step(run) for _ in range(steps)]
-    return 1e3 * np.array(rows), (ranks.exchanged_bytes - before) // steps
+    return 1e3 * np.array(rows), (ranks.sent_bytes - before) // steps
 
 
 def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str | None, out: Path) -> None:
@@ -143,7 +143,7 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
     rt = Runtime(device, profile=True, ranks=ranks)
     run = started(rt, gaussians, pixels, batch)
     rows, nbytes = measure(run, steps)
-    everyone = ranks.join(rows[None])
+    everyone = ranks.allgather(rows[None])
     if ranks.rank == 0:
         facts = {
             "gaussians": run.cloud.count,

@@ -151,7 +151,7 @@ def _reconstructed(
     extra: dict[str, Any] = {"before": job.before}
     leads = rt.ranks.rank == 0
     if job.resume:
-        extra["resume"] = rt.ranks.tell(_resumed(job, fingerprint) if leads else None)
+        extra["resume"] = rt.ranks.bcast(_resumed(job, fingerprint) if leads else None)
     elif leads:
         _set_aside(job.output)
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
