@@ -40,7 +40,7 @@ TRIALS = (
     Trial("intensity not modelled", changes={"detector_model": "log"}),
     Trial(CLEAN, CLEAN),
     Trial(LINEAR, LINEAR),
-    Trial("the same, 15 times a line", LINEAR, changes={"sub_intervals": 15}),
+    Trial("the same, 15 times per line", LINEAR, changes={"sub_intervals": 15}),
     Trial("the same, 500 iterations", LINEAR, changes={"iterations": 500}),
     Trial("the same, a tenth of the TV weight", LINEAR, changes={"tv_weight": 1e-4}),
     Trial("the same, ten times the TV weight", LINEAR, changes={"tv_weight": 1e-2}),

@@ -4,8 +4,8 @@
 
 In an environment with the extra [mpi]. Every number of ranks is a run of mpiexec on this machine; where the device is its
 processor, a rank has one thread of PoCL, and times are seconds of the processor, not of the clock. Splats exact in time, 25
-frames. Strong: four frames a step whatever the ranks. Weak: a frame a rank. Of every part the least of the steps counts, on
-the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks than
+frames. Strong: four frames per step whatever the ranks. Weak: one frame per rank. Of every part the least of the steps counts,
+on the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks than
 processors, or others at work on them, they say nothing.
 
 The model. A step of B frames on R ranks takes
@@ -224,7 +224,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--pixels", type=int, default=128)
     parser.add_argument("--steps", type=int, default=12)
-    parser.add_argument("--batch", type=int, default=0, help="frames a step of one run, within mpiexec")
+    parser.add_argument("--batch", type=int, default=0, help="frames per step of one run, within mpiexec")
     parser.add_argument("--out", type=Path, default=None, help="where rank 0 writes, within mpiexec")
     arguments = parser.parse_args()
     gaussians, pixels, steps = (

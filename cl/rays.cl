@@ -1,5 +1,5 @@
 /* Ray-driven projector by Joseph's method and its exactly matched adjoint, over all time cells of many frames in
-   one launch each. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample a plane of the ray's main
+   one launch each. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample per plane of the ray's main
    axis. Frames are padded rows, volumes too, with a border of zeros in y and z. Twin: operators/twins/rays.py. */
 #include "common/intensity.h"
 #include "common/ray.h"
@@ -82,7 +82,7 @@ __kernel void rays_forward(
 #if !RAY_VOXEL_ITEMS
 /* Adjoint for CPUs: a work-item owns a brick of voxels. It follows the rays that may meet its brick, plane by plane as
    the projector does, and adds their shares into a tile of its own; a border of one voxel catches what belongs to
-   neighbours, who find it themselves. One writer a voxel in a fixed order: no atomics. */
+   neighbours, who find it themselves. One writer per voxel in a fixed order: no atomics. */
 #define TILE_X (BRICK_X + 2)
 #define TILE_Y (BRICK_Y + 2)
 #define TILE_Z (BRICK_Z + 2)

@@ -1,6 +1,6 @@
 """Scans and volumes in other programs' formats: read, checked as if by strangers, and turned into our conventions.
 
-`import_scan` and `load_volume` are the doors; one module a format.
+`import_scan` and `load_volume` are the doors; one module per format.
 """
 
 from __future__ import annotations

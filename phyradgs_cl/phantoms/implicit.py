@@ -154,7 +154,7 @@ def texture(
     ex, ey, ez = (np.exp(1j * np.outer(axis, k[:, i])).astype(np.complex64) for i in range(3))
     ez = ez * (amplitude * np.exp(1j * phase)).astype(np.complex64)
     n = lattice.count
-    # cos(a + b + c) is the real part of a product: one matrix product a slice instead of n^3 cosines.
+    # cos(a + b + c) is the real part of a product: one matrix product per slice instead of n^3 cosines.
     noise = np.empty((n, n, n), dtype=np.float32)
     for i in range(n):
         noise[i] = ((ey * ez[i]) @ ex.T).real

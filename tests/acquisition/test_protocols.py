@@ -106,7 +106,7 @@ def test_times_grow_with_the_exposure(exposure_s) -> None:
     np.testing.assert_allclose(turning.frame_start_s(), 3 * exposure_s * np.arange(4), rtol=1e-12)
 
 
-def test_the_gantry_wanders_in_straight_lines_between_a_knot_a_frame() -> None:
+def test_the_gantry_wanders_in_straight_lines_between_one_knot_per_frame() -> None:
     protocol = Protocol(5, 20.0, exposure_s=2.0, start_deg=7.0)
     encoder = protocol.orbit(GEOMETRY, 0.3, np.random.default_rng(6)).kinematics
     knots = np.random.default_rng(6).normal(0, np.deg2rad(0.3), 6)

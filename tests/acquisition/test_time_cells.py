@@ -112,7 +112,7 @@ def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_i
 
 
 def test_many_micro_views_meet_the_per_line_times() -> None:
-    """With a strip a line, mean times differ from the exact ones by at most half a strip's readout."""
+    """With one strip per line, mean times differ from the exact ones by at most half a strip's readout."""
     shutter, lines = Shutter(0.8, 0.3), 200
     micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
     exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)

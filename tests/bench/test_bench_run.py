@@ -41,7 +41,7 @@ from phyradgs_cl.simulation import phantom_scene
 
 TINY = BenchSize("T", 12, 16, 8)
 ROWS = ["FDK", "PhyRadGS w/o ST", "PhyRadGS"]
-RUNS_A_CASE = 5  # three on the fly-scan, two on the stop-and-shoot scan
+RUNS_PER_CASE = 5  # three on the fly-scan, two on the stop-and-shoot scan
 
 
 def no_runtime() -> Runtime:
@@ -69,16 +69,16 @@ def test_a_run_is_not_made_twice_and_a_damaged_line_again(job: BenchJob, rt: Run
     written = run_bench(job, lambda: rt, seen.append)
     results = job.output / RESULTS
     whole = results.read_bytes()
-    assert whole.count(b"\n") == 2 * RUNS_A_CASE
-    assert [p.number for p in seen if p.line is not None] == list(range(1, 2 * RUNS_A_CASE + 1))
+    assert whole.count(b"\n") == 2 * RUNS_PER_CASE
+    assert [p.number for p in seen if p.line is not None] == list(range(1, 2 * RUNS_PER_CASE + 1))
     assert all(path.stat().st_size for path in written)
     run_bench(job, no_runtime)
     assert results.read_bytes() == whole
     results.write_bytes(whole[:-40])  # killed while the last line was written
     made: list[BenchProgress] = []
     run_bench(job, lambda: rt, made.append)
-    assert [p.number for p in made if p.line is not None] == [2 * RUNS_A_CASE]
-    assert len(read_lines(results)) == 2 * RUNS_A_CASE
+    assert [p.number for p in made if p.line is not None] == [2 * RUNS_PER_CASE]
+    assert len(read_lines(results)) == 2 * RUNS_PER_CASE
     run_bench(job, no_runtime)
 
 
@@ -275,7 +275,7 @@ def test_an_interruption_loses_the_present_run_only(
         run_bench(job, lambda: rt, stop_after_two)
     assert len(read_lines(job.output / RESULTS)) == 2
     run_bench(job, lambda: rt)
-    assert len(read_lines(job.output / RESULTS)) == 2 * RUNS_A_CASE
+    assert len(read_lines(job.output / RESULTS)) == 2 * RUNS_PER_CASE
 
 
 def test_a_run_that_overflows_is_noted_and_tried_again(

@@ -15,7 +15,7 @@ from phyradgs_cl.metrics.edge import RISE_PER_SIGMA, ball_edge, blurred_ball
 from phyradgs_cl.metrics.roundness import ball_sections
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
-GRID = Grid.cube(64, 32.0)  # half a millimetre a voxel
+GRID = Grid.cube(64, 32.0)  # half a millimetre per voxel
 CENTRE = (0.3, -0.2, 0.4)
 NOISE = 0.1
 

@@ -94,7 +94,7 @@ def round_splat(scale: float, x: float) -> np.ndarray:
 
 @pytest.mark.parametrize("pixels", [0.05, 0.3, 0.5, 1.0, 3.0])
 def test_pixels_with_an_area_see_the_mean_over_it(rt, pixels) -> None:
-    """A round splat of ``pixels`` pixels (σ), against the mean of 15 × 15 rays a pixel."""
+    """A round splat of ``pixels`` pixels (σ), against the mean of 15 × 15 rays per pixel."""
     shape, fine = (31, 33), 15
     coarse = ConeGeometry(5.0, 7.5, shape, (0.1, 0.1))
     rays = ConeGeometry(5.0, 7.5, (shape[0] * fine, shape[1] * fine), (0.1 / fine, 0.1 / fine))

@@ -145,7 +145,7 @@ def steep(shape: tuple[int, int]) -> list[TimeCells]:
         (tilted(TALL_PANEL), False),
         (steep(TALL_PANEL), False),
     ],
-    ids=["static", "strips", "a pose a line", "few lines", "columns", "tilted", "steep"],
+    ids=["static", "strips", "a pose per line", "few lines", "columns", "tilted", "steep"],
 )
 def test_where_it_applies(cells, applies) -> None:
     width = 85 if cells[0].lines == 15 else 7

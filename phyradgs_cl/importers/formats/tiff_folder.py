@@ -167,7 +167,7 @@ def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTi
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
-    """(F,) as stored: a list, a file of one angle a line, or the first with the last or a step."""
+    """(F,) as stored: a list, a file of one angle per line, or the first with the last or a step."""
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:
         raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
@@ -190,5 +190,5 @@ def _mask(stack: np.ndarray, shape: tuple[int, ...], culprit: str) -> np.ndarray
     if stack.shape == (1, *shape[1:]):
         return stack[0] != 0
     if stack.shape != shape:
-        raise InputError(culprit, f"shape {stack.shape}", f"one image of {shape[1:]}, or one a frame")
+        raise InputError(culprit, f"shape {stack.shape}", f"one image of {shape[1:]}, or one per frame")
     return stack != 0

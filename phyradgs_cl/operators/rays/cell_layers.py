@@ -1,4 +1,4 @@
-"""The cells of frames in layers of one cell a line, and what a detector that adds photons makes of them, on the host."""
+"""The cells of frames in layers of one cell per line, and what a detector that adds photons makes of them, on the host."""
 
 from __future__ import annotations
 

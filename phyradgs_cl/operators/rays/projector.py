@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 class RayProjector:
     """Line integrals of a voxel grid, weighted over a frame's cells: the merged frame, in one launch.
 
-    Joseph's method: one bilinear sample a plane of each ray's own main axis; voxels outside are zero.
+    Joseph's method: one bilinear sample per plane of each ray's own main axis; voxels outside are zero.
     """
 
     def __init__(self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str = "rows") -> None:

@@ -45,7 +45,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one an index.
+    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one per index.
 
     first_mm, step_mm: centre of slice 0 and the way to the next. size_mm: (width, height) of a slice. still: the result's
     middle slice as it is seen without a script, a PNG.
@@ -69,7 +69,7 @@ class Plane:
 
 
 def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
-    """A window a layer; the truth's range serves both where there is one, so that a wrong gain shows."""
+    """A window per layer; the truth's range serves both where there is one, so that a wrong gain shows."""
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
