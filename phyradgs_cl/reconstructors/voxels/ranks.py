@@ -1,7 +1,7 @@
 """The frames of a scan's operator shared out over ranks: each projects its own; frames are gathered, volumes summed.
 
 Volumes and frames are whole on every rank, so that the methods around an operator need not know of the others: they do the
-same everywhere. Sums of volumes do not depend on their order, but on how many frames a rank adds up by itself.
+same everywhere. Sums of volumes do not depend on their order, but on how many frames per rank adds up by itself.
 """
 
 from __future__ import annotations
