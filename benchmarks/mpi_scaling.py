@@ -5,8 +5,8 @@
 In an environment with the extra [mpi]. Every number of ranks is a run of mpiexec on this machine; where the device is its
 processor, a rank has one thread of PoCL, and times are seconds of the processor, not of the clock. Splats exact in time, 25
 frames. Strong: four frames per step whatever the ranks. Weak: one frame per rank. Of every part the least of the steps
-counts, on the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks than
-processors, or others at work on them, they say nothing.
+counts, on the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks
+than processors, or others at work on them, they say nothing.
 
 The model. A step of B frames on R ranks takes
 

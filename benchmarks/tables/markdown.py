@@ -95,9 +95,9 @@ def _row_cells(
 ) -> list[str]:
     moving = lines_of_run(lines, protocol, row.run, FLY)
     volumes = {line["volume"] for line in moving}
-    standing = lines_of_run(lines, protocol, row.standing().run, STILL)
+    static = lines_of_run(lines, protocol, row.static().run, STILL)
     summary = summarise(moving)
-    still = summarise([line for line in standing if line["volume"] in volumes or not volumes])
+    still = summarise([line for line in static if line["volume"] in volumes or not volumes])
     label = row.label
     if summary is None and (lacks := row.lacks(job.bench_size.voxels)):
         label += f" ({lacks})"

@@ -19,7 +19,7 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, sphere_phantom
 from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
-from tables.case import FLY, HeldOutViews, Images, Measure, standing
+from tables.case import FLY, HeldOutViews, Images, Measure, stop_and_shoot
 from tables.raw_counts import Panel, measured_attenuation
 from tables.sizes import BenchSize
 
@@ -106,7 +106,7 @@ class PhantomCase:
         return labels
 
     def _measured(self, acquisition: str) -> Scan:
-        protocol = self._protocol if acquisition == FLY else standing(self._protocol)
+        protocol = self._protocol if acquisition == FLY else stop_and_shoot(self._protocol)
         if acquisition == PSEUDO:
             protocol = replace(protocol, views=PSEUDO_VIEWS)
         options = SimulationOptions(

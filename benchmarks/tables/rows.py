@@ -40,8 +40,8 @@ class Row:
         counts = f"{self.strips}x{self.sub_intervals}" if self.motion == "micro-views" else ""
         return " ".join(part for part in (self.method, self.motion, counts, self.variant) if part)
 
-    def standing(self) -> Row:
-        """The row of the same method for a gantry that stands still."""
+    def static(self) -> Row:
+        """The row of the same method with a static model, for a gantry at rest."""
         return Row(self.still or self.label, self.method, variant=self.variant, changes=self.changes)
 
     def options(self, gaussians: int, iterations: int) -> Any:

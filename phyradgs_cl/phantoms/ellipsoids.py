@@ -72,7 +72,7 @@ class Ellipsoid:
 
     @property
     def half_box_mm(self) -> Array:
-        """(3,): half the sides (x, y, z) of the smallest upright box around the ellipsoid."""
+        """(3,): half the sides (x, y, z) of the smallest axis-aligned box around the ellipsoid."""
         return np.linalg.norm(np.asarray(self.rotation) * np.asarray(self.semi_axes_mm), axis=1)
 
 

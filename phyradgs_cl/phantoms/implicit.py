@@ -79,7 +79,7 @@ def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
 
 
 def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: Field) -> Field:
-    """First-order distance to an upright ellipsoid: exact on the surface and in sign."""
+    """First-order distance to an axis-aligned ellipsoid: exact on the surface and in sign."""
     return ratio_distance([(p - c) for p, c in zip((x, y, z), centre, strict=True)], semi_axes)
 
 

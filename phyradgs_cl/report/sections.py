@@ -12,7 +12,7 @@ from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
-from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, upright
+from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
 from phyradgs_cl.report.pictures.projections import TIMES_PER_LINE, View
 from phyradgs_cl.report.pictures.slices import planes_of, windows_of
 from phyradgs_cl.report.pictures.viewer import viewer
@@ -132,10 +132,10 @@ def facts_table(facts: Mapping[str, object]) -> Markup:
 
 
 def _view(view: View, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
-    residual = png_bytes(upright(bytes_of(view.residual, -limit, limit)), diverging())
+    residual = png_bytes(top_row_first(bytes_of(view.residual, -limit, limit)), diverging())
     pictures = [
-        ("measured", png_bytes(upright(bytes_of(view.measured, *window)))),
-        ("computed", png_bytes(upright(bytes_of(view.computed, *window)))),
+        ("measured", png_bytes(top_row_first(bytes_of(view.measured, *window)))),
+        ("computed", png_bytes(top_row_first(bytes_of(view.computed, *window)))),
         (f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)", residual),
     ]
     style = f"aspect-ratio: {proportion[0]:.6g} / {proportion[1]:.6g}"

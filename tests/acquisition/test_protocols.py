@@ -211,10 +211,10 @@ def test_timing_names_the_first_frame_that_a_table_misses() -> None:
                 moving.check_timing()
 
 
-def test_timing_of_a_standing_gantry_is_checked_where_it_is_asked() -> None:
+def test_timing_of_a_stopped_gantry_is_checked_where_it_is_asked() -> None:
     """Its cell stands mid-window, so a table that ends before that is refused early."""
     poses = PoseTable([0.0, 20.5], GEOMETRY.pose(np.array([0.0, 1.0])))
-    standing = scan(trajectory=poses, frame_start_s=np.array([0.0, 10.0, 20.0]), is_fly=False)
+    stopped = scan(trajectory=poses, frame_start_s=np.array([0.0, 10.0, 20.0]), is_fly=False)
     with pytest.raises(InputError, match="frame 2 needs"):
-        standing.check_timing()
-    dataclasses.replace(standing, shutter=Shutter(0.5, 0.5)).check_timing()
+        stopped.check_timing()
+    dataclasses.replace(stopped, shutter=Shutter(0.5, 0.5)).check_timing()

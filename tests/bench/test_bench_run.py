@@ -25,7 +25,7 @@ from tables import (
 from tables import rows as bench_rows
 from tables import run as bench_run
 from tables.__main__ import run
-from tables.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, standing
+from tables.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, stop_and_shoot
 from tables.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
 from tables.raw_counts import Panel, measured_attenuation
 from tables.results import read_lines
@@ -299,7 +299,7 @@ def test_a_run_that_overflows_is_noted_and_tried_again(
 def test_stop_and_shoot_stands_at_the_mid_window_poses(name: str) -> None:
     protocol, geometry = PROTOCOLS[name], ConeGeometry(5.0, 7.0, (8, 8), (0.5, 0.5))
     shutter, start_s = protocol.shutter(), protocol.frame_start_s()
-    moving, still = protocol.orbit(geometry), standing(protocol).orbit(geometry)
+    moving, still = protocol.orbit(geometry), stop_and_shoot(protocol).orbit(geometry)
     between = held_out(protocol).orbit(geometry)
     for frame in range(protocol.views):
         middle_s = np.array([start_s[frame] + shutter.span_s / 2])

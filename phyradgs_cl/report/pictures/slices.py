@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, upright
+from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, top_row_first
 from phyradgs_cl.report.pictures.preview import grey_range
 
 LONGEST_EDGE = 192  # pixels of a slice in the page
@@ -110,7 +110,7 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
 
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
     """A slice as a grey PNG, black ``low`` and white ``high``."""
-    return png_bytes(upright(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
+    return png_bytes(top_row_first(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
 
 
 def _base64(png: bytes) -> str:
