@@ -1,6 +1,6 @@
 """How close a reconstruction is to the truth."""
 
-from phyradgs_cl.metrics.balls import Ball
+from phyradgs_cl.metrics.beads import Ball
 from phyradgs_cl.metrics.bias import regional_bias
 from phyradgs_cl.metrics.compare import compare
 from phyradgs_cl.metrics.edge import edge_sharpness

@@ -10,7 +10,7 @@ from scipy.special import erfc
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import Ball, edge_sharpness, roundness
-from phyradgs_cl.metrics.balls import resolved
+from phyradgs_cl.metrics.beads import resolved
 from phyradgs_cl.metrics.edge import RISE_PER_SIGMA, ball_edge, blurred_ball
 from phyradgs_cl.metrics.roundness import ball_sections
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
