@@ -26,7 +26,7 @@ from tables import rows as bench_rows
 from tables import run as bench_run
 from tables.__main__ import run
 from tables.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, stop_and_shoot
-from tables.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
+from tables.phantom_case import BEADS, HOLDER, PhantomCase, beads_of, c_arm, phantom_in
 from tables.raw_counts import Panel, measured_attenuation
 from tables.results import read_lines
 
@@ -378,20 +378,20 @@ def test_the_phantoms_scan_is_the_papers_kind(rt: Runtime) -> None:
     assert shape["bias_balls"] == pytest.approx(0, abs=1e-6)
     assert shape["bias_holder"] == pytest.approx(0, abs=1e-6)
     assert shape["round_sections"] == 3 * shape["edge_balls"] > 0
-    assert {HOLDER, BALLS} <= set(np.unique(case._labels()))
+    assert {HOLDER, BEADS} <= set(np.unique(case._labels()))
 
 
 def test_every_ball_of_the_phantom_has_surroundings_of_its_own() -> None:
-    """The shape metrics look out to 1.75 radii: no other ball, and no end of the holder, may be there."""
+    """The shape metrics look out to 1.75 radii: no other bead, and no end of the holder, may be there."""
     _, grid = c_arm(BenchSize("T", 40, 24, 8))
     phantom = phantom_in(grid)
     holder = phantom.ellipsoids[0].attenuation_per_mm
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 500))
     directions /= np.linalg.norm(directions, axis=0)
-    for ball in balls_of(phantom):
+    for bead in beads_of(phantom):
         for share in (1.01, 1.4, 1.75):
-            points = np.array(ball.centre_mm)[:, None] + share * ball.radius_mm * directions
+            points = np.array(bead.centre_mm)[:, None] + share * bead.radius_mm * directions
             np.testing.assert_allclose(phantom.density(*points), holder)
 
 
