@@ -32,7 +32,7 @@ class SartOptions(IterativeOptions):
 
     frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
     (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
-    transmission_weights: rays count by the light that came through, W = t/(A 1) and V = 1/(Aᵀ t).
+    transmission_weights: transmission-weighted (PWLS), W = t/(A 1) and V = 1/(Aᵀ t).
     """
 
     relaxation: float = 1.0
