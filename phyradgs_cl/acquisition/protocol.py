@@ -72,7 +72,7 @@ class Protocol:
         """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan.
 
         Jitter is a smooth wander of the true gantry about constant speed, recorded by the encoder
-        (standard deviation ``jitter_deg``, one knot a frame).
+        (standard deviation ``jitter_deg``, one knot per frame).
         """
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)

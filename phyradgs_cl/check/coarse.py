@@ -14,14 +14,14 @@ from phyradgs_cl.fields import Grid
 
 _MOST_FRAMES = 60
 _LEAST_VALID = 0.5  # of a block's pixels
-_MOST_VOXELS = 64  # a side
+_MOST_VOXELS = 64  # per side
 _SMOOTH = 0.8  # of a block: standard deviation
 _KEPT_COLUMNS = 12  # of blocks, where the panel has as many
 
 
 @dataclass(frozen=True)
 class Level:
-    """How coarse: at most ``columns`` pixels along the detector's longer side, ``voxels`` a pixel at the axis."""
+    """How coarse: at most ``columns`` pixels along the detector's longer side, ``voxels`` per pixel at the axis."""
 
     columns: int
     voxels: float

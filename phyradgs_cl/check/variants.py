@@ -100,7 +100,7 @@ class Changed:
 
 
 def at_rest(scan: Scan) -> Scan:
-    """The gantry standing while it exposes."""
+    """The gantry at rest while it exposes."""
     return replace(scan, is_fly=False)
 
 

@@ -29,7 +29,7 @@ def put_together(
     reference: np.ndarray | None = None,
     lag: float = 0.0,
 ) -> Scan:
-    """A scan of line integrals, upright already; the grid is the cone's cube where none is given."""
+    """A scan of line integrals, row 0 the lowest already; the grid is the cone's cube where none is given."""
     return Scan(
         projections=integrals.values,
         geometry=geometry,

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) on the raw parameters of all Gaussians at once, with a rate a parameter row."""
+"""Adam (Kingma and Ba 2015) on the raw parameters of all Gaussians at once, with a rate per parameter row."""
 
 from __future__ import annotations
 

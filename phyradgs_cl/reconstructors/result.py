@@ -21,7 +21,7 @@ State = Mapping[str, np.ndarray]
 class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``.
 
-    gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict a report;
+    gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted.
     """

@@ -31,7 +31,7 @@ class Runtime:
 
     ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
     the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
-    ``pixel_items`` selects the launch shape: a work-item a pixel and small groups (GPUs, needs ``lanes`` 1), or a
+    ``pixel_items`` selects the launch shape: one work-item per pixel and small groups (GPUs, needs ``lanes`` 1), or a
     work-item a band of lines (CPUs). ``memory`` (bytes, or text as 2GiB) limits what its buffers hold together.
     ``ranks``: the processes that work on the same scan, each with a Runtime of its own on the device that is its turn.
     """
@@ -223,7 +223,7 @@ class Runtime:
         return {name: use.seconds for name, use in self.kernel_uses().items()}
 
     def best_rates(self) -> Rates:
-        """What the device copies and computes at best, measured now (a second); needs ``profile=True``."""
+        """What the device copies and computes at best, measured now (per second); needs ``profile=True``."""
         kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 

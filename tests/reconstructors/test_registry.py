@@ -191,7 +191,7 @@ def test_errors_about_motion_offer_what_the_method_has(method) -> None:
 def test_counts_belong_to_the_motions_that_have_them(method, key) -> None:
     models = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}, "segments": {"exact"}}
     having = models[key]
-    if method == "fdk":  # one pose a line
+    if method == "fdk":  # one pose per line
         having = set()
     for name in motions_of(method):
         changes = {"motion": name, key: 3}

@@ -15,7 +15,7 @@ from phyradgs_cl.check.frames import alike, odd_ones
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
 from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
 from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
-from phyradgs_cl.check.statistics import standing
+from phyradgs_cl.check.statistics import t_statistic
 from phyradgs_cl.check.variants import Path, path_of, reversed_rotation, shifted, stretched, turned, with_path
 from phyradgs_cl.runtime import Runtime
 
@@ -62,7 +62,7 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
     """
     everything = np.arange(scan.frames)
     if scan.frames < _FEWEST_FRAMES or _pixels(scan) < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
-        text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels a frame"
+        text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
         return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
     kept, notes = _without_odd(scan)
     unshifted, part = _best_turning(rt, some_frames(scan, kept))
@@ -179,7 +179,7 @@ def _cause(rt: Runtime, scan: Scan, stated: Fit, most: float, looks_closely: boo
     best, least = None, most
     for cause in _causes(scan, looks_closely):
         squares = fitted(rt, cause.scan())
-        if squares.sum() < least and standing(stated.squares, squares) <= -_ERRORS:
+        if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
             best, least = cause, float(squares.sum())
     return best
 

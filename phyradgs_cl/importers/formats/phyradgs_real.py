@@ -119,10 +119,10 @@ def _frames_and_views(
     if not paths or len(paths) != len(views):
         remedy = f"say {option_name('first_view')} if the JSON holds several scans"
         found = f"{len(paths)} TIFF files for {len(views)} views"
-        raise InputError(str(folder.root), found, "one frame a view", remedy)
+        raise InputError(str(folder.root), found, "one frame per view", remedy)
     frames = tiff.read_tiffs(paths)
     if len(frames) != len(views):
-        raise InputError(str(folder.root), f"{len(frames)} pages for {len(views)} views", "one page a file")
+        raise InputError(str(folder.root), f"{len(frames)} pages for {len(views)} views", "one page per file")
     return frames, views
 
 

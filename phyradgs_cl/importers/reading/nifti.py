@@ -71,7 +71,7 @@ def _layout(culprit: str, head: np.void) -> tuple[int, tuple[int, ...], np.dtype
 
 
 def _frame(head: np.void) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (3, 3), a row an axis, and the place (3,) of voxel (0, 0, 0), in RAS."""
+    """Steps (3, 3), one row per axis, and the place (3,) of voxel (0, 0, 0), in RAS."""
     if head["sform_code"] > 0:
         matrix = head["srow"].astype(np.float64)
         return matrix[:, :3].T, matrix[:, 3]

@@ -1,4 +1,4 @@
-"""Grey TIFF images, plain or deflated, one a file or many in one, of a size that the file can hold."""
+"""Grey TIFF images, plain or deflated, one per file or many in one, of a size that the file can hold."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class Voxels:
     note: str = ""
 
 
-def upright(culprit: str, stored: Voxels) -> LoadedVolume:
+def along_world_axes(culprit: str, stored: Voxels) -> LoadedVolume:
     """The volume (z, y, x) float32 along rising world axes, and its grid; bare integers as shares of their type's maximum.
 
     Raises:

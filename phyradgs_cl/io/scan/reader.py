@@ -133,7 +133,7 @@ def _trajectory_word(scan: Scan) -> str:
         return "pose table"
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, EncoderTable):
         return "encoder table"
-    return "constant speed in each frame" if scan.is_fly else "one angle a frame"
+    return "constant speed in each frame" if scan.is_fly else "one angle per frame"
 
 
 def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:

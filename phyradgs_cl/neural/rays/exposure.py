@@ -46,7 +46,7 @@ class ExposureRays:
 
     @property
     def times(self) -> int:
-        """K, how many times a line has."""
+        """K, how many times per line has."""
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from phyradgs_cl.fields import triple
 from phyradgs_cl.operators.bricks import Brick, cut, whole
-from phyradgs_cl.operators.rays.launches import RayLayout, owner_steps
+from phyradgs_cl.operators.rays.launches import owner_steps
+from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import DeviceArray, Runtime
 

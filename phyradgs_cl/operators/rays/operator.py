@@ -12,7 +12,8 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import averaged, layered
-from phyradgs_cl.operators.rays.launches import RayCells, RayLayout, launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.upright import launch_upright, upright_block
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks

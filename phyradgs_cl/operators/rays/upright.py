@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.launches import BORDER, RayCells, RayLayout, ray_constants
+from phyradgs_cl.operators.rays.layout import BORDER, RayCells, RayLayout, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 

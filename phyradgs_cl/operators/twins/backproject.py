@@ -22,7 +22,7 @@ def backprojection(frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, gri
 def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
 ) -> np.ndarray:
-    """The same with one pose a line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
+    """The same with one pose per line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
     power = 2 if axis == "columns" else 1
     if axis == "columns":
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)

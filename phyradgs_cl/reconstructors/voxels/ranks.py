@@ -1,7 +1,7 @@
-"""The frames of a scan's operator shared out over ranks: each projects its own; frames are joined, volumes summed.
+"""The frames of a scan's operator shared out over ranks: each projects its own; frames are gathered, volumes summed.
 
 Volumes and frames are whole on every rank, so that the methods around an operator need not know of the others: they do the
-same everywhere. Sums of volumes do not depend on their order, but on how many frames a rank adds up by itself.
+same everywhere. Sums of volumes do not depend on their order, but on how many frames per rank adds up by itself.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class SharedOperator:
 
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
-        return self._joined(None if self._part is None else self._part.forward(volume))
+        return self._gathered(None if self._part is None else self._part.forward(volume))
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
         """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
@@ -43,9 +43,9 @@ class SharedOperator:
         """The same of some of the frames, in this order, shared out anew."""
         return type(self)(self.ranks, self.whole.subset(frames))
 
-    def _joined(self, part: np.ndarray | None) -> np.ndarray:
+    def _gathered(self, part: np.ndarray | None) -> np.ndarray:
         none = np.zeros((0, *self.frames_shape[1:]), np.float32)
-        return self.ranks.join(none if part is None else part)
+        return self.ranks.allgather(none if part is None else part)
 
 
 class Intensity(Interface):
@@ -70,4 +70,4 @@ class SharedIntensity(SharedOperator):
 
     def expected(self, volume: np.ndarray) -> np.ndarray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
-        return self._joined(None if self._part is None else self._part.expected(volume))
+        return self._gathered(None if self._part is None else self._part.expected(volume))
