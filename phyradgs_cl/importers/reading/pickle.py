@@ -1,8 +1,7 @@
 """Pickles without trust: the standard library's unpickler, with an allow-list in place of whatever a file names.
 
 What a name of the list stands for is a function of this module, not NumPy's: none of them allocates by a number in the
-file or takes a state that it does not check. The unpickler is the one written in Python, because the one in C hashes keys
-before anyone can look at them: integers that share one hash, or tuples of tuples, keep it for hours.
+file or takes a state that it does not check.
 """
 
 from __future__ import annotations
@@ -19,112 +18,49 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import check_room
-from phyradgs_cl.importers.reading.folder import regular_file
+from phyradgs_cl.io.memory import at_most
+from phyradgs_cl.io.regular import read_regular, regular_file
 
-_MOST_OPCODES = 1_000_000  # two seconds
-_MOST_COPIES, _FREE_BYTES = 4, 1 << 20  # of the file's size: one text may be made an array again and again
 _BESIDE = 3  # arrays and line integrals, for every byte of the file
-_LARGEST_KEY = 1 << 60  # smaller integers are their own hashes
-_REFUSED = ("INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "EMPTY_SET", "FROZENSET")
 _LATIN1 = ("latin1", "latin-1")
 
 
 def read_pickle(path: Path) -> object:
     """What a pickle file holds: dicts, lists, tuples, text, numbers, NumPy arrays. InputError for anything else."""
     culprit = str(path)
-    check_room(culprit, _BESIDE * regular_file(path, culprit).stat().st_size)
+    size = regular_file(path, culprit).st_size
+    check_room(culprit, _BESIDE * size)
+    data = read_regular(path, culprit, size, "a pickle")
     try:
-        return PlainUnpickler(culprit, path.read_bytes()).load()
+        with at_most(_BESIDE * size):
+            return PlainUnpickler(culprit, data).load()
     except InputError:
         raise
-    except OSError as error:
-        raise InputError(culprit, error.strerror or str(error), "a readable file") from error
     except Exception as error:  # a stranger's opcodes in any order: every failure is the file's
         found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
         raise InputError(culprit, found, "a pickle of plain containers and NumPy arrays") from error
 
 
-class PlainUnpickler(pickle._Unpickler):
+class PlainUnpickler(pickle.Unpickler):
     """Plain containers, and arrays of real numbers, of the pickle ``data``; ``culprit`` is how errors name it."""
 
     def __init__(self, culprit: str, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")  # Python 2 wrote an array's bytes as text
         self._culprit = culprit
-        self._bytes_left = _MOST_COPIES * len(data) + _FREE_BYTES
-        self._names = {
-            ("numpy", "ndarray"): object(),  # named in the arguments of _reconstruct, never called
-            ("numpy", "dtype"): _Allowed(_Dtype),
-            ("numpy.core.multiarray", "_reconstruct"): _Allowed(lambda *_: _Array(self._spend)),
-            ("numpy.core.multiarray", "scalar"): _Allowed(lambda dtype, raw: self._array(raw, dtype, ()).item()),
-            ("numpy.core.numeric", "_frombuffer"): _Allowed(self._array),
-            ("_codecs", "encode"): _Allowed(self._encoded),
-        }
-        self.dispatch = _Opcodes(pickle._Unpickler.dispatch)
-        self.dispatch[pickle.EMPTY_DICT[0]] = lambda machine: machine.append(_Table())
-        self.dispatch[pickle.DICT[0]] = _load_table
-        for name in _REFUSED:
-            self.dispatch[getattr(pickle, name)[0]] = lambda machine, n=name: machine.refuse(f"the opcode {n}")
 
     def find_class(self, module: str, name: str) -> object:
         """What a name of the list stands for; NumPy 2 calls its core by another name."""
         known = module.replace("numpy._core.", "numpy.core."), name
-        if known not in self._names:
-            self.refuse(f"a call of {module[:60]}.{name[:60]}")
-        return self._names[known]
+        if known not in _NAMES:
+            self._refuse(f"a call of {module[:60]}.{name[:60]}")
+        return _NAMES[known]
 
     def persistent_load(self, pid: object) -> NoReturn:
         """An object that lies elsewhere."""
-        self.refuse("a persistent object")
+        self._refuse("a persistent object")
 
-    def refuse(self, found: str) -> NoReturn:
-        """Raises InputError for what no plain file holds."""
+    def _refuse(self, found: str) -> NoReturn:
         raise InputError(self._culprit, found, "plain containers and NumPy arrays", "nothing was executed")
-
-    def _spend(self, count: int) -> None:
-        self._bytes_left -= count
-        if self._bytes_left < 0:
-            raise ValueError("more bytes than the file holds")
-
-    def _array(self, raw: object, dtype: object, shape: object, order: object = "C") -> np.ndarray:
-        made = _Array(self._spend)
-        made.__setstate__((1, shape, dtype, order == "F", raw))
-        return made
-
-    def _encoded(self, text: object, encoding: object) -> bytes:
-        if not isinstance(text, str) or encoding not in _LATIN1:
-            raise ValueError("an encoding that is not latin1")
-        self._spend(len(text))
-        return text.encode("latin1")
-
-
-class _Opcodes(dict[int, Callable[..., None]]):
-    """What each opcode does, for as many of them as an import may take."""
-
-    left = _MOST_OPCODES
-
-    def __getitem__(self, code: int) -> Callable[..., None]:
-        self.left -= 1
-        if self.left < 0:
-            raise ValueError(f"more than {_MOST_OPCODES} opcodes, where arrays belong")
-        return super().__getitem__(code)
-
-
-class _Table(dict[object, object]):
-    """A dict whose keys are quick to hash, and hard to give one hash."""
-
-    __slots__ = ()
-
-    def __setitem__(self, key: object, value: object) -> None:
-        if not (isinstance(key, (str, bytes)) or (isinstance(key, int) and abs(key) < _LARGEST_KEY)):
-            raise ValueError("a key that is neither text nor a small integer")
-        super().__setitem__(key, value)
-
-
-def _load_table(machine: PlainUnpickler) -> None:
-    items, table = machine.pop_mark(), _Table()
-    for key, value in zip(items[::2], items[1::2], strict=True):
-        table[key] = value
-    machine.append(table)
 
 
 class _Allowed:
@@ -162,10 +98,8 @@ class _Dtype:
 class _Array(np.ndarray):
     """An array that is filled by its state, with exactly as many bytes as its shape needs."""
 
-    def __new__(cls, spend: Callable[[int], None]) -> _Array:
-        made = super().__new__(cls, (0,), np.uint8)
-        made._spend = spend
-        return made
+    def __new__(cls) -> _Array:
+        return super().__new__(cls, (0,), np.uint8)
 
     def __setstate__(self, state: object) -> None:
         if not isinstance(state, tuple) or len(state) != 5:
@@ -179,5 +113,26 @@ class _Array(np.ndarray):
             raise ValueError("an array with an impossible shape")
         if math.prod(shape) * dtype.dtype.itemsize != len(raw):
             raise ValueError(f"an array of shape {shape} in {len(raw)} bytes")
-        self._spend(len(raw))
         super().__setstate__((1, shape, dtype.dtype, fortran is True or fortran == 1, bytes(raw)))
+
+
+def _array(raw: object, dtype: object, shape: object, order: object = "C") -> _Array:
+    made = _Array()
+    made.__setstate__((1, shape, dtype, order == "F", raw))
+    return made
+
+
+def _encoded(text: object, encoding: object) -> bytes:
+    if not isinstance(text, str) or encoding not in _LATIN1:
+        raise ValueError("an encoding that is not latin1")
+    return text.encode("latin1")
+
+
+_NAMES = {
+    ("numpy", "ndarray"): object(),  # named in the arguments of _reconstruct, never called
+    ("numpy", "dtype"): _Allowed(_Dtype),
+    ("numpy.core.multiarray", "_reconstruct"): _Allowed(lambda *_: _Array()),
+    ("numpy.core.multiarray", "scalar"): _Allowed(lambda dtype, raw: _array(raw, dtype, ()).item()),
+    ("numpy.core.numeric", "_frombuffer"): _Allowed(_array),
+    ("_codecs", "encode"): _Allowed(_encoded),
+}
