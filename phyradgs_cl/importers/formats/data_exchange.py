@@ -12,7 +12,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, option_name
 from phyradgs_cl.importers.reading.frames import line_integrals, upright
 from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
 from phyradgs_cl.importers.scan_parts import checked, needed, put_together
@@ -21,11 +21,6 @@ from phyradgs_cl.io.hdf5.datasets import read_array, read_word
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import ANGLE, TIME
 
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
-)
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
 _DETECTOR = f"{_INSTRUMENT}/detector"
@@ -33,7 +28,7 @@ _DETECTOR = f"{_INSTRUMENT}/detector"
 
 def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
     """The projections of /exchange, with its flats and darks."""
-    options.refuse_unused("data-exchange", OPTIONS)
+    options.refuse_unused("data-exchange", OF_BARE_FRAMES)
     with opened(path) as source:
         frames = read_frames(source, f"{_EXCHANGE}/data")
         panel = (frames.shape[1], frames.shape[2])

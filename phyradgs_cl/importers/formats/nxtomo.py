@@ -17,8 +17,8 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned
-from phyradgs_cl.importers.options import ImportOptions, option_name
-from phyradgs_cl.importers.reading.frames import line_integrals, united, upright
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, option_name
+from phyradgs_cl.importers.reading.frames import line_integrals, upright
 from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
 from phyradgs_cl.importers.scan_parts import checked, needed, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
@@ -34,19 +34,15 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.header import find_entry
+from phyradgs_cl.io.scan.reader import united
 
 _log = logging.getLogger(__name__)
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
-)
 _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     """The projections of the file's NXtomo entry, with its flats and darks."""
-    options.refuse_unused("nxtomo", OPTIONS)
+    options.refuse_unused("nxtomo", OF_BARE_FRAMES)
     with opened(path) as source:
         entry = find_entry(source)
         _refuse_ours(source, entry)

@@ -26,12 +26,7 @@ from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io.tables import Fields
 
 OPTIONS = (
-    "exposure_s",
-    "readout_direction",
-    "pixel_size_mm",
-    "quantity",
-    "flat_value",
-    "detector_model",
+    *("exposure_s", "readout_direction", "pixel_size_mm", "quantity", "flat_value", "detector_model"),
     "first_view",
 )
 PROJECTIONS = "projections"
@@ -72,7 +67,7 @@ class Circle:
 def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     """A folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON itself."""
     options.refuse_unused("phyradgs-real", OPTIONS)
-    description = path if path.is_file() else geometry_file(SafeFolder(path))
+    description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
     meta = Fields(f"{description}:", read_json(description))
     frames, views = _frames_and_views(description, list(meta.tables("views")), options)
     panel = (frames.shape[1], frames.shape[2])
@@ -93,16 +88,6 @@ def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     plain = plain_geometry(poses[:, 0], panel)
     title = path.resolve().stem
     return put_together(integrals, trajectory, plain, timing, options, title=title, source=str(path))
-
-
-def geometry_file(folder: SafeFolder) -> Path:
-    """The folder's only JSON file."""
-    found = folder.matching(".json")
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found[:5]) or "none"
-        remedy = "name the file itself"
-        raise InputError(str(folder.root), f"JSON files: {names}", "one that describes the views", remedy)
-    return found[0]
 
 
 def _frames_and_views(

@@ -9,8 +9,9 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import read_raw
-from phyradgs_cl.importers.reading.folder import SafeFolder, regular_file
+from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.voxels import Voxels
+from phyradgs_cl.io.regular import regular_file
 
 SUFFIXES = (".mha", ".mhd")
 _MOST_HEADER_BYTES = 1 << 16

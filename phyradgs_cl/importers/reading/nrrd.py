@@ -9,9 +9,9 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import read_raw
-from phyradgs_cl.importers.reading.folder import regular_file
 from phyradgs_cl.importers.reading.voxels import RAS, Voxels
 from phyradgs_cl.io.hdf5.units import LENGTH
+from phyradgs_cl.io.regular import regular_file
 
 _MOST_HEADER_BYTES = 1 << 16
 _NAMES = {
