@@ -111,3 +111,10 @@ _OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offse
 def option_name(field: str) -> str:
     """How the command line calls a field of ImportOptions."""
     return _OPTIONS.get(field, "--" + field.replace("_", "-"))
+
+
+def needed(value: float | None, option: str, culprit: str) -> float:
+    """A length that the file does not carry, from the options, or an InputError that asks for it."""
+    if value is None:
+        raise InputError(culprit, "nothing", "a length in mm", f"say {option_name(option)}")
+    return value

@@ -17,18 +17,24 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, option_name
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed, option_name
 from phyradgs_cl.importers.reading.frames import line_integrals, upright
-from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
-from phyradgs_cl.importers.scan_parts import checked, needed, put_together
+from phyradgs_cl.importers.reading.hdf5_frames import (
+    distance_to_detector,
+    gantry_sign,
+    opened,
+    read_frames,
+    stored_pitch,
+)
+from phyradgs_cl.importers.scan_parts import checked, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import (
     read_array,
     read_attribute,
     read_integers,
     read_number,
+    read_title,
     read_values,
-    read_word,
 )
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
@@ -56,7 +62,7 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         timing, trajectory = _motion(source, entry, used, geometry, options)
         quantity = read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, used)
-        title = _title(source, entry, path)
+        title = read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
         _log.warning(text, path, option_name("row_0"))
@@ -132,22 +138,10 @@ def _geometry(
     if to_axis is None and source.find(where) is not None:
         to_axis = abs(read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
-    to_detector = options.source_to_detector_mm
-    if to_detector is None:
-        behind = optional_length(source, f"{detector}/distance")
-        to_detector = None if behind is None else to_axis + behind
-    to_detector = needed(to_detector, "source_to_detector_mm", source.name(f"{detector}/distance"))
-    pitch = options.pixel_size_mm or tuple(_pitch(source, detector, axis) for axis in "yx")
+    to_detector = distance_to_detector(source, f"{detector}/distance", to_axis, options)
+    pitch = options.pixel_size_mm or tuple(stored_pitch(source, f"{detector}/{axis}_pixel_size") for axis in "yx")
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
-
-
-def _pitch(source: Hdf5Source, detector: str, axis: str) -> float:
-    size = optional_length(source, f"{detector}/{axis}_pixel_size")
-    if size is None:
-        remedy = f"say {option_name('pixel_size_mm')} V,U"
-        raise InputError(source.name(f"{detector}/{axis}_pixel_size"), "nothing", "a length", remedy)
-    return size
 
 
 def _axis_offset(
@@ -215,8 +209,3 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
         if np.ptp(values) > 0:
             found = f"{values.min():.6g} to {values.max():.6g} mm"
             raise InputError(source.name(address), found, "a sample that stays where it is")
-
-
-def _title(source: Hdf5Source, entry: str, path: Path) -> str:
-    address = f"{entry}/title"
-    return (read_word(source, address) if source.find(address) is not None else "") or path.stem

@@ -114,6 +114,11 @@ def read_word(
     return word
 
 
+def read_title(source: Hdf5Source, address: str, default: str) -> str:
+    """A string that may be missing or empty."""
+    return (read_word(source, address) if source.find(address) is not None else "") or default
+
+
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
     """Finite values (any shape) in the package's unit; InputError for some beyond all reason."""
     values = values * unit_factor(source, address, quantity)

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_word
+from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.facts import read_facts
 from phyradgs_cl.io.hdf5.grid import default_grid, read_grid
 from phyradgs_cl.io.hdf5.source import Hdf5Source
@@ -88,7 +88,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         grid=grid,
         is_fly=is_fly,
         detector_model=_read_model(source, entry),
-        title=_optional_word(source, f"{entry}/title", "cone-beam scan"),
+        title=read_title(source, f"{entry}/title", "cone-beam scan"),
         provenance=_read_provenance(source, entry),
         lag=_read_lag(source, entry),
         saturation=_read_saturation(source, entry),
@@ -164,10 +164,6 @@ def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
     if source.optional(address, KNOWN) is None:
         return {}
     return read_facts(source.name(address), read_word(source, address), {})
-
-
-def _optional_word(source: Hdf5Source, address: str, default: str) -> str:
-    return (read_word(source, address) if source.find(address) is not None else "") or default
 
 
 def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
