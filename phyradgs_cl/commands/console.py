@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -31,6 +31,12 @@ def complain(text: str, status: int = 2) -> int:
     with suppress(OSError):  # nobody is left to be told
         typer.echo("phyradgs: " + plain_text(" ".join(text.split())), err=True)
     return status
+
+
+def scores(metrics: Mapping[str, float | None]) -> str:
+    """PSNR and SSIM where there are any, with a comma before."""
+    psnr_db, ssim = metrics.get("psnr_db"), metrics.get("ssim")
+    return "" if psnr_db is None else f", PSNR {psnr_db:.2f} dB, SSIM {ssim:.4f}"
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:

@@ -6,10 +6,9 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.options import AsJson
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"
@@ -21,7 +20,7 @@ def evaluate_command(
         Path,
         file_option("--reference", help="Scan with a known truth, or a volume; VOLUME is resampled onto its grid (linear)."),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
     picture: Annotated[
         Path | None,
         file_option(
