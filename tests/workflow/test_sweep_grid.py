@@ -121,10 +121,10 @@ def test_a_product_beyond_all_measure_is_refused(read) -> None:
         read(GRID + f'[[grid]]\nmethod = "sirt"\niterations = [{values}]\nrelaxation = [{values}]\n')
 
 
-def test_patterns_are_bounded_and_meet_regular_files_only(read, tmp_path) -> None:
-    """All files of a machine have no end; a pipe is waited for."""
-    for pattern in ("/**/*", "/**/*.h5", "/*/*/*/*/*"):
-        with pytest.raises(InputError, match="covers too many files|found a file that|not HDF5|empty"):
+def test_patterns_meet_regular_files_only(read, tmp_path) -> None:
+    """A pipe would be waited for."""
+    for pattern in ("", "/", "**.x", "none/*.h5", "/none/*.h5"):
+        with pytest.raises(InputError, match="no file for"):
             read(f'scans = ["{pattern}"]\n[[runs]]\n')
     (tmp_path / "below/deep").mkdir(parents=True)
     (tmp_path / "below/loop").symlink_to(tmp_path)

@@ -19,7 +19,6 @@ from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, met
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
-from phyradgs_cl.workflow.sweep.patterns import Search
 
 MOST_RUNS = 100_000
 _LARGEST_SEED = 2**63
@@ -119,14 +118,25 @@ def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
         expected = 'a list of file names or patterns, as scans = ["scans/*.h5"]'
         raise InputError(f"{path}: scans", checks.shown(patterns), expected)
     found: dict[Path, None] = {}
-    search, start = Search(f"{path}: scans"), path.resolve().parent
+    start = path.resolve().parent
     for pattern in patterns:
-        names = search.files(plain_text(pattern), start)
+        names = _matching(plain_text(pattern), start)
         if not names:
             remedy = f"patterns start at the folder of the file, {start}"
             raise InputError(f"{path}: scans", f"no file for {pattern!r}", "at least one scan file", remedy)
         found.update((Path(os.path.abspath(name)), None) for name in names)
     return tuple(found)
+
+
+def _matching(pattern: str, start: Path) -> list[Path]:
+    """The regular files that match, but for hidden ones; a name without wildcards stands for itself, whatever is there."""
+    anchor, is_name = Path(pattern).anchor, not set("*?[") & set(pattern)
+    root = Path(anchor) if anchor else start
+    try:
+        found = sorted(root.glob(pattern.removeprefix(anchor)))
+    except ValueError:  # no pattern
+        return []
+    return [path for path in found if is_name or (path.is_file() and not path.name.startswith("."))]
 
 
 def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
