@@ -149,7 +149,9 @@ def device_wish(value: object, culprit: str = "--device") -> str | None:
     return value
 
 
-def pair_parser(option: str, form: str, example: str, largest: float = math.inf) -> Callable[[str], tuple[float, float]]:
+def pair_parser(
+    option: str, form: str, example: str, largest: float = math.inf
+) -> Callable[[str], tuple[float, float]]:
     """Reads two finite numbers with a comma between, ``form``, in size at most ``largest``."""
 
     def pair(text: str) -> tuple[float, float]:

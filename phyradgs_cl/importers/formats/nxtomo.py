@@ -11,7 +11,6 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
@@ -39,6 +38,7 @@ from phyradgs_cl.io.hdf5.datasets import (
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.header import find_entry
 from phyradgs_cl.io.scan.reader import united
 
@@ -171,8 +171,8 @@ def _motion(
     starts = f"{detector}/frame_start_time"
     start_s = read_array(source, starts, used.shape, TIME)[used] if sweeps else None
     stored = StoredTiming(
-        exposure_s=_duration(source, f"{detector}/count_time", used),
-        readout_s=_duration(source, f"{detector}/detector_readout_time", used),
+        exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
+        readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
         start_s=start_s,
     )
     timing = make_timing(source.name(entry), int(used.sum()), options, stored)
@@ -182,20 +182,6 @@ def _motion(
     return timing, CircularOrbit(
         geometry, FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
     )
-
-
-def _duration(source: Hdf5Source, address: str, used: np.ndarray) -> float | None:
-    """One time in s, stored once or equal for all projections."""
-    if not isinstance(source.find(address), h5py.Dataset):
-        return None
-    dataset = source.dataset(address)
-    if dataset.size == 1:
-        return read_number(source, address, TIME)
-    values = read_array(source, address, used.shape, TIME)[used]
-    if np.ptp(values) > 1e-6 * np.abs(values).max():
-        found = f"{values.min():.6g} to {values.max():.6g} s"
-        raise InputError(source.name(address), found, "one time for all projections")
-    return float(values[0])
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:

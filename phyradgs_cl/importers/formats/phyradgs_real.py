@@ -15,7 +15,11 @@ import numpy as np
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
-from phyradgs_cl.importers.formats.phyradgs_synthetic import readout_ratio, start_times_s
+from phyradgs_cl.importers.formats.phyradgs_synthetic import (
+    exposure_of_blurred_s,
+    readout_ratio,
+    start_times_s,
+)
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_json
@@ -130,9 +134,7 @@ def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
 
 def _timing(culprit: str, detector: Circle, options: ImportOptions) -> Timing:
     """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
-    exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
-    if exposure_s <= 0:
-        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+    exposure_s = exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = readout_ratio(culprit, closed - first, done - closed)
     shutter = Shutter(exposure_s, ratio * exposure_s)

@@ -11,10 +11,11 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
-from phyradgs_cl.io.regular import read_regular, regular_file
+from phyradgs_cl.io.regular import open_regular, read_regular, regular_file
 from phyradgs_cl.io.tables import LARGEST
 
 MOST_TEXT_BYTES = 64 << 20
+_MOST_HEADER_BYTES = 1 << 16
 MOST_INFLATION = 1040  # deflate cannot do more than 1032
 
 
@@ -30,6 +31,12 @@ def check_room(culprit: str, needed_bytes: int) -> None:
 def read_bytes(path: Path) -> bytes:
     """A whole file, of a description's size at most."""
     return read_regular(path, str(path), MOST_TEXT_BYTES, "a description of a scan")
+
+
+def read_head(path: Path) -> bytes:
+    """As much of a file as a text header takes."""
+    with open_regular(path, str(path)) as (file, _):
+        return file.read(_MOST_HEADER_BYTES)
 
 
 def read_json(path: Path) -> dict[str, object]:
