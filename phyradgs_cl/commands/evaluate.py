@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_argument, file_option
-from phyradgs_cl.commands.options import AsJson
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_argument
-from phyradgs_cl.commands.options import AsJson
 from phyradgs_cl.workflow import summary
 
 EXAMPLE = "Example: phyradgs info scan.h5"

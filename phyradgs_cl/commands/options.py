@@ -21,7 +21,6 @@ Axis = Literal[AXES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 
 Scan = Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Device = Annotated[
     str | None,
     typer.Option(
