@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,6 +64,14 @@ def shape(culprit: str, array: ArrayLike, expected: Sequence[int | None]) -> Non
     if not fits:
         wanted = ", ".join("any" if e is None else str(e) for e in expected)
         raise InputError(culprit, f"shape {found}", f"shape ({wanted})")
+
+
+def package(name: str, use: str, install: str) -> ModuleType:
+    """The imported package, or an InputError that says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(name, "not installed", use, f"pip install '{install}'") from error
 
 
 def shown(value: object) -> str:

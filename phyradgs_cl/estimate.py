@@ -19,6 +19,7 @@ from typing import Any
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.io import sha256_of, write_volume
+from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import METHODS, InputOptions, Reconstruction, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
@@ -227,10 +228,8 @@ def peak_host_bytes() -> int:
 
     In Linux the system's call would also tell that of the process which started this one.
     """
-    with suppress(OSError, ValueError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
+    if held := in_use_bytes("VmHWM:"):
+        return held
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return largest if sys.platform == "darwin" else 1024 * largest
 

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -24,7 +24,6 @@ else:
     import tomli as tomllib
 
 LARGEST_SEED = 2**63
-LARGEST_OFFSET_MM = 1e6
 
 
 @dataclass(frozen=True)
@@ -150,17 +149,21 @@ def device_wish(value: object, culprit: str = "--device") -> str | None:
     return value
 
 
-def offset_pair(option: str, text: str | None) -> tuple[float, float] | None:
-    """Two lengths "V,U" in mm."""
-    if text is None:
-        return None
-    try:
-        v_mm, u_mm = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(option, repr(text), "two numbers V,U in mm", "write for example 0,12.5") from None
-    if not all(math.isfinite(x) and abs(x) <= LARGEST_OFFSET_MM for x in (v_mm, u_mm)):
-        raise InputError(option, repr(text), f"two lengths of at most {LARGEST_OFFSET_MM:g} mm")
-    return v_mm, u_mm
+def pair_parser(
+    option: str, form: str, example: str, largest: float = math.inf
+) -> Callable[[str], tuple[float, float]]:
+    """Reads two finite numbers with a comma between, ``form``, in size at most ``largest``."""
+
+    def pair(text: str) -> tuple[float, float]:
+        try:
+            first, second = (float(part) for part in text.split(","))
+        except ValueError:
+            raise InputError(option, repr(text), f"two numbers {form}", f"write for example {example}") from None
+        if not all(math.isfinite(x) and abs(x) <= largest for x in (first, second)):
+            raise InputError(option, repr(text), f"two numbers {form}, of at most {largest:g}")
+        return first, second
+
+    return pair
 
 
 def numbers(text: str) -> float | list[float] | str:
@@ -170,18 +173,6 @@ def numbers(text: str) -> float | list[float] | str:
     except ValueError:
         return text
     return found if len(found) > 1 else found[0]
-
-
-def pulse_pair(option: str, text: str | None) -> tuple[float, float] | None:
-    """When the beam is on, "START,LENGTH" in shares of the exposure; the protocol checks that a frame sees it."""
-    if text is None:
-        return None
-    try:
-        start, length = (float(part) for part in text.split(","))
-    except ValueError:
-        expected = "two numbers START,LENGTH in shares of the exposure"
-        raise InputError(option, repr(text), expected, "write for example 0.86,0.14") from None
-    return start, length
 
 
 def _word(settings: dict[str, Any], key: str, origins: Mapping[str, str]) -> str | None:

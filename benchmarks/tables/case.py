@@ -11,9 +11,10 @@ import numpy as np
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.acquisition.cells import static_cells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics import compare, compare_projections
+from phyradgs_cl.metrics import compare
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import FrameSource, Scene, SimulationOptions, VolumeSource, simulate
+from tables.metrics import compare_projections
 
 FLY, STILL = "fly-scan", "stop-and-shoot"
 Images = list[np.ndarray]

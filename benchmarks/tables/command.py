@@ -103,7 +103,7 @@ def bench_command(
     iterations: Annotated[
         int | None, typer.Option(help="Iterations of the splatting methods.", show_default="the size's")
     ] = None,
-    readout: Annotated[Axis, typer.Option(help="What is read out at one time.")] = Axis.rows,
+    readout: Annotated[Axis, typer.Option(help="What is read out at one time.")] = "rows",
     table_only: Annotated[
         bool,
         typer.Option(
@@ -127,7 +127,7 @@ def bench_command(
         listed("--rows", rows),
         (0,) if chosen_seeds is None else chosen_seeds,
         iterations,
-        readout.value,
+        readout,
     )
     wish = device_wish(device)
     pool = None

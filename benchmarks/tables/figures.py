@@ -13,9 +13,9 @@ import numpy as np
 
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import written_beside
-from phyradgs_cl.metrics import panels_png
 from tables.case import FLY, Images
 from tables.job import BenchJob
+from tables.metrics import panels_png
 from tables.results import Line, key_of
 from tables.summary import lines_of
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.detector import attenuation_to_counts, counts_to_attenuation, sample_counts
+from phyradgs_cl.detector import counts_to_attenuation, sample_counts
 
 CALIBRATION_FRAMES = 10
 _FULL_SCALE = 65_535
@@ -43,7 +43,7 @@ def measured_attenuation(
     frames, rows, columns = line_integrals.shape
     gain = _open_beam(panel, rows, columns, rng)
     flats = np.broadcast_to(gain, (CALIBRATION_FRAMES, rows, columns))
-    light = [attenuation_to_counts(line_integrals, gain), flats, np.zeros_like(flats)]
+    light = [gain * np.exp(-line_integrals.astype(np.float64)), flats, np.zeros_like(flats)]
     counts = np.concatenate([_digitised(part, panel, rng) for part in light])
     image_key = np.repeat([0, 1, 2], [frames, CALIBRATION_FRAMES, CALIBRATION_FRAMES])
     return counts_to_attenuation(counts, image_key, "counts")

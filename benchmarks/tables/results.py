@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl.io import json_lines
-from phyradgs_cl.io.hdf5.facts import FINITE, SCALAR, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
+from phyradgs_cl.io.hdf5.facts import FINITE, SECONDS, TABLE, TEXT, WHOLE, Kind, Schema, damage
 from phyradgs_cl.io.json_lines import Line, append_line, refuse_irregular
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]
@@ -31,7 +31,7 @@ KEY = (
 _TIMES = ("seconds", "processor_s")
 # What is read of every line, and what tables read of one with numbers besides.
 _KINDS: Schema = {
-    **dict.fromkeys(KEY, SCALAR),
+    **dict.fromkeys(KEY, Kind("a text or a number", lambda value: not isinstance(value, list | dict))),
     **dict.fromkeys(_TIMES, SECONDS),
     **dict.fromkeys(("label", "method", "error"), TEXT),
     "metrics": FINITE,

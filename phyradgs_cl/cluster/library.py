@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import logging
 from types import ModuleType
 
-from phyradgs_cl.errors import InputError
+from phyradgs_cl import checks
 
 
 def has_dask() -> bool:
@@ -17,14 +16,8 @@ def has_dask() -> bool:
 
 def distributed() -> ModuleType:
     """The package, or an InputError that says how to install it."""
-    try:
-        package = importlib.import_module("distributed")
-    except ImportError as error:
-        remedy = "pip install 'phyradgs-cl[cluster]'"
-        found = "not installed"
-        raise InputError(
-            "dask.distributed", found, "the package that --scheduler and --workers need", remedy
-        ) from error
+    use = "the package that --scheduler and --workers need"
+    package = checks.package("distributed", use, "phyradgs-cl[cluster]")
     for name in list(logging.root.manager.loggerDict):
         if name == "distributed" or name.startswith("distributed."):
             logging.getLogger(name).setLevel(logging.CRITICAL)

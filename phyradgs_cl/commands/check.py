@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl.check import SUSPICIOUS, CheckResult, CountReader, check
-from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.files import file_argument, file_option
-from phyradgs_cl.commands.options import Device
+from phyradgs_cl.commands.console import AsJson, say
+from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, read_scan
 from phyradgs_cl.io.scan.copy import copy_with_offset
@@ -27,8 +27,8 @@ SUSPICIOUS_STATUS = 10
 
 
 def check_command(
-    scan: Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    scan: Scan,
+    as_json: AsJson = False,
     fix_offset: Annotated[
         bool,
         typer.Option(

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.text import plain_text
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def say(text: str) -> None:
@@ -31,6 +33,12 @@ def complain(text: str, status: int = 2) -> int:
     with suppress(OSError):  # nobody is left to be told
         typer.echo("phyradgs: " + plain_text(" ".join(text.split())), err=True)
     return status
+
+
+def scores(metrics: Mapping[str, float | None]) -> str:
+    """PSNR and SSIM where there are any, with a comma before."""
+    psnr_db, ssim = metrics.get("psnr_db"), metrics.get("ssim")
+    return "" if psnr_db is None else f", PSNR {psnr_db:.2f} dB, SSIM {ssim:.4f}"
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.files import file_argument
+from phyradgs_cl.commands.options import Scan
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
 from phyradgs_cl.reconstructors import Reconstruction, method_options
@@ -18,7 +15,7 @@ EXAMPLE = "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row
 
 @with_run_options("seed")
 def estimate_command(
-    scan: Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")],
+    scan: Scan,
     request: RunRequest,
 ) -> None:
     """Say how long a reconstruction would take and how much memory, from a few iterations of it."""

@@ -6,9 +6,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.workflow import run_evaluation
 
@@ -21,7 +19,7 @@ def evaluate_command(
         Path,
         file_option("--reference", help="Scan with a known truth, or a volume; VOLUME is resampled onto its grid (linear)."),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
     picture: Annotated[
         Path | None,
         file_option(

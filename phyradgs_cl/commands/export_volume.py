@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -15,7 +14,6 @@ from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting
 
 EXAMPLE = "Example: phyradgs export volume.h5 -o volume.nii --mu-water-per-mm 0.0195"
-Export = Enum("Export", {name: name for name in EXPORTS}, type=str)  # type: ignore[misc]
 
 
 def export_command(
@@ -30,7 +28,7 @@ def export_command(
         ),
     ] = None,
     to: Annotated[
-        Export | None,
+        Literal[EXPORTS] | None,  # type: ignore[valid-type]
         typer.Option(
             "--to",
             help="nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians.",
@@ -45,7 +43,7 @@ def export_command(
     ] = None,
 ) -> None:
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
-    form = format_of(output) if to is None else str(to.value)
+    form = to or format_of(output)
     with finish_despite_interrupt(), expecting(volume, "volume"):
         written = export_volume(volume, form, output, mu_water_per_mm)
     unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from enum import Enum
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
 
 from phyradgs_cl.commands.console import remark, say
 from phyradgs_cl.commands.files import file_argument, file_option
-from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, VoxelMm
+from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, VoxelMm, lengths
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
-from phyradgs_cl.settings import offset_pair
 
 EXAMPLE = (
     "Example: phyradgs import chest_50.pickle -o scan.h5\n\n"
@@ -27,14 +26,12 @@ EXAMPLE = (
 )
 
 
-def _words(name: str, words: tuple[str, ...]) -> type[Enum]:
-    return Enum(name, {word: word for word in words}, type=str)  # type: ignore[return-value]
+FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
+AngleAt, Part, Quantity = Literal[ANGLE_AT], Literal[PARTS], Literal[QUANTITIES]  # type: ignore[valid-type]
+Rotates, Row0, Column0 = Literal[ROTATES], Literal[ROW_0], Literal[COLUMN_0]  # type: ignore[valid-type]
 
 
-FormatName = _words("FormatName", tuple(FORMATS))
-AngleAt, Part = _words("AngleAt", ANGLE_AT), _words("Part", PARTS)
-Quantity, Rotates = _words("Quantity", QUANTITIES), _words("Rotates", ROTATES)
-Row0, Column0 = _words("Row0", ROW_0), _words("Column0", COLUMN_0)
+_FIELDS = frozenset(f.name for f in fields(ImportOptions))
 
 
 def _number(help: str, default: str = "the file's") -> typer.models.OptionInfo:
@@ -47,7 +44,7 @@ def import_command(
         Path, file_option("--output", "-o", help="Scan file to write; an existing one is replaced whole.")
     ],
     form: Annotated[
-        FormatName | None,  # type: ignore[valid-type]
+        FormatName | None,
         typer.Option("--format", help="Format of SRC.", show_default="recognised"),
     ] = None,
     exposure_s: Annotated[float | None, _number("Exposure of a line, s.")] = None,
@@ -62,13 +59,13 @@ def import_command(
         ),
     ] = None,
     angle_at: Annotated[
-        AngleAt | None,  # type: ignore[valid-type]
+        AngleAt | None,
         typer.Option(
             help="What a frame's angle belongs to: start or middle of its exposure.", show_default="start"
         ),
     ] = None,
-    readout: Annotated[
-        Axis | None, typer.Option(help="What is read out at one time.", show_default="the format's")
+    readout_axis: Annotated[
+        Axis | None, typer.Option("--readout", help="What is read out at one time.", show_default="the format's")
     ] = None,
     readout_direction: Annotated[
         int | None,
@@ -78,29 +75,27 @@ def import_command(
     ] = None,
     source_to_axis_mm: Annotated[float | None, _number("Source to rotation axis, mm.")] = None,
     source_to_detector_mm: Annotated[float | None, _number("Source to detector, mm.")] = None,
-    pixel_size_mm: Annotated[
-        str | None, typer.Option(help="Pixel size V,U in mm.", metavar="V,U", show_default="the file's")
-    ] = None,
-    detector_offset: Annotated[
-        str | None, typer.Option(help="Detector offset V,U in mm.", metavar="V,U", show_default="the file's")
+    pixel_size_mm: Annotated[Any, lengths("--pixel-size-mm", "Pixel size V,U in mm.", "the file's")] = None,
+    detector_offset_mm: Annotated[
+        Any, lengths("--detector-offset", "Detector offset V,U in mm.", "the file's")
     ] = None,
     unit_mm: Annotated[float, typer.Option(help="Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
     rotates: Annotated[
-        Rotates | None,  # type: ignore[valid-type]
+        Rotates | None,
         typer.Option(help="What the stored angles turn.", show_default="the format's"),
     ] = None,
     row_0: Annotated[
-        Row0 | None,  # type: ignore[valid-type]
+        Row0 | None,
         typer.Option("--row-0", help="Where the first stored row is.", show_default="the format's"),
     ] = None,
     column_0: Annotated[
-        Column0 | None,  # type: ignore[valid-type]
+        Column0 | None,
         typer.Option(
             "--column-0", help="Where the first stored column is, seen from the source.", show_default="left"
         ),
     ] = None,
     quantity: Annotated[
-        Quantity | None,  # type: ignore[valid-type]
+        Quantity | None,
         typer.Option(help="What the pixels hold.", show_default="the file's"),
     ] = None,
     flat_value: Annotated[
@@ -113,9 +108,9 @@ def import_command(
         ),
     ] = None,
     part: Annotated[
-        Part,  # type: ignore[valid-type]
+        Part,
         typer.Option(help="Projections of a benchmark folder (r2, phyradgs, naf)."),
-    ] = Part["train"],
+    ] = "train",
     first_view: Annotated[
         int | None,
         typer.Option(
@@ -127,31 +122,12 @@ def import_command(
     roi_mm: RoiMm = None,
 ) -> None:
     """Import a scan of another program: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF."""
-    options = ImportOptions(
-        exposure_s=exposure_s,
-        readout_s=readout_s,
-        frame_time_s=frame_time_s,
-        angle_at=_value(angle_at),
-        readout_axis=_value(readout),
-        readout_direction=readout_direction,
-        source_to_axis_mm=source_to_axis_mm,
-        source_to_detector_mm=source_to_detector_mm,
-        pixel_size_mm=offset_pair("--pixel-size-mm", pixel_size_mm),
-        detector_offset_mm=offset_pair("--detector-offset", detector_offset),
-        unit_mm=unit_mm,
-        rotates=_value(rotates),
-        row_0=_value(row_0),
-        column_0=_value(column_0),
-        quantity=_value(quantity),
-        flat_value=flat_value,
-        detector_model=_value(detector_model),
-        part=str(_value(part)),
-        first_view=first_view,
-    )
+    given = {name: value for name, value in locals().items() if name in _FIELDS}
+    options = ImportOptions(**given)
     grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
     check_writable(output)
-    chosen = _value(form) or recognise(source)
+    chosen = form or recognise(source)
     with only_run(output):
         stored = import_scan(source, options, chosen)
         scan = stored.with_grid(grid)
@@ -166,10 +142,6 @@ def import_command(
         f"{output}: {chosen}, {frames} frames of {rows}×{columns}, {kind}, "
         f"largest line integral {scan.projections.max():.3g}, {masked} pixels masked"
     )
-
-
-def _value(word: Enum | None) -> str | None:
-    return None if word is None else str(word.value)
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:

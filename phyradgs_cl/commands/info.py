@@ -6,9 +6,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.workflow import summary
 
@@ -18,7 +16,7 @@ _LONGEST = 2000
 
 def info_command(
     file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say what a file holds."""
     facts = summary(file)

@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import numbers
+from phyradgs_cl.settings import numbers, pair_parser
 
-MethodName = Enum("MethodName", {name: name for name in METHODS}, type=str)  # type: ignore[misc]
+LARGEST_MM = 1e6
+MethodName = Literal[tuple(METHODS)]  # type: ignore[valid-type]
+MotionName = Literal["static", "static-start", "micro-views", "per-row", "exact"]
+Axis = Literal[AXES]  # type: ignore[valid-type]
+DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 
-
-class MotionName(str, Enum):
-    static = "static"
-    static_start = "static-start"
-    micro_views = "micro-views"
-    per_row = "per-row"
-    exact = "exact"
-
-
-class Axis(str, Enum):
-    rows = "rows"
-    columns = "columns"
-
-
-class DetectorModel(str, Enum):
-    log = "log"
-    intensity = "intensity"
-
-
+Scan = Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")]
 Device = Annotated[
     str | None,
     typer.Option(
@@ -70,6 +57,14 @@ Scheduler = Annotated[
 WorkerCount = Annotated[
     int | None, typer.Option(metavar="N", help="Local workers, each a process.", show_default="one per device")
 ]
+
+
+
+def lengths(option: str, help: str, show_default: str) -> Any:
+    """An option that takes two lengths V,U."""
+    parser = pair_parser(option, "V,U in mm", "0,12.5", LARGEST_MM)
+    return typer.Option(option, parser=parser, metavar="V,U", help=help, show_default=show_default)
+
 
 # which voxels; Any, as the numbers are checked where they are used
 Size = Annotated[

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from phyradgs_cl import signals
-from phyradgs_cl.commands.console import complain, say
-from phyradgs_cl.commands.files import file_argument, file_option
-from phyradgs_cl.commands.options import Output
+from phyradgs_cl.commands.console import complain, say, scores
+from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.options import Output, Scan
 from phyradgs_cl.commands.ranks import last_words
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.io import partial_path
@@ -31,7 +31,7 @@ EXAMPLE = (
 
 @with_run_options()
 def reconstruct_command(
-    scan: Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")],
+    scan: Scan,
     output: Output,
     request: RunRequest,
     resume: Annotated[
@@ -94,10 +94,8 @@ def reconstruct_command(
             with finish_despite_interrupt():
                 report.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
-    say(
-        f"{written}: {job.method}{_early_stop(result.facts)}, {result.facts['seconds']:.1f} s"
-        + _metrics_text(metrics)
-    )
+    how = f"{job.method}{_early_stop(result.facts)}, {result.facts['seconds']:.1f} s"
+    say(f"{written}: {how}{scores(metrics)}")
     if profile:
         say(profile_report(runtimes[-1], result))
     if result.state is not None:
@@ -113,7 +111,3 @@ def _early_stop(facts: Mapping[str, Any]) -> str:
     if reason in (None, "iterations", "interrupt") or facts.get("iterations") in (None, asked):
         return ""
     return f", stopped after {facts['iterations']} of {asked} iterations ({reason})"
-
-
-def _metrics_text(metrics: dict[str, float]) -> str:
-    return f", PSNR {metrics['psnr_db']:.2f} dB, SSIM {metrics['ssim']:.4f}" if metrics else ""

@@ -6,7 +6,6 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import Any, get_args
 
@@ -65,7 +64,8 @@ def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def called(**values: Any) -> None:
-            given = {name: _plain(values.pop(name)) for name in names}
+            found = {name: values.pop(name) for name in names}
+            given = {name: None if value is False else value for name, value in found.items()}  # a flag not raised
             config, assignments = given.pop("config"), given.pop("assignments") or []
             command(request=RunRequest(config, assignments, given), **values)
 
@@ -90,9 +90,3 @@ def _parameter(name: str) -> inspect.Parameter:
     annotation = RUN_OPTIONS[name]
     default = False if get_args(annotation)[0] is bool else None
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-def _plain(value: Any) -> Any:
-    """As settings take it: the word of a choice, and None for a flag that is not raised."""
-    plain = value.value if isinstance(value, Enum) else value
-    return None if plain is False else plain

@@ -2,41 +2,27 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import typer
 
+from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.files import file_option
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output, lengths
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import device_wish, offset_pair, pulse_pair
+from phyradgs_cl.settings import device_wish, pair_parser
 from phyradgs_cl.simulation import scanner_for, scanner_options
 from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_options, run_simulation
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
 
 
-class PhantomName(str, Enum):
-    foot = "foot"
-    jaw = "jaw"
-    shepp_logan = "shepp-logan"
-    spheres = "spheres"
-
-
-class ProtocolName(str, Enum):
-    rapid = "rapid"
-    standard = "standard"
-    static = "static"
-
-
-class Noise(str, Enum):
-    none = "none"
-    tigre = "tigre"
-    beer = "beer"
+PhantomName = Literal["foot", "jaw", "shepp-logan", "spheres"]
+ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
+Noise = Literal["none", "tigre", "beer"]
 
 
 def simulate_command(
@@ -58,7 +44,7 @@ def simulate_command(
             help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
             "rapid, or of the fly-scan that the options below describe."
         ),
-    ] = ProtocolName.rapid,
+    ] = "rapid",
     views: Annotated[int | None, typer.Option(help="Frames in the turn.", show_default="protocol's")] = None,
     exposure_deg: Annotated[
         float | None, typer.Option(help="Arc of one exposure, degrees.", show_default="protocol's")
@@ -76,8 +62,9 @@ def simulate_command(
         int | None, typer.Option(help="1 reads index 0 first, -1 last.", show_default="scanner's")
     ] = None,
     pulse: Annotated[
-        str | None,
+        Any,
         typer.Option(
+            parser=pair_parser("--pulse", "START,LENGTH in shares of the exposure", "0.86,0.14"),
             metavar="START,LENGTH",
             help="When the beam is on, after a frame's start, in shares of the exposure.",
             show_default="scanner's: always on",
@@ -93,7 +80,7 @@ def simulate_command(
     detector_model: Annotated[
         DetectorModel,
         typer.Option(help="Average line integrals (log) or transmitted intensity over the exposure."),
-    ] = DetectorModel.log,
+    ] = "log",
     peak: Annotated[
         float, typer.Option(help="Scale attenuation so that the largest line integral is this; 0 leaves it.")
     ] = 0.0,
@@ -102,7 +89,7 @@ def simulate_command(
         typer.Option(
             help="tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."
         ),
-    ] = Noise.none,
+    ] = "none",
     dose: Annotated[
         float | None, typer.Option(help="Photons per pixel without object, for --noise.", show_default="10000")
     ] = None,
@@ -124,7 +111,7 @@ def simulate_command(
         ),
     ] = None,
     detector_offset: Annotated[
-        str | None, typer.Option(help="Detector offset V,U in mm.", show_default="scanner's")
+        Any, lengths("--detector-offset", "Detector offset V,U in mm.", "scanner's")
     ] = None,
     size: Annotated[
         int | None,
@@ -148,23 +135,23 @@ def simulate_command(
     memory: Memory = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
-    refuse_jitter(protocol.value, jitter_deg)
-    refuse_noise_options(noise.value, {"--dose": dose, "--electronic-noise": electronic_noise})
+    refuse_jitter(protocol, jitter_deg)
+    refuse_noise_options(noise, {"--dose": dose, "--electronic-noise": electronic_noise})
     wish = device_wish(device)
-    described = scanner_for(scanner, detector, offset_pair("--detector-offset", detector_offset))
+    described = scanner_for(scanner, detector, detector_offset)
     options = scanner_options(
         described,
-        protocol.value,
+        protocol,
         views=views,
         exposure_deg=exposure_deg,
         readout_ratio=readout_ratio,
-        pulse=pulse_pair("--pulse", pulse),
+        pulse=pulse,
         start_deg=start_deg,
-        readout_axis=readout.value if readout else None,
+        readout_axis=readout,
         readout_direction=readout_direction,
-        detector_model=detector_model.value,
+        detector_model=detector_model,
         peak=peak,
-        noise=noise.value,
+        noise=noise,
         dose=dose,
         electronic_noise=electronic_noise,
         jitter_deg=jitter_deg,
@@ -172,7 +159,7 @@ def simulate_command(
         time_samples=time_samples,
         seed=seed,
     )
-    job = SimulationJob(output, phantom.value if phantom else None, volume, scanner, size, pixel_samples)
+    job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples)
     with Ticker("frame") as ticker:
         scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)
     frames, rows, columns = scan.projections.shape

@@ -10,7 +10,7 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.cluster import LOCAL, Workers, has_dask
-from phyradgs_cl.commands.console import complain, remark, say
+from phyradgs_cl.commands.console import complain, remark, say, scores
 from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.commands.options import Scheduler, WorkerCount
 from phyradgs_cl.errors import InputError
@@ -124,7 +124,4 @@ class SweepTicker:
 def _found(line: Line) -> str:
     if "error" in line:
         return f"failed: {line['error']}"
-    metrics = line["metrics"]
-    psnr = metrics.get("psnr_db")
-    scores = f"PSNR {psnr:.2f} dB, SSIM {metrics['ssim']:.4f}, " if psnr is not None else ""
-    return f"{scores}{line['seconds']:.1f} s"
+    return f"{line['seconds']:.1f} s{scores(line['metrics'])}"

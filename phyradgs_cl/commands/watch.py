@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl import signals
-from phyradgs_cl.commands.console import complain, say
+from phyradgs_cl.commands.console import complain, say, scores
 from phyradgs_cl.commands.files import file_argument
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.progress import Ticker
@@ -95,10 +95,8 @@ class _Telling:
         if event.result is None:
             complain(f"{event.scan}: set aside in {self.output}: {event.error}")
             return
-        scores = event.metrics or {}
-        told = f", PSNR {scores['psnr_db']:.2f} dB, SSIM {scores['ssim']:.4f}" if scores else ""
         facts = event.result.facts
-        say(f"{self.output / event.scan.name}: {facts['method']}, {facts['seconds']:.1f} s{told}")
+        say(f"{self.output / event.scan.name}: {facts['method']}, {facts['seconds']:.1f} s{scores(event.metrics or {})}")
 
     def end_line(self) -> None:
         with self.ticker:

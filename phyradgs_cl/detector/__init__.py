@@ -1,12 +1,8 @@
 """The detector: counts and line integrals, noise, and averaging over the exposure."""
 
-from phyradgs_cl.detector.attenuation import (
-    attenuation_to_counts,
-    counts_to_attenuation,
-    frames_to_attenuation,
-)
+from phyradgs_cl.detector.attenuation import counts_to_attenuation, frames_to_attenuation
 from phyradgs_cl.detector.average import average, intensity_average
-from phyradgs_cl.detector.lag import add_lag, lagged, remove_lag, without_lag
+from phyradgs_cl.detector.lag import add_lag, lagged, without_lag
 from phyradgs_cl.detector.noise import (
     beer_lambert_counts,
     beer_lambert_noise,
@@ -20,7 +16,6 @@ from phyradgs_cl.detector.transmission import transmission_weights
 
 __all__ = [
     "add_lag",
-    "attenuation_to_counts",
     "average",
     "beer_lambert_counts",
     "beer_lambert_noise",
@@ -31,7 +26,6 @@ __all__ = [
     "intensity_average",
     "lagged",
     "noise_level",
-    "remove_lag",
     "sample_counts",
     "tigre_counts",
     "tigre_noise",

@@ -1,4 +1,4 @@
-"""From what a detector records to line integrals, with its flat and dark frames, and back."""
+"""From what a detector records to line integrals, with its flat and dark frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phyradgs_cl.checks import at_least, finite, one_of, positive, shape
+from phyradgs_cl.checks import one_of, shape
 from phyradgs_cl.errors import InputError
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # NXtomo's image_key
@@ -88,31 +88,6 @@ def _converted(
                 else:
                     result[i, part], unusable[i, part] = _minus_log(values - dark[part], gain[part])
     return result, unusable
-
-
-def attenuation_to_counts(
-    line_integrals: ArrayLike, flat: ArrayLike, dark: ArrayLike = 0.0
-) -> NDArray[np.float64]:
-    """Expected counts dark + (flat - dark) · exp(-p): the inverse, for simulations; no noise, no rounding.
-
-    Args:
-        line_integrals: (P, v, u).
-        flat: counts without an object, scalar or (v, u), above `dark`.
-        dark: counts without beam, scalar or (v, u).
-
-    Returns:
-        (P, v, u) float64.
-
-    Raises:
-        InputError: flat not above dark, values not finite.
-    """
-    for culprit, value in (("line integrals", line_integrals), ("flat", flat), ("dark", dark)):
-        finite(culprit, value)
-    offset = np.asarray(dark, dtype=np.float64)
-    gain = np.asarray(flat, dtype=np.float64) - offset
-    at_least("dark", float(offset.min()), 0.0)
-    positive("flat minus dark", float(gain.min()))
-    return offset + gain * np.exp(-np.asarray(line_integrals, dtype=np.float64))
 
 
 def _check_keys(key: NDArray[np.generic]) -> None:

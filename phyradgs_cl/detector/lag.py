@@ -26,15 +26,6 @@ def add_lag(signal: ArrayLike, lag: float) -> NDArray[np.float64]:
     return recorded
 
 
-def remove_lag(recorded: ArrayLike, lag: float) -> NDArray[np.float64]:
-    """The signals (F, ...) behind recorded ones: the exact inverse of ``add_lag``, float64."""
-    signal = np.array(recorded, dtype=np.float64)
-    if lag == 0:
-        return signal
-    signal[1:] -= lag * np.asarray(recorded, dtype=np.float64)[:-1]
-    return signal / (1 - lag)
-
-
 def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
     """Line integrals (F, ...) that a panel with lag shows, without noise, float64."""
     p = np.asarray(line_integrals, dtype=np.float64)

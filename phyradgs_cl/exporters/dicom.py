@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.exporters.folder_beside import folder_written_beside
-from phyradgs_cl.exporters.libraries import needed
 from phyradgs_cl.exporters.placed import Placed
 
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
@@ -22,7 +22,7 @@ _LARGEST = 32_767
 
 def write_dicom(path: Path, volume: Placed) -> None:
     """A new folder with 0001.dcm from the lowest slice up."""
-    pydicom = needed("pydicom")
+    pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     slope = rescale_slope(volume)
     seed = hashlib.sha256(
         volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters.placed import write_whole
 from phyradgs_cl.io import StoredVolume, written_beside
 
 _PLY_NAMES = (
@@ -32,7 +33,7 @@ def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
 def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:
     """Binary PLY: a vertex per Gaussian, every number in the unit that the header's comments state."""
     columns = [cloud["mean"], cloud["scale"], cloud["quaternion"], cloud["density"][:, None]]
-    rows = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
+    rows = np.concatenate(columns, axis=1)
     properties = "".join(f"property float {name}\n" for name in _PLY_NAMES)
     head = (
         "ply\nformat binary_little_endian 1.0\n"
@@ -40,6 +41,4 @@ def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:
         "comment x y z and scale in mm, rot quaternion w x y z, density in 1/mm; all linear\n"
         f"element vertex {len(rows)}\n{properties}end_header\n"
     )
-    with written_beside(path) as temporary, open(temporary, "wb") as file:
-        file.write(head.encode("ascii"))
-        file.write(rows.tobytes())
+    write_whole(path, head.encode("ascii"), rows)

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from phyradgs_cl.exporters.placed import Placed
-from phyradgs_cl.io import written_beside
+from phyradgs_cl.exporters.placed import Placed, write_whole
 
 
 def write_nrrd(path: Path, volume: Placed) -> None:
     """One file, uncompressed."""
-    with written_beside(path) as temporary, open(temporary, "wb") as file:
-        file.write(header(volume).encode("ascii"))
-        file.write(volume.values.astype("<f4", copy=False).data.cast("B"))
+    write_whole(path, header(volume).encode("ascii"), volume.values)
 
 
 def header(volume: Placed) -> str:

@@ -8,12 +8,13 @@ in a viewer that knows directions and in one that shows bare images with row 0 a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import StoredVolume
+from phyradgs_cl.io import StoredVolume, written_beside
 
 Triple = tuple[float, float, float]
 
@@ -57,6 +58,13 @@ def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
             "--mu-water-per-mm", f"{mu_water_per_mm:g}", "water's attenuation in 1/mm, near 0.02"
         )
     return hu
+
+
+def write_whole(path: Path, head: bytes, values: np.ndarray) -> None:
+    """A file of a header and float32 in little endian behind it, whole or not at all."""
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        file.write(head)
+        file.write(memoryview(np.ascontiguousarray(values, "<f4")).cast("B"))
 
 
 def _xyz(triple: Triple) -> Triple:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from phyradgs_cl.exporters.libraries import needed
+from phyradgs_cl import checks
 from phyradgs_cl.exporters.placed import Placed
 from phyradgs_cl.io import written_beside
 
@@ -16,7 +16,7 @@ _MOST_BYTES = 4_000_000_000  # ImageJ's TIFF counts in 32 bits
 
 def write_tiff(path: Path, volume: Placed) -> None:
     """One file of float32 pages; beyond 4 GB a BigTIFF, which ImageJ opens through Bio-Formats."""
-    tifffile = needed("tifffile")
+    tifffile = checks.package("tifffile", "the package that this export needs", "phyradgs-cl[formats]")
     dx, dy, dz = volume.spacing_mm
     origin = [-place / step for place, step in zip(volume.origin_mm, volume.spacing_mm, strict=True)]
     facts = {

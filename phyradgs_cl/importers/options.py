@@ -98,9 +98,23 @@ class ImportOptions:
                 )
 
 
+# what formats that say little take from the user
+TIMING = ("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction")
+OF_BARE_FRAMES = (
+    *TIMING,
+    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
+    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
+)
 _OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offset"}
 
 
 def option_name(field: str) -> str:
     """How the command line calls a field of ImportOptions."""
     return _OPTIONS.get(field, "--" + field.replace("_", "-"))
+
+
+def needed(value: float | None, option: str, culprit: str) -> float:
+    """A length that the file does not carry, from the options, or an InputError that asks for it."""
+    if value is None:
+        raise InputError(culprit, "nothing", "a length in mm", f"say {option_name(option)}")
+    return value

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals
 from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io import default_grid
@@ -66,10 +66,3 @@ def checked(geometry: ConeGeometry) -> ConeGeometry:
         expected = f"more than the distance to the axis ({to_axis:g} mm)"
         raise InputError("source-to-detector distance", f"{to_detector:g} mm", expected)
     return geometry
-
-
-def needed(value: float | None, option: str, culprit: str) -> float:
-    """A length that the file does not carry, from the options, or an InputError that asks for it."""
-    if value is None:
-        raise InputError(culprit, "nothing", "a length in mm", f"say {option_name(option)}")
-    return value

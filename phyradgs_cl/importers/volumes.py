@@ -16,6 +16,7 @@ from phyradgs_cl.importers.reading.nifti import read_nifti
 from phyradgs_cl.importers.reading.nrrd import read_nrrd
 from phyradgs_cl.importers.reading.voxels import Voxels, along_world_axes
 from phyradgs_cl.io import LoadedVolume
+from phyradgs_cl.io.tables import Fields
 
 
 def foreign_volume(path: str | Path) -> str | None:
@@ -56,16 +57,8 @@ def _read_npy(path: Path) -> Voxels:
     if facts.get("axes") != ["z", "y", "x"] or facts.get("shape") != list(values.shape):
         found = f"axes {facts.get('axes')}, shape {facts.get('shape')}"
         raise InputError(str(beside), found[:80], f"axes z, y, x, shape {list(values.shape)}")
-    size, first = (_lengths(beside, facts, key)[::-1] for key in ("voxel_size_mm", "first_centre_mm"))
+    size, first = (Fields(str(beside), facts).numbers(key, 3)[::-1] for key in ("voxel_size_mm", "first_centre_mm"))
     return Voxels(values, np.diag(size), first, str(facts.get("values", "")))
-
-
-def _lengths(path: Path, facts: dict[str, object], key: str) -> np.ndarray:
-    values = facts.get(key)
-    numbers = isinstance(values, list) and all(type(v) in (int, float) and abs(v) <= 1e12 for v in values)
-    if not isinstance(values, list) or not numbers or len(values) != 3:
-        raise InputError(f"{path} {key}", str(values)[:60], "three lengths in mm")
-    return np.array(values, np.float64)
 
 
 def _read_tiff(path: Path) -> Voxels:

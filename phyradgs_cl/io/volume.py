@@ -230,10 +230,10 @@ def _plain(value: object) -> object:
 
 def _checked(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
     """The volume's dataset, unread, and its grid; they fit each other."""
-    dataset = source.dataset(_VOLUME, ("title", *_AXES))
+    dataset = source.dataset(_VOLUME)
     if dataset.ndim != 3 or min(dataset.shape) < 1:
         raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", "three axes (z, y, x), none empty")
-    stored = source.optional_group("/entry/grid", ("reconstruction", "provenance", "metrics", "gaussians"))
+    stored = source.optional_group("/entry/grid")
     grid = read_grid(source, "/entry/grid") if stored is not None else _grid_of_axes(source, dataset.shape)
     if grid.shape != dataset.shape:
         raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", f"the grid's {grid.shape}")
@@ -244,7 +244,7 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
     steps_mm: list[float | None] = []
     centres_mm = []
     for name, count in zip(_AXES, shape, strict=True):
-        axis_mm = read_array(source, f"{_DATA}/{name}", (count,), LENGTH, ("volume", "title", *_AXES))
+        axis_mm = read_array(source, f"{_DATA}/{name}", (count,), LENGTH)
         step_mm = float((axis_mm[-1] - axis_mm[0]) / max(count - 1, 1))
         even_mm = axis_mm[0] + np.arange(count) * step_mm
         if count > 1 and (step_mm <= 0 or np.abs(axis_mm - even_mm).max() > _AXIS_TOLERANCE * step_mm):
@@ -304,7 +304,7 @@ def _read_gaussians(source: Hdf5Source) -> Gaussians | None:
     arrays: dict[str, np.ndarray] = {}
     for name, rest in _CLOUD.items():
         address = f"{_GAUSSIANS}/{name}"
-        dataset = source.dataset(address, _CLOUD)
+        dataset = source.dataset(address)
         checks.shape(source.name(address), dataset, (len(arrays.get("mean", ())) if arrays else None, *rest))
         with np.errstate(over="ignore"):  # what float32 cannot hold is infinite for everybody who reads on
             arrays[name] = read_values(source, address, dataset).astype(np.float32)

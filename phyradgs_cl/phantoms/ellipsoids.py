@@ -87,13 +87,6 @@ class EllipsoidPhantom:
     def __post_init__(self) -> None:
         object.__setattr__(self, "ellipsoids", tuple(self.ellipsoids))
 
-    @property
-    def extent_mm(self) -> Triple:
-        """Half the sides (x, y, z) of the smallest box about the origin that holds the phantom."""
-        reach = [np.abs(e.centre_mm) + e.half_box_mm for e in self.ellipsoids]
-        x, y, z = np.max(reach, axis=0) if reach else np.zeros(3)
-        return (float(x), float(y), float(z))
-
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
         """Attenuation integrated along the segments from `source` to `target`.
 

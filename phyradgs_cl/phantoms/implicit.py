@@ -46,6 +46,11 @@ class Lattice:
     def step(self) -> float:
         return 2.0 / self.count
 
+    @property
+    def everything(self) -> Box:
+        """All voxels."""
+        return (slice(0, self.count),) * 3
+
     def axis(self) -> Field:
         """(count,) coordinates."""
         return ((np.arange(self.count) + 0.5) * self.step - 1.0).astype(np.float32)

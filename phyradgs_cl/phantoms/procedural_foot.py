@@ -13,7 +13,6 @@ import numpy as np
 
 from phyradgs_cl.checks import at_least
 from phyradgs_cl.phantoms.implicit import (
-    Box,
     Capsule,
     Field,
     Lattice,
@@ -136,8 +135,7 @@ def _point(values: np.ndarray) -> Point:
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:
     """Muscle, a layer of fat and the skin, stretched over `cover` and the flesh; air 0."""
-    everything: Box = (slice(0, lattice.count),) * 3
-    distance = capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, everything) + ripple
+    distance = capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, lattice.everything) + ripple
     muscle = np.float32(_MUSCLE) + np.float32(0.02) * texture(lattice, (0.12, 0.4), 48, rng)
     whole = lattice.coverage(distance)
     below_skin = lattice.coverage(distance + np.float32(_SKIN_DEPTH))

@@ -14,7 +14,6 @@ import numpy as np
 
 from phyradgs_cl.checks import at_least
 from phyradgs_cl.phantoms.implicit import (
-    Box,
     Capsule,
     Field,
     Lattice,
@@ -151,12 +150,11 @@ def _rami() -> list[Capsule]:
 
 def _bone_distance(lattice: Lattice) -> Field:
     """(n, n, n) distance to the whole mandible: swept body, chin, rami."""
-    _, _, z = lattice.points((slice(0, lattice.count),) * 3)
-    everything: Box = (slice(0, lattice.count),) * 3
+    _, _, z = lattice.points(lattice.everything)
     section = (np.float32(_BODY_WIDTH), np.float32(_BODY_HEIGHT))
     across = _arc_distance(lattice)
     union = np.zeros((lattice.count,) * 3, dtype=np.float32)
-    add_to_union(union, everything, ratio_distance((across, z - np.float32(_BODY_Z)), section), _BONE_BLEND)
+    add_to_union(union, lattice.everything, ratio_distance((across, z - np.float32(_BODY_Z)), section), _BONE_BLEND)
     front = _arc(0.0)[1]
     chin = Capsule((-0.08, front - 0.02, -0.38), (0.08, front - 0.02, -0.38), 0.10, 0.10)
     for capsule in [chin, *_rami()]:
@@ -167,16 +165,15 @@ def _bone_distance(lattice: Lattice) -> Field:
 
 def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
     """Gums, cheeks and the floor of the mouth with a layer of fat; the airway and the outside are 0."""
-    everything: Box = (slice(0, lattice.count),) * 3
-    x, y, z = lattice.points(everything)
+    x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
-    add_to_union(union, everything, bone - np.float32(0.075), _FLESH_BLEND)
+    add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
     for centre, axes in (
         ((0.0, -0.02, -0.28), (0.52, 0.56, 0.22)),  # floor of the mouth
         ((0.0, -0.12, -0.06), (0.30, 0.42, 0.20)),  # tongue
         ((0.0, 0.34, -0.10), (0.50, 0.34, 0.46)),  # throat
     ):
-        add_to_union(union, everything, ellipsoid_distance(centre, axes, x, y, z), _FLESH_BLEND)
+        add_to_union(union, lattice.everything, ellipsoid_distance(centre, axes, x, y, z), _FLESH_BLEND)
     distance = union_distance(union, _FLESH_BLEND)
     airway = Capsule((0.0, 0.36, -0.9), (0.0, 0.30, 0.9), 0.10, 0.12)
     distance = np.maximum(distance, -capsule_distance(airway, x, y, z))
@@ -188,7 +185,7 @@ def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.rand
 
 def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.Generator) -> None:
     """Replace what is in `volume` by cortical bone around trabeculae around the nerve's canal."""
-    _, _, z = lattice.points((slice(0, lattice.count),) * 3)
+    _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))
     grain = np.float32(0.11) * texture(lattice, (0.04, 0.10), 160, rng)

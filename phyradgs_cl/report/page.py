@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, element, joined, raw_text
+from phyradgs_cl.report.pictures.png import base64_of
 from phyradgs_cl.report.pictures.projections import View, computed_views
 from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
@@ -93,7 +93,7 @@ def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
 
 def _head(title: str) -> Markup:
     """Styles and a policy that lets nothing in: no network, no script but the page's own."""
-    digest = base64.b64encode(hashlib.sha256(_file("page.js").encode()).digest()).decode()
+    digest = base64_of(hashlib.sha256(_file("page.js").encode()).digest())
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     policy += "; base-uri 'none'; form-action 'none'"
     return element(

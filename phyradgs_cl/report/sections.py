@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, PerRow
-from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow
 from phyradgs_cl.report.charts.curve import convergence_charts
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
@@ -85,7 +84,7 @@ def shutter_section(run: Run) -> Markup | None:
     words = shutter_words(run.scan)
     one = words[0].upper() + words[1:] + "."
     if run.motion is not None:
-        one += f" {_motion_words(run)}"
+        one += f" {_motion_words(run.motion)}"
     several = "The first frames on one axis of time."
     charts = [(one, shutter_drawing(run.scan, run.motion)), (several, frames_drawing(run.scan))]
     return _section("shutter", "Shutter in space and time", _charts(charts))
@@ -149,10 +148,7 @@ def _view(view: View, window: tuple[float, float], limit: float, proportion: tup
     return element("div", element("h3", f"Frame {view.frame}"), *figures, class_="view")
 
 
-def _motion_words(run: Run) -> str:
-    motion = run.motion
-    if motion is None:
-        return ""
+def _motion_words(motion: Motion) -> str:
     match motion:
         case MicroViews():
             words = f"dots are the poses of {motion.strips} strips × {motion.sub_intervals} sub-intervals"
@@ -164,7 +160,7 @@ def _motion_words(run: Run) -> str:
             words = "dashed lines bound the segments in which Gaussians move"
         case _:
             words = "the dashed line is the one pose of a frame"
-    return f"The run's motion is {motion_facts(motion)['name']}: {words}."
+    return f"The run's motion is {motion.name}: {words}."
 
 
 def _charts(charts: Iterable[tuple[str, Markup]]) -> Markup:

@@ -297,7 +297,7 @@ RTK: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "truncated XML": (truncated(XML), ("well formed",)),
     "another root": (filled(XML, b"<svg/>"), ("svg",)),
     "an old version": (in_text(XML, 'version="3"', 'version="2"'), ("version",)),
-    "elements without end": (filled(XML, b"<RTKThreeDCircularGeometry>" + b"<a>" * 100_000), ("nested",)),
+    "elements without end": (filled(XML, b"<RTKThreeDCircularGeometry>" + b"<a>" * 100_000), ("well formed",)),
     "no distance": (in_text(XML, f"{SID}>500.0</{SID}>", "X>1</X>"), (SID,)),
     "a distance of 0": (in_text(XML, "Distance>500.0<", "Distance>0<"), ("SourceToIsocenterDistance",)),
     "a detector before the axis": (in_text(XML, "Distance>800.0<", "Distance>80<"), ("SourceToDetectorDistance",)),

@@ -113,11 +113,10 @@ def test_one_sample_a_voxel_is_the_density_at_its_centre() -> None:
     assert np.allclose(phantom.voxelise(grid, 1), expected, atol=1e-8)
 
 
-def test_extent_touches_the_surface() -> None:
-    tilted = EllipsoidPhantom((Ellipsoid((5, 0, 0), (10, 2, 3), 1.0, rotation_about_z(np.pi / 4)),), "one")
+def test_the_box_touches_the_surface() -> None:
+    tilted = Ellipsoid((5, 0, 0), (10, 2, 3), 1.0, rotation_about_z(np.pi / 4))
     reach = np.sqrt((10**2 + 2**2) / 2)
-    assert np.allclose(tilted.extent_mm, (5 + reach, reach, 3))
-    assert EllipsoidPhantom((), "none").extent_mm == (0, 0, 0)
+    assert np.allclose(tilted.half_box_mm, (reach, reach, 3))
 
 
 def test_rotation_about_z_turns_the_long_axis_counter_clockwise() -> None:

@@ -11,21 +11,22 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan
-from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
-from phyradgs_cl.importers.scan_parts import checked, needed, put_together
+from phyradgs_cl.importers.reading.hdf5_frames import (
+    distance_to_detector,
+    gantry_sign,
+    opened,
+    optional_length,
+    read_frames,
+    stored_pitch,
+)
+from phyradgs_cl.importers.scan_parts import checked, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
-from phyradgs_cl.io.hdf5.datasets import read_array, read_word
+from phyradgs_cl.io.hdf5.datasets import read_array, read_title
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import ANGLE, TIME
 
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
-)
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
 _DETECTOR = f"{_INSTRUMENT}/detector"
@@ -33,7 +34,7 @@ _DETECTOR = f"{_INSTRUMENT}/detector"
 
 def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
     """The projections of /exchange, with its flats and darks."""
-    options.refuse_unused("data-exchange", OPTIONS)
+    options.refuse_unused("data-exchange", OF_BARE_FRAMES)
     with opened(path) as source:
         frames = read_frames(source, f"{_EXCHANGE}/data")
         panel = (frames.shape[1], frames.shape[2])
@@ -41,7 +42,7 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
         theta_rad = read_array(source, f"{_EXCHANGE}/theta", (len(frames),), ANGLE)
         geometry = _geometry(source, panel, options)
         exposure_s = optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
-        title = _title(source, path)
+        title = read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
     turned = {name: None if s is None else oriented(s, options, "top") for name, s in stacks.items()}
     integrals = line_integrals(
@@ -64,26 +65,7 @@ def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions
     """Distances and pitches: the options, else the instrument's group where it has them."""
     to_axis = options.source_to_axis_mm or optional_length(source, f"{_INSTRUMENT}/source/distance")
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(f"{_INSTRUMENT}/source/distance"))
-    to_detector = options.source_to_detector_mm
-    if to_detector is None:
-        behind = optional_length(source, f"{_DETECTOR}/distance")
-        to_detector = None if behind is None else to_axis + behind
-    to_detector = needed(to_detector, "source_to_detector_mm", source.name(f"{_DETECTOR}/distance"))
-    pitch = options.pixel_size_mm or _stored_pitch(source)
+    to_detector = distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
+    names = [(f"{_DETECTOR}/pixel_size_{axis}", f"{_DETECTOR}/{axis}_pixel_size") for axis in "yx"]
+    pitch = options.pixel_size_mm or tuple(stored_pitch(source, *addresses) for addresses in names)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, options.detector_offset_mm or (0.0, 0.0)))
-
-
-def _stored_pitch(source: Hdf5Source) -> tuple[float, float]:
-    sizes = [
-        optional_length(source, f"{_DETECTOR}/pixel_size_{axis}", f"{_DETECTOR}/{axis}_pixel_size")
-        for axis in "yx"
-    ]
-    if None in sizes:
-        remedy = f"say {option_name('pixel_size_mm')} V,U"
-        raise InputError(source.name(f"{_DETECTOR}/pixel_size_x"), "nothing", "a length", remedy)
-    return float(sizes[0]), float(sizes[1])  # type: ignore[arg-type]
-
-
-def _title(source: Hdf5Source, path: Path) -> str:
-    address = f"{_EXCHANGE}/title"
-    return read_word(source, address) if source.find(address) is not None else path.stem

@@ -13,17 +13,14 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import tigre_frame
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.reading.pickle import read_pickle
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
 from phyradgs_cl.io.tables import Fields, described
 
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("detector_model", "part"),
-)
+OPTIONS = (*TIMING, "detector_model", "part")
 _PER_MM = 1e-3  # of a density per metre
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 

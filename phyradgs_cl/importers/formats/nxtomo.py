@@ -11,42 +11,44 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned
-from phyradgs_cl.importers.options import ImportOptions, option_name
-from phyradgs_cl.importers.reading.frames import line_integrals, oriented, united
-from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
-from phyradgs_cl.importers.scan_parts import checked, needed, put_together
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed, option_name
+from phyradgs_cl.importers.reading.frames import line_integrals, oriented
+from phyradgs_cl.importers.reading.hdf5_frames import (
+    distance_to_detector,
+    gantry_sign,
+    opened,
+    read_frames,
+    stored_pitch,
+)
+from phyradgs_cl.importers.scan_parts import checked, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import (
     read_array,
     read_attribute,
     read_integers,
     read_number,
+    read_title,
     read_values,
-    read_word,
 )
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.header import find_entry
+from phyradgs_cl.io.scan.reader import united
 
 _log = logging.getLogger(__name__)
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
-)
 _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     """The projections of the file's NXtomo entry, with its flats and darks."""
-    options.refuse_unused("nxtomo", OPTIONS)
+    options.refuse_unused("nxtomo", OF_BARE_FRAMES)
     with opened(path) as source:
         entry = find_entry(source)
         _refuse_ours(source, entry)
@@ -60,7 +62,7 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         timing, trajectory = _motion(source, entry, used, geometry, options)
         quantity = read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, used)
-        title = _title(source, entry, path)
+        title = read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
         _log.warning(text, path, option_name("row_0"))
@@ -136,22 +138,10 @@ def _geometry(
     if to_axis is None and source.find(where) is not None:
         to_axis = abs(read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
-    to_detector = options.source_to_detector_mm
-    if to_detector is None:
-        behind = optional_length(source, f"{detector}/distance")
-        to_detector = None if behind is None else to_axis + behind
-    to_detector = needed(to_detector, "source_to_detector_mm", source.name(f"{detector}/distance"))
-    pitch = options.pixel_size_mm or (_pitch(source, detector, "y"), _pitch(source, detector, "x"))
+    to_detector = distance_to_detector(source, f"{detector}/distance", to_axis, options)
+    pitch = options.pixel_size_mm or tuple(stored_pitch(source, f"{detector}/{axis}_pixel_size") for axis in "yx")
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
-
-
-def _pitch(source: Hdf5Source, detector: str, axis: str) -> float:
-    size = optional_length(source, f"{detector}/{axis}_pixel_size")
-    if size is None:
-        remedy = f"say {option_name('pixel_size_mm')} V,U"
-        raise InputError(source.name(f"{detector}/{axis}_pixel_size"), "nothing", "a length", remedy)
-    return size
 
 
 def _axis_offset(
@@ -181,8 +171,8 @@ def _motion(
     starts = f"{detector}/frame_start_time"
     start_s = read_array(source, starts, used.shape, TIME)[used] if sweeps else None
     stored = StoredTiming(
-        exposure_s=_duration(source, f"{detector}/count_time", used),
-        readout_s=_duration(source, f"{detector}/detector_readout_time", used),
+        exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
+        readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
         start_s=start_s,
     )
     timing = make_timing(source.name(entry), int(used.sum()), options, stored)
@@ -192,20 +182,6 @@ def _motion(
     return timing, CircularOrbit(
         geometry, FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
     )
-
-
-def _duration(source: Hdf5Source, address: str, used: np.ndarray) -> float | None:
-    """One time in s, stored once or equal for all projections."""
-    if not isinstance(source.find(address), h5py.Dataset):
-        return None
-    dataset = source.dataset(address)
-    if dataset.size == 1:
-        return read_number(source, address, TIME)
-    values = read_array(source, address, used.shape, TIME)[used]
-    if np.ptp(values) > 1e-6 * np.abs(values).max():
-        found = f"{values.min():.6g} to {values.max():.6g} s"
-        raise InputError(source.name(address), found, "one time for all projections")
-    return float(values[0])
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
@@ -219,8 +195,3 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
         if np.ptp(values) > 0:
             found = f"{values.min():.6g} to {values.max():.6g} mm"
             raise InputError(source.name(address), found, "a sample that stays where it is")
-
-
-def _title(source: Hdf5Source, entry: str, path: Path) -> str:
-    address = f"{entry}/title"
-    return (read_word(source, address) if source.find(address) is not None else "") or path.stem

@@ -15,7 +15,11 @@ import numpy as np
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
-from phyradgs_cl.importers.formats.phyradgs_synthetic import readout_ratio, start_times_s
+from phyradgs_cl.importers.formats.phyradgs_synthetic import (
+    exposure_of_blurred_s,
+    readout_ratio,
+    start_times_s,
+)
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_json
@@ -26,12 +30,7 @@ from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io.tables import Fields
 
 OPTIONS = (
-    "exposure_s",
-    "readout_direction",
-    "pixel_size_mm",
-    "quantity",
-    "flat_value",
-    "detector_model",
+    *("exposure_s", "readout_direction", "pixel_size_mm", "quantity", "flat_value", "detector_model"),
     "first_view",
 )
 PROJECTIONS = "projections"
@@ -72,7 +71,7 @@ class Circle:
 def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     """A folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON itself."""
     options.refuse_unused("phyradgs-real", OPTIONS)
-    description = path if path.is_file() else geometry_file(SafeFolder(path))
+    description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
     meta = Fields(f"{description}:", read_json(description))
     frames, views = _frames_and_views(description, list(meta.tables("views")), options)
     panel = (frames.shape[1], frames.shape[2])
@@ -93,16 +92,6 @@ def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     plain = plain_geometry(poses[:, 0], panel)
     title = path.resolve().stem
     return put_together(integrals, trajectory, plain, timing, options, title=title, source=str(path))
-
-
-def geometry_file(folder: SafeFolder) -> Path:
-    """The folder's only JSON file."""
-    found = folder.matching(".json")
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found[:5]) or "none"
-        remedy = "name the file itself"
-        raise InputError(str(folder.root), f"JSON files: {names}", "one that describes the views", remedy)
-    return found[0]
 
 
 def _frames_and_views(
@@ -145,9 +134,7 @@ def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
 
 def _timing(culprit: str, detector: Circle, options: ImportOptions) -> Timing:
     """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
-    exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
-    if exposure_s <= 0:
-        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+    exposure_s = exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = readout_ratio(culprit, closed - first, done - closed)
     shutter = Shutter(exposure_s, ratio * exposure_s)

@@ -52,9 +52,7 @@ def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptio
 
     The first stored line is read first: column 0, or with a readout along rows the one at the top.
     """
-    exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
-    if exposure_s <= 0:
-        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+    exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(
         culprit.culprit, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]
     )
@@ -63,6 +61,14 @@ def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptio
     direction = custom if options.readout_direction is None else options.readout_direction
     shutter = Shutter(exposure_s, ratio * exposure_s, axis, direction)
     return Timing(shutter, start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s), True)
+
+
+def exposure_of_blurred_s(options: ImportOptions) -> float:
+    """The exposure in s, which the files do not state: 1 s unless it is given."""
+    exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
+    if exposure_s <= 0:
+        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+    return exposure_s
 
 
 def readout_ratio(culprit: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:

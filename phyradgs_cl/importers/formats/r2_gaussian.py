@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.formats import tigre_frame
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.bounded import read_json, read_npy
 from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
@@ -22,10 +22,7 @@ from phyradgs_cl.importers.timing import make_timing, turning
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("unit_mm", "detector_model", "part"),
-)
+OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 
 
 @dataclass(frozen=True, eq=False)

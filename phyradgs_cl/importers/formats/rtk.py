@@ -10,25 +10,22 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned, plain_geometry, table_over_time, turn_of
 from phyradgs_cl.importers.formats.rtk_xml import RtkGeometry, read_rtk_xml
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.importers.reading.meta_image import SUFFIXES, MetaStack, read_meta_stack
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing, make_timing, turning
 
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("quantity", "flat_value", "detector_model"),
-)
+OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")
 
 
 def import_rtk(path: Path, options: ImportOptions) -> Scan:
     """A folder with one .xml and one .mha (or .mhd), or the .xml itself with the stack beside it."""
     options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
-    description = path if path.is_file() else _only(folder, (".xml",), "geometry")
-    stack_path = _only(folder, SUFFIXES, "stack of projections")
+    description = path if path.is_file() else folder.only("geometry", ".xml")
+    stack_path = folder.only("stack of projections", *SUFFIXES)
     rtk, stack = read_rtk_xml(description), read_meta_stack(stack_path)
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
@@ -60,13 +57,3 @@ def _trajectory(
     if rtk.is_circular and stack.step_u_mm[1] == 0 and stack.step_v_mm[0] == 0:
         return turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
     return table_over_time(poses, timing, culprit), geometry, turn
-
-
-def _only(folder: SafeFolder, suffixes: tuple[str, ...], what: str) -> Path:
-    found = folder.matching(*suffixes)
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found[:5]) or "none"
-        raise InputError(
-            str(folder.root), f"{' or '.join(suffixes)} files: {names}", f"one {what}", "leave only one"
-        )
-    return found[0]

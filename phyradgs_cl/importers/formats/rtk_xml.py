@@ -1,15 +1,15 @@
 """RTK's geometry files (RTKThreeDCircularGeometry, version 3): nine numbers per projection, and the poses they mean.
 
-Read with expat alone: no entity is declared, no external file is looked at. RTK's own files carry an empty
-DOCTYPE, which is harmless and the only one that passes.
+No entity is declared, no external file is looked at. RTK's own files carry an empty DOCTYPE, the only one that passes.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -24,7 +24,8 @@ NAMES = (
 )
 _REQUIRED = ("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle")
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
-_MOST_DEPTH = 8
+_RADIUS = "RadiusCylindricalDetector"
+_DECLARATIONS = re.compile(rb"<!DOCTYPE[^>]*(SYSTEM|PUBLIC|\[)")
 _LARGEST = 1e9
 # RTK's axes (X, Y, Z) are (y, z, x) here: the same right-handed frame under other names.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -79,13 +80,13 @@ class RtkGeometry:
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
     """All projections of a geometry file."""
-    reader = _Reader(str(path))
-    reader.parse(read_bytes(path))
-    if not reader.projections:
+    root = _root(path)
+    common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]
+    if not projections:
         raise InputError(str(path), "no Projection", "at least one")
     columns = {}
     for name in NAMES:
-        column = [projection.get(name, reader.common.get(name)) for projection in reader.projections]
+        column = [projection.get(name, common.get(name)) for projection in projections]
         if name in _REQUIRED and None in column:
             found = f"no {name} for projection {column.index(None)}"
             raise InputError(str(path), found, "one, in the projection or above all of them")
@@ -122,68 +123,39 @@ def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
     return about_y @ about_x @ about_z
 
 
-class _Reader:
-    """Collects the numbers; everything that RTK does not write is refused, or passed over if it moves nothing."""
+def _root(path: Path) -> ElementTree.Element:
+    """The root element, of the version that is known here."""
+    data, culprit = read_bytes(path), str(path)
+    if _DECLARATIONS.search(data):
+        expected, remedy = "plain elements", "nothing outside of the file is read"
+        raise InputError(culprit, "a DOCTYPE with declarations or an external file", expected, remedy)
+    try:
+        root = ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise InputError(culprit, f"XML that is not well formed ({error})", f"a {ROOT}") from error
+    except (ValueError, LookupError) as error:  # an encoding that nobody knows
+        raise InputError(culprit, f"XML that cannot be read ({error})", f"a {ROOT}") from error
+    if root.tag != ROOT:
+        raise InputError(culprit, f"a root element {root.tag[:60]!r}", ROOT)
+    if (version := root.get("version", "3")) != "3":
+        raise InputError(culprit, f"version {version[:20]!r}", "version 3")
+    return root
 
-    def __init__(self, culprit: str) -> None:
-        self.culprit = culprit
-        self.common: dict[str, float] = {}
-        self.projections: list[dict[str, float]] = []
-        self._path: list[str] = []
-        self._text: list[str] = []
 
-    def parse(self, data: bytes) -> None:
-        """Read a whole file."""
-        parser = expat.ParserCreate()
-        parser.StartDoctypeDeclHandler = self._doctype
-        parser.EntityDeclHandler = lambda *_: self._refuse("an entity declaration")
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        parser.CharacterDataHandler = self._text.append
-        try:
-            parser.Parse(data, True)
-        except expat.ExpatError as error:
-            raise InputError(self.culprit, f"XML that is not well formed ({error})", f"a {ROOT}") from error
-        except (ValueError, LookupError) as error:  # an encoding that nobody knows
-            raise InputError(self.culprit, f"XML that cannot be read ({error})", f"a {ROOT}") from error
+def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
+    """The numbers right inside an element by their names; others are passed over, but for a panel that is curved."""
+    values = {e.tag: _number(f"{path} {e.tag}", e.text) for e in parent if e.tag in (*NAMES, _RADIUS)}
+    if radius := values.pop(_RADIUS, 0.0):
+        raise InputError(f"{path} {_RADIUS}", f"{radius:g}", "a flat panel")
+    return values
 
-    def _refuse(self, found: str) -> None:
-        raise InputError(self.culprit, found, "plain elements", "nothing outside of the file is read")
 
-    def _doctype(self, name: str, system: str | None, public: str | None, subset: int) -> None:
-        if system or public or subset:
-            self._refuse("a DOCTYPE with declarations or an external file")
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        if not self._path:
-            if name != ROOT:
-                raise InputError(self.culprit, f"a root element {name[:60]!r}", ROOT)
-            if attributes.get("version", "3") != "3":
-                raise InputError(self.culprit, f"version {attributes['version'][:20]!r}", "version 3")
-        self._path.append(name)
-        if len(self._path) > _MOST_DEPTH:
-            self._refuse(f"elements nested more than {_MOST_DEPTH} deep")
-        if self._path[1:] == ["Projection"]:
-            self.projections.append({})
-        self._text.clear()
-
-    def _end(self, name: str) -> None:
-        inside = self._path[1:-1]
-        if name in (*NAMES, "RadiusCylindricalDetector") and inside in ([], ["Projection"]):
-            value = self._number(name)
-            if name in NAMES:
-                (self.projections[-1] if inside else self.common)[name] = value
-            elif value != 0:
-                raise InputError(f"{self.culprit} {name}", f"{value:g}", "a flat panel")
-        self._path.pop()
-        self._text.clear()
-
-    def _number(self, name: str) -> float:
-        text = "".join(self._text).strip()
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= _LARGEST:
-            raise InputError(f"{self.culprit} {name}", repr(text[:40]), "a finite number")
-        return value
+def _number(culprit: str, text: str | None) -> float:
+    text = (text or "").strip()
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _LARGEST:
+        raise InputError(culprit, repr(text[:40]), "a finite number")
+    return value

@@ -13,22 +13,26 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, QUANTITIES, ROTATES, ROW_0, ImportOptions
+from phyradgs_cl.importers.options import (
+    ANGLE_AT,
+    COLUMN_0,
+    OF_BARE_FRAMES,
+    QUANTITIES,
+    ROTATES,
+    ROW_0,
+    ImportOptions,
+)
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_numbers
 from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented, united
+from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
 from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign
 from phyradgs_cl.importers.scan_parts import put_together, with_options
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
+from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.io.scanner import Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
-OPTIONS = (
-    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
-)
 _OWN = {
     "frames": ("projections", "flats", "darks", "mask", "quantity", "flat_value", "row_0", "column_0"),
     "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
@@ -41,9 +45,9 @@ _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
 
 def import_tiff(path: Path, options: ImportOptions) -> Scan:
     """A folder with one TOML, or the TOML itself with its frames beside it."""
-    options.refuse_unused("tiff", OPTIONS)
+    options.refuse_unused("tiff", OF_BARE_FRAMES)
     folder = SafeFolder(path if path.is_dir() else path.parent)
-    description = path if path.is_file() else description_of(folder)
+    description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
     said = _with_file(options, tables["frames"], tables["angles"])
     stacks = _stacks(folder, tables["frames"], tables["angles"])
@@ -65,15 +69,6 @@ def import_tiff(path: Path, options: ImportOptions) -> Scan:
         grid=scanner.grid if tables[""].has("volume") else None,
         lag=scanner.lag,
     )
-
-
-def description_of(folder: SafeFolder) -> Path:
-    """The folder's only TOML file."""
-    found = folder.matching(".toml")
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found[:5]) or "none"
-        raise InputError(str(folder.root), f"TOML files: {names}", "one that describes the scan")
-    return found[0]
 
 
 def _tables(path: Path) -> dict[str, Fields]:

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.folder import regular_file
 from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
+from phyradgs_cl.io.regular import open_regular, read_regular, regular_file
 from phyradgs_cl.io.tables import LARGEST
 
 MOST_TEXT_BYTES = 64 << 20
+_MOST_HEADER_BYTES = 1 << 16
 MOST_INFLATION = 1040  # deflate cannot do more than 1032
 
 
@@ -27,15 +28,15 @@ def check_room(culprit: str, needed_bytes: int) -> None:
         raise InputError(culprit, f"{found} to unpack", f"at most {expected} on this machine", remedy)
 
 
-def read_bytes(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
-    """A whole file of at most ``most`` bytes."""
-    size = regular_file(path, str(path)).stat().st_size
-    if size > most:
-        raise InputError(str(path), f"{size} bytes", f"at most {most} bytes for a description of a scan")
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from error
+def read_bytes(path: Path) -> bytes:
+    """A whole file, of a description's size at most."""
+    return read_regular(path, str(path), MOST_TEXT_BYTES, "a description of a scan")
+
+
+def read_head(path: Path) -> bytes:
+    """As much of a file as a text header takes."""
+    with open_regular(path, str(path)) as (file, _):
+        return file.read(_MOST_HEADER_BYTES)
 
 
 def read_json(path: Path) -> dict[str, object]:

@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import regular
+from phyradgs_cl.io.regular import regular_file
 
 _MOST_FILES = 200_000
 _LONGEST_NAME = 4096
@@ -38,7 +38,8 @@ class SafeFolder:
             path = path / part
             if path.is_symlink():
                 raise InputError(culprit, f"{text!r}, which leads over a symbolic link", "a plain file")
-        return regular_file(path, culprit)
+        regular_file(path, culprit)
+        return path
 
     def exists(self, name: str) -> bool:
         """Whether there is an entry of this plain name, whatever it is."""
@@ -54,6 +55,15 @@ class SafeFolder:
                 found.append(self.file(path.name, f"{self.root}/{path.name}"))
         return in_natural_order(found)
 
+    def only(self, what: str, *suffixes: str) -> Path:
+        """The folder's one regular file whose name ends so, which is ``what``."""
+        found = self.matching(*suffixes)
+        if len(found) != 1:
+            names = ", ".join(path.name for path in found[:5]) or "none"
+            expected, remedy = f"one {what}", "leave only one, or name the file itself"
+            raise InputError(str(self.root), f"{' or '.join(suffixes)} files: {names}", expected, remedy)
+        return found[0]
+
 
 def checked_name(name: object, culprit: str) -> str:
     """A relative path without "..", with forward slashes; InputError for everything else."""
@@ -66,12 +76,6 @@ def checked_name(name: object, culprit: str) -> str:
             culprit, repr(name)[:80], "a name inside the folder", "copy the file into the folder"
         )
     return text
-
-
-def regular_file(path: Path, culprit: str) -> Path:
-    """The path of a file that exists and is neither a folder nor a device."""
-    regular.regular_file(path, culprit)
-    return path
 
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:

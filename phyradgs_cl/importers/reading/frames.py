@@ -101,13 +101,6 @@ def compact(mask: np.ndarray) -> Mask:
     return mask[0] if all(np.array_equal(frame, mask[0]) for frame in mask) else mask
 
 
-def united(first: Mask, second: Mask) -> Mask:
-    """Union of two masks, each (v, u), (P, v, u) or None."""
-    if first is None or second is None:
-        return second if first is None else first
-    return first | second
-
-
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
     """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.options import ImportOptions, needed, option_name
 from phyradgs_cl.io.hdf5.datasets import read_length, read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
@@ -52,6 +52,22 @@ def optional_length(source: Hdf5Source, *addresses: str, quantity: Quantity = LE
         if source.find(address) is not None:
             return read_length(source, address, quantity)
     return None
+
+
+def stored_pitch(source: Hdf5Source, *addresses: str) -> float:
+    """The size of a pixel in mm at the first of some addresses, which somebody has to give."""
+    size = optional_length(source, *addresses)
+    if size is None:
+        remedy = f"say {option_name('pixel_size_mm')} V,U"
+        raise InputError(source.name(addresses[0]), "nothing", "a length", remedy)
+    return size
+
+
+def distance_to_detector(source: Hdf5Source, address: str, to_axis_mm: float, options: ImportOptions) -> float:
+    """From the source, mm: the option's, else behind the axis by what is stored at ``address``."""
+    behind_mm = None if options.source_to_detector_mm else optional_length(source, address)
+    to_detector_mm = options.source_to_detector_mm if behind_mm is None else to_axis_mm + behind_mm
+    return needed(to_detector_mm, "source_to_detector_mm", source.name(address))
 
 
 def gantry_sign(options: ImportOptions, custom: str) -> float:

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.bounded import read_raw
-from phyradgs_cl.importers.reading.folder import SafeFolder, regular_file
-from phyradgs_cl.importers.reading.voxels import Voxels
+from phyradgs_cl.importers.reading.bounded import read_head, read_raw
+from phyradgs_cl.importers.reading.folder import SafeFolder
+from phyradgs_cl.importers.reading.voxels import Voxels, header_numbers
 
 SUFFIXES = (".mha", ".mhd")
-_MOST_HEADER_BYTES = 1 << 16
 _TYPES = {
     **{"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4"},
     **{
@@ -55,18 +54,18 @@ def read_meta_image(path: Path) -> Voxels:
         raise InputError(f"{culprit} NDims", header.get("NDims", "nothing"), "3 axes")
     if header.get("ElementNumberOfChannels", "1") != "1":
         raise InputError(f"{culprit} ElementNumberOfChannels", header["ElementNumberOfChannels"], "1")
-    shape = tuple(int(n) for n in _numbers(culprit, header, "DimSize", 3)[::-1])
+    shape = tuple(int(n) for n in header_numbers(culprit, header, "DimSize", 3)[::-1])
     word = header.get("ElementType", "nothing")
     if word not in _TYPES:
         raise InputError(f"{culprit} ElementType", word[:40], ", ".join(_TYPES))
     big = _first(header, "BinaryDataByteOrderMSB", "ElementByteOrderMSB") in ("True", "true", "1")
     dtype = np.dtype(_TYPES[word]).newbyteorder(">" if big else "<")
     values = _voxels(path, header, start, shape, dtype)
-    spacing = _numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
+    spacing = header_numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
     if spacing.min() <= 0:
         raise InputError(f"{culprit} ElementSpacing", str(spacing.tolist()), "lengths above 0")
     places = [key for key in ("Offset", "Position", "Origin") if key in header]
-    origin = _numbers(culprit, header, places[0] if places else "Offset", 3, "0 0 0")
+    origin = header_numbers(culprit, header, places[0] if places else "Offset", 3, "0 0 0")
     steps = spacing[:, None] * _axes(culprit, header)
     return Voxels(values, steps, origin, header.get("Comment", ""))
 
@@ -75,7 +74,7 @@ def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
     """(3, 3): row i is the direction of axis i."""
     keys = [key for key in ("TransformMatrix", "Rotation", "Orientation") if key in header]
     key = keys[0] if keys else "TransformMatrix"
-    axes = _numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
+    axes = header_numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
         raise InputError(f"{culprit} {key}", str(axes.tolist())[:80], "three directions at right angles")
     return axes
@@ -83,9 +82,7 @@ def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
     """Keys and values, and where the data begin."""
-    regular_file(path, str(path))
-    with open(path, "rb") as file:
-        text = file.read(_MOST_HEADER_BYTES)
+    text = read_head(path)
     header: dict[str, str] = {}
     position = 0
     while (end := text.find(b"\n", position)) >= 0:
@@ -115,16 +112,3 @@ def _voxels(
 
 def _first(header: dict[str, str], *keys: str) -> str:
     return next((header[key] for key in keys if key in header), "False")
-
-
-def _numbers(
-    culprit: str, header: dict[str, str], key: str, count: int, default: str | None = None
-) -> np.ndarray:
-    text = header.get(key, default)
-    try:
-        values = np.array([float(word) for word in (text or "").split()])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != count or not np.all(np.abs(values) <= 1e12):
-        raise InputError(f"{culprit} {key}", (text or "nothing")[:60], f"{count} numbers")
-    return values

@@ -11,9 +11,9 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import MOST_INFLATION, check_array
-from phyradgs_cl.importers.reading.folder import regular_file
 from phyradgs_cl.importers.reading.voxels import RAS, Voxels
 from phyradgs_cl.io.nifti_header import HEADER, VOXELS_AT
+from phyradgs_cl.io.regular import regular_file
 
 _TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
 _UNITS_MM = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}  # of xyzt_units: not said, m, mm, µm
@@ -23,7 +23,7 @@ _MOST_EXTENSION = 1 << 24
 def read_nifti(path: Path) -> Voxels:
     """An image of three axes; its frame is that of sform, else of qform."""
     culprit = str(path)
-    size = regular_file(path, culprit).stat().st_size
+    size = regular_file(path, culprit).st_size
     packed = path.suffix.lower() == ".gz"
     try:
         with gzip.open(path) if packed else open(path, "rb") as file:

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.bounded import read_raw
-from phyradgs_cl.importers.reading.folder import regular_file
-from phyradgs_cl.importers.reading.voxels import RAS, Voxels
+from phyradgs_cl.importers.reading.bounded import read_head, read_raw
+from phyradgs_cl.importers.reading.voxels import RAS, Voxels, header_numbers
 from phyradgs_cl.io.hdf5.units import LENGTH
 
-_MOST_HEADER_BYTES = 1 << 16
 _NAMES = {
     "i1": ("signed char", "int8", "int8_t"),
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
@@ -49,7 +47,7 @@ def read_nrrd(path: Path) -> Voxels:
     if kind not in _TYPES:
         raise InputError(f"{culprit} type", kind[:40] or "nothing", "plain real numbers")
     dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if header.get("endian", "").lower() == "big" else "<")
-    shape = tuple(int(n) for n in _numbers(culprit, header, "sizes", 3)[::-1])
+    shape = tuple(int(n) for n in header_numbers(culprit, header, "sizes", 3)[::-1])
     values = read_raw(path, start, shape, dtype, header["encoding"].lower() != "raw")
     return Voxels(values, *_frame(culprit, header), header.get("content", ""))
 
@@ -64,31 +62,18 @@ def _frame(culprit: str, header: dict[str, str]) -> tuple[np.ndarray | None, np.
     if factor is None:
         raise InputError(f"{culprit} space units", header["space units"][:40], LENGTH.accepted)
     to_lps = _SPACES[space] * factor
-    origin = _numbers(culprit, header, "space origin", 3) * to_lps if "space origin" in header else None
+    origin = header_numbers(culprit, header, "space origin", 3) * to_lps if "space origin" in header else None
     if "space directions" in header:
-        return _numbers(culprit, header, "space directions", 9).reshape(3, 3) * to_lps, origin
-    return (np.diag(_numbers(culprit, header, "spacings", 3)) if "spacings" in header else None), origin
+        return header_numbers(culprit, header, "space directions", 9).reshape(3, 3) * to_lps, origin
+    return (np.diag(header_numbers(culprit, header, "spacings", 3)) if "spacings" in header else None), origin
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
     """Fields by their names, and where the data begin."""
-    regular_file(path, str(path))
-    with open(path, "rb") as file:
-        text = file.read(_MOST_HEADER_BYTES)
+    text = read_head(path)
     end = re.search(rb"\r?\n\r?\n", text)
     if not re.match(rb"NRRD000\d\r?\n", text) or end is None:
         raise InputError(str(path), "no header of NRRD", "a NRRD file with its data in it")
     lines = text[: end.start()].decode("latin-1").splitlines()[1:]
     fields = (line.partition(":") for line in lines if not line.startswith("#"))
     return {name.strip().lower(): value.strip() for name, _, value in fields}, end.end()
-
-
-def _numbers(culprit: str, header: dict[str, str], key: str, count: int) -> np.ndarray:
-    text = header.get(key, "nothing")
-    try:
-        values = np.array([float(word) for word in re.split(r"[\s,()]+", text) if word])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != count or not np.all(np.abs(values) <= 1e12):
-        raise InputError(f"{culprit} {key}", text[:60], f"{count} numbers")
-    return values

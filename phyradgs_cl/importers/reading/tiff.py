@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import check_room
-from phyradgs_cl.importers.reading.folder import regular_file
+from phyradgs_cl.io.regular import regular_file
 
 SUFFIXES = (".tif", ".tiff")
 _MOST_EXPANSION = 1200  # of a compressed image: deflate reaches 1032
@@ -87,7 +87,7 @@ def _header(path: Path) -> _Header:
 def _opened(path: Path) -> Iterator[Any]:
     """A TIFF; whatever the library stumbles over in the body comes out as an InputError."""
     regular_file(path, str(path))
-    tifffile = _library()
+    tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
             yield tiff
@@ -105,7 +105,7 @@ def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None
 
     Of ImageJ's own stacks, and of BigTIFF in which tifffile keeps the same words as JSON. Call ``read_pages`` first.
     """
-    tifffile = _library()
+    tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
             facts: dict[str, Any] = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
@@ -177,12 +177,3 @@ def _check_inflation(path: Path, page: Any, most: int) -> None:
             if left < 0:
                 found = f"a strip of more than {most} bytes"
                 raise InputError(str(path), found, "as many as its pixels take")
-
-
-def _library() -> ModuleType:
-    try:
-        import tifffile
-    except ImportError as error:
-        remedy = "pip install 'phyradgs-cl[formats]'"
-        raise InputError("tifffile", "not installed", "the package that reads TIFF", remedy) from error
-    return tifffile

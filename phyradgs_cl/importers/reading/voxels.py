@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.io import LoadedVolume
 from phyradgs_cl.io.hdf5.units import LENGTH
+from phyradgs_cl.io.tables import LARGEST
 
 RAS = np.array([-1.0, -1.0, 1.0])  # what turns right, anterior, superior into LPS, and back
 _OBLIQUE = 1e-3  # of a step
@@ -62,6 +65,20 @@ def along_world_axes(culprit: str, stored: Voxels) -> LoadedVolume:
     if not np.all(np.abs(centre_mm) <= LENGTH.largest):
         raise InputError(f"{culprit}: origin", str(stored.origin_mm.tolist())[:80], "three lengths in mm")
     return LoadedVolume(_float32(culprit, turned), Grid(turned.shape, size_mm, triple(centre_mm[::-1])))
+
+
+def header_numbers(
+    culprit: str, header: Mapping[str, str], key: str, count: int, default: str = "nothing"
+) -> np.ndarray:
+    """(count,) numbers of a text header, with spaces, commas or brackets between."""
+    text = header.get(key, default)
+    try:
+        values = np.array([float(word) for word in re.split(r"[\s,()]+", text) if word])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count or not np.all(np.abs(values) <= LARGEST):
+        raise InputError(f"{culprit} {key}", text[:60] or "nothing", f"{count} numbers")
+    return values
 
 
 def _float32(culprit: str, values: np.ndarray) -> np.ndarray:

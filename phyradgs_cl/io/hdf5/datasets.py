@@ -55,19 +55,18 @@ def read_array(
     address: str,
     shape: Sequence[int | None],
     quantity: Quantity | None = None,
-    known: Collection[str] = (),
 ) -> np.ndarray:
     """A required numeric dataset as float64 in the package's unit; every value finite."""
-    dataset = source.dataset(address, known)
+    dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     values = read_values(source, address, dataset).astype(np.float64)
     checks.finite(source.name(address), values)
     return in_unit(source, address, values, quantity) if quantity else values
 
 
-def read_length(source: Hdf5Source, address: str, quantity: Quantity, known: Collection[str] = ()) -> float:
+def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     """A required number above zero; a dataset of one element will do."""
-    value = read_number(source, address, quantity, known)
+    value = read_number(source, address, quantity)
     if value <= 0:
         raise InputError(source.name(address), str(value), f"a {quantity.name} above 0", "correct the value")
     if value < 1 / quantity.largest:
@@ -76,10 +75,10 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity, known: Col
 
 
 def read_number(
-    source: Hdf5Source, address: str, quantity: Quantity | None = None, known: Collection[str] = ()
+    source: Hdf5Source, address: str, quantity: Quantity | None = None
 ) -> float:
     """A required finite number in the package's unit; a dataset of one element will do."""
-    dataset = source.dataset(address, known)
+    dataset = source.dataset(address)
     if dataset.size != 1:
         raise InputError(source.name(address), f"shape {dataset.shape}", "one number")
     values = read_values(source, address, dataset).astype(np.float64)
@@ -88,19 +87,19 @@ def read_number(
 
 
 def read_integers(
-    source: Hdf5Source, address: str, shape: Sequence[int | None], known: Collection[str] = ()
+    source: Hdf5Source, address: str, shape: Sequence[int | None]
 ) -> np.ndarray:
     """A required dataset of whole numbers as int64."""
-    dataset = source.dataset(address, known)
+    dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     return read_values(source, address, dataset, kinds="iu").astype(np.int64)
 
 
 def read_word(
-    source: Hdf5Source, address: str, allowed: Collection[str] | None = None, known: Collection[str] = ()
+    source: Hdf5Source, address: str, allowed: Collection[str] | None = None
 ) -> str:
     """A required string, one of ``allowed`` where they are given."""
-    dataset = source.dataset(address, known)
+    dataset = source.dataset(address)
     if dataset.size != 1:  # many entries may all be one long text, which the file's size does not bound
         raise InputError(source.name(address), f"shape {dataset.shape}", "a string")
     try:
@@ -112,6 +111,11 @@ def read_word(
     if allowed is not None:
         checks.one_of(source.name(address), word, allowed)
     return word
+
+
+def read_title(source: Hdf5Source, address: str, default: str) -> str:
+    """A string that may be missing or empty."""
+    return (read_word(source, address) if source.find(address) is not None else "") or default
 
 
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:

@@ -44,7 +44,6 @@ FINITE = Kind(
     "a table of finite numbers",
     lambda value: isinstance(value, dict) and all(v is None or NUMBER.fits(v) for v in value.values()),
 )
-SCALAR = Kind("a text or a number", lambda value: not isinstance(value, list | dict))
 
 Schema = Mapping[str, Kind]
 PROVENANCE: Schema = {

@@ -15,16 +15,14 @@ from phyradgs_cl.io.hdf5.datasets import new_group, read_array, read_integers, w
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import LENGTH
 
-_NAMES = ("shape", "voxel_size", "offset")
-
 
 def read_grid(source: Hdf5Source, address: str) -> Grid:
     """The grid stored in the group at ``address``: shape, voxel_size and offset, each (z, y, x)."""
-    shape = read_integers(source, f"{address}/shape", (3,), _NAMES)
-    voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH, _NAMES)
+    shape = read_integers(source, f"{address}/shape", (3,))
+    voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
     offset_mm = (0.0, 0.0, 0.0)
-    if source.optional(f"{address}/offset", _NAMES) is not None:
-        offset_mm = tuple(read_array(source, f"{address}/offset", (3,), LENGTH, _NAMES).tolist())
+    if source.optional(f"{address}/offset") is not None:
+        offset_mm = tuple(read_array(source, f"{address}/offset", (3,), LENGTH).tolist())
     if shape.min() < 1:
         raise InputError(source.name(f"{address}/shape"), str(shape.tolist()), "three counts of at least 1")
     if math.prod(shape.tolist()) > MOST_VOXELS:

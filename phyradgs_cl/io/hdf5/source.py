@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import posixpath
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,16 @@ from phyradgs_cl.io.hdf5.trial import survive
 from phyradgs_cl.io.regular import regular_file
 
 _MOST_SOFT_LINKS = 16
+# What scan and volume files have: a name outside this set that nearly is one of them is a misspelling.
+_KNOWN = frozenset((
+    *("name", "title", "provenance", "data", "image_key", "image_key_control", "pixel_mask", "quantity"),
+    *("x_pixel_size", "y_pixel_size", "distance", "count_time", "detector_readout_time", "frame_start_time"),
+    *("rotation_angle", "rotation_angle_end", "readout_axis", "readout_direction"),
+    *("detector_offset", "detector_model", "pulse_start", "pulse_length", "lag"),
+    *("saturation_level", "saturation_share", "reference", "volume", "z", "y", "x"),
+    *("kinematics", "poses", "time_s", "angle_deg", "pose", "grid", "shape", "voxel_size", "offset"),
+    *("reconstruction", "metrics", "gaussians", "mean", "scale", "quaternion", "density"),
+))
 # Masks of zeros shrink a thousandfold, frames hardly at all: a file of some size may unfold to so many times that.
 _MOST_EXPANSION = 100
 _FREE_BYTES = 64 << 20
@@ -91,52 +101,52 @@ class Hdf5Source:
         if found is None and parent != "/":
             self.group(parent)
         what = "nothing there" if found is None else "a dataset"
-        raise InputError(self.name(address), what, f"a group {name!r}", self.near_miss(parent, name, ()))
+        raise InputError(self.name(address), what, f"a group {name!r}", self.near_miss(parent, name))
 
-    def optional_group(self, address: str, known: Collection[str] = ()) -> h5py.Group | None:
+    def optional_group(self, address: str) -> h5py.Group | None:
         """The group at an address or None; InputError if there is one under a misspelt name instead."""
         found = self.find(address)
         if isinstance(found, h5py.Dataset):
             raise InputError(self.name(address), "a dataset", "a group", "store the values inside a group")
         if found is None:
-            self._refuse_near_miss(address, "a group", known)
+            self._refuse_near_miss(address, "a group")
         return found
 
-    def dataset(self, address: str, known: Collection[str] = ()) -> h5py.Dataset:
+    def dataset(self, address: str) -> h5py.Dataset:
         """The dataset at an address; InputError, with the nearest unknown name, where there is none."""
-        found = self.optional(address, known)
+        found = self.optional(address)
         if found is not None:
             return found
         parent, name = posixpath.split(address)
         if parent != "/":
             self.group(parent)
-        remedy = self.near_miss(parent, name, known) or "add it to the file"
+        remedy = self.near_miss(parent, name) or "add it to the file"
         raise InputError(self.name(address), "nothing there", f"a dataset {name!r}", remedy)
 
-    def optional(self, address: str, known: Collection[str] = ()) -> h5py.Dataset | None:
+    def optional(self, address: str) -> h5py.Dataset | None:
         """The dataset at an address or None; InputError if there is one under a misspelt name instead."""
         found = self.find(address)
         if found is None:
-            self._refuse_near_miss(address, "a dataset", known)
+            self._refuse_near_miss(address, "a dataset")
             return None
         if not isinstance(found, h5py.Dataset):
             raise InputError(self.name(address), "a group", "a dataset", "store the values as a dataset")
         self._check_storage(address, found)
         return found
 
-    def near_miss(self, parent: str, name: str, known: Collection[str], cutoff: float = 0.6) -> str:
+    def near_miss(self, parent: str, name: str, cutoff: float = 0.6) -> str:
         """What to do about a name that is nearly ``name`` and means nothing else; "" if there is none."""
         group = self.find(parent)
         strangers = (
-            [n for n in group if n != name and n not in known] if isinstance(group, h5py.Group) else []
+            [n for n in group if n != name and n not in _KNOWN] if isinstance(group, h5py.Group) else []
         )
         by_lower = {n.lower(): n for n in strangers}
         close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
         return f"rename {by_lower[close[0]]!r} to {name!r}" if close else ""
 
-    def _refuse_near_miss(self, address: str, what: str, known: Collection[str]) -> None:
+    def _refuse_near_miss(self, address: str, what: str) -> None:
         parent, name = posixpath.split(address)
-        remedy = self.near_miss(parent, name, known, cutoff=0.8)
+        remedy = self.near_miss(parent, name, cutoff=0.8)
         if remedy:
             raise InputError(self.name(address), "nothing there", f"{what} {name!r}", remedy)
 

@@ -23,13 +23,11 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 
-KNOWN = schema.KNOWN_NAMES
-
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
     """The frames' dataset (F, v, u), unread, and what it holds."""
     address = f"{entry}/{schema.DETECTOR}/data"
-    data, culprit = source.dataset(address, KNOWN), source.name(address)
+    data, culprit = source.dataset(address), source.name(address)
     if data.ndim != 3 or min(data.shape) < 1:
         raise InputError(culprit, f"shape {data.shape}", "three axes (frame, v, u), none of them empty")
     if (data.dtype.kind, data.dtype.itemsize) not in (("f", 4), ("u", 2)):
@@ -51,7 +49,7 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
 def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
     """What each stored frame is (F,): at least one of them a projection."""
     address = f"{entry}/{schema.DETECTOR}/image_key"
-    image_key = read_integers(source, address, (frames,), KNOWN)
+    image_key = read_integers(source, address, (frames,))
     wrong = ~np.isin(image_key, (schema.PROJECTION, schema.FLAT, schema.DARK, schema.INVALID))
     if wrong.any():
         at = int(np.argmax(wrong))
@@ -67,31 +65,31 @@ def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
 def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int]) -> ConeGeometry:
     """The circular geometry that the distances, pitches and offset describe."""
     detector, address = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
-    to_axis_mm = abs(read_number(source, address, LENGTH, KNOWN))  # NeXus gives it a minus sign
+    to_axis_mm = abs(read_number(source, address, LENGTH))  # NeXus gives it a minus sign
     if to_axis_mm == 0:
         raise InputError(source.name(address), "0", "a length other than 0", "correct the value")
-    pitch_v_mm = read_length(source, f"{detector}/y_pixel_size", LENGTH, KNOWN)
-    pitch_u_mm = read_length(source, f"{detector}/x_pixel_size", LENGTH, KNOWN)
-    to_detector_mm = to_axis_mm + read_length(source, f"{detector}/distance", LENGTH, KNOWN)
+    pitch_v_mm = read_length(source, f"{detector}/y_pixel_size", LENGTH)
+    pitch_u_mm = read_length(source, f"{detector}/x_pixel_size", LENGTH)
+    to_detector_mm = to_axis_mm + read_length(source, f"{detector}/distance", LENGTH)
     offset = f"{entry}/{schema.EXTRA}/detector_offset"
     offset_mm = (0.0, 0.0)
-    if source.optional(offset, KNOWN) is not None:
-        offset_mm = tuple(read_array(source, offset, (2,), LENGTH, KNOWN).tolist())
+    if source.optional(offset) is not None:
+        offset_mm = tuple(read_array(source, offset, (2,), LENGTH).tolist())
     return ConeGeometry(to_axis_mm, to_detector_mm, detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
     """Exposure and readout; what a rolling readout needs is required only where the gantry moves."""
-    exposure_s = _read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
+    exposure_s = read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
     needed = moving and exposure_s > 0
-    readout_s = _read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
+    readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
     axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
     rolling = needed and readout_s > 0  # only then does it matter which line comes first
     word, way = "rows", 1
-    if rolling or source.optional(axis, KNOWN) is not None:
-        word = read_word(source, axis, AXES, KNOWN)
-    if rolling or source.optional(direction, KNOWN) is not None:
-        number = read_number(source, direction, known=KNOWN)
+    if rolling or source.optional(axis) is not None:
+        word = read_word(source, axis, AXES)
+    if rolling or source.optional(direction) is not None:
+        number = read_number(source, direction)
         checks.one_of(source.name(direction), number, (1, -1))
         way = int(number)
     pulse_s = _read_pulse(source, entry, exposure_s + readout_s)
@@ -101,10 +99,10 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
 def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, float] | None:
     """When the beam is on (start, length) in s after a frame's start, or None: always."""
     start, length = f"{entry}/{schema.EXTRA}/pulse_start", f"{entry}/{schema.EXTRA}/pulse_length"
-    if source.optional(start, KNOWN) is None and source.optional(length, KNOWN) is None:
+    if source.optional(start) is None and source.optional(length) is None:
         return None
-    start_s = read_number(source, start, TIME, KNOWN)
-    length_s = read_length(source, length, TIME, KNOWN)
+    start_s = read_number(source, start, TIME)
+    length_s = read_length(source, length, TIME)
     if start_s >= span_s or start_s + length_s <= 0:
         found = f"a pulse from {start_s:g} to {start_s + length_s:g} s"
         expected = f"one that meets the frame's window, 0 to {span_s:g} s"
@@ -112,9 +110,9 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
     return start_s, length_s
 
 
-def _read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
+def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
     """One time in s for all projections, stored once or for every frame; 0 where it may be missing."""
-    dataset = source.dataset(address, KNOWN) if needed else source.optional(address, KNOWN)
+    dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
     culprit = source.name(address)
@@ -138,15 +136,15 @@ def read_starts(
 ) -> np.ndarray:
     """Opening times (frames,) of the projections; evenly spaced where nothing moves and none are stored."""
     address = f"{entry}/{schema.DETECTOR}/frame_start_time"
-    if not moving and source.optional(address, KNOWN) is None:
+    if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
-    return read_array(source, address, used.shape, TIME, KNOWN)[used]
+    return read_array(source, address, used.shape, TIME)[used]
 
 
 def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:
     """Shape of the pixel mask, unread, or None without one."""
     address = f"{entry}/{schema.DETECTOR}/pixel_mask"
-    mask = source.optional(address, KNOWN)
+    mask = source.optional(address)
     if mask is None:
         return None
     if mask.shape not in (data_shape, data_shape[1:]):

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_word
+from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.facts import read_facts
 from phyradgs_cl.io.hdf5.grid import default_grid, read_grid
 from phyradgs_cl.io.hdf5.source import Hdf5Source
@@ -29,7 +29,6 @@ from phyradgs_cl.io.scan.detector import (
 from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
 
 _log = logging.getLogger(__name__)
-KNOWN = schema.KNOWN_NAMES
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +87,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         grid=grid,
         is_fly=is_fly,
         detector_model=_read_model(source, entry),
-        title=_optional_word(source, f"{entry}/title", "cone-beam scan"),
+        title=read_title(source, f"{entry}/title", "cone-beam scan"),
         provenance=_read_provenance(source, entry),
         lag=_read_lag(source, entry),
         saturation=_read_saturation(source, entry),
@@ -112,12 +111,12 @@ def find_entry(source: Hdf5Source) -> str:
     if len(entries) == 1:
         return entries[0]
     found = f"{len(entries)} NXentry groups" if entries else "no NXentry group"
-    raise InputError(source.name("/entry"), found, "a group 'entry'", source.near_miss("/", "entry", ()))
+    raise InputError(source.name("/entry"), found, "a group 'entry'", source.near_miss("/", "entry"))
 
 
 def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry) -> tuple[Grid, bool]:
     address = f"{entry}/{schema.GRID}"
-    if source.optional_group(address, KNOWN) is not None:
+    if source.optional_group(address) is not None:
         return read_grid(source, address), True
     try:
         grid = default_grid(geometry)
@@ -136,45 +135,41 @@ def _warn_of_grid(source: Hdf5Source, entry: str, grid: Grid) -> None:
 
 def _read_model(source: Hdf5Source, entry: str) -> str:
     address = f"{entry}/{schema.EXTRA}/detector_model"
-    if source.optional(address, KNOWN) is None:
+    if source.optional(address) is None:
         return "log"
-    return read_word(source, address, DETECTOR_MODELS, KNOWN)
+    return read_word(source, address, DETECTOR_MODELS)
 
 
 def _read_lag(source: Hdf5Source, entry: str) -> float:
     address = f"{entry}/{schema.EXTRA}/lag"
-    if source.optional(address, KNOWN) is None:
+    if source.optional(address) is None:
         return 0.0
-    lag = read_number(source, address, known=KNOWN)
+    lag = read_number(source, address)
     checks.within(source.name(address), lag, 0, LARGEST_LAG)
     return lag
 
 
 def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
     level, share = (f"{entry}/{schema.EXTRA}/saturation_{name}" for name in ("level", "share"))
-    if source.optional(level, KNOWN) is None and source.optional(share, KNOWN) is None:
+    if source.optional(level) is None and source.optional(share) is None:
         return None
-    found = Saturation(read_number(source, level, known=KNOWN), read_number(source, share, known=KNOWN))
+    found = Saturation(read_number(source, level), read_number(source, share))
     checks.within(source.name(share), found.share, 0, 1)
     return found
 
 
 def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
     address = f"{entry}/{schema.EXTRA}/provenance"
-    if source.optional(address, KNOWN) is None:
+    if source.optional(address) is None:
         return {}
     return read_facts(source.name(address), read_word(source, address), {})
 
 
-def _optional_word(source: Hdf5Source, address: str, default: str) -> str:
-    return (read_word(source, address) if source.find(address) is not None else "") or default
-
-
 def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
-    if source.optional_group(f"{entry}/{schema.REFERENCE}", KNOWN) is None:
+    if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False
     address = f"{entry}/{schema.REFERENCE}/volume"
-    volume = source.dataset(address, KNOWN)
+    volume = source.dataset(address)
     if volume.shape != grid.shape:
         remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
         raise InputError(source.name(address), f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)

@@ -34,9 +34,9 @@ _SUSPECT_RAD = math.radians(5.0)
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
     """Whether the file says how the gantry moved during an exposure."""
-    end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end", schema.KNOWN_NAMES)
+    end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end")
     groups = (schema.KINEMATICS, schema.POSES)
-    found = [source.optional_group(f"{entry}/{group}", schema.KNOWN_NAMES) for group in groups]
+    found = [source.optional_group(f"{entry}/{group}") for group in groups]
     return end is not None or any(group is not None for group in found)
 
 
@@ -51,14 +51,14 @@ def read_trajectory(
     """The trajectory of the frames that the mask ``used`` (F,) selects and that open at ``start_s``."""
     first_rad = read_angles(source, entry, "rotation_angle", used)
     poses, kinematics = f"{entry}/{schema.POSES}", f"{entry}/{schema.KINEMATICS}"
-    if source.optional_group(poses, schema.KNOWN_NAMES) is not None:
+    if source.optional_group(poses) is not None:
         time_s = _read_table_times(source, f"{poses}/time_s")
-        table_mm = read_array(source, f"{poses}/pose", (len(time_s), 12), LENGTH, schema.KNOWN_NAMES)
+        table_mm = read_array(source, f"{poses}/pose", (len(time_s), 12), LENGTH)
         return PoseTable(time_s, table_mm, source.name(f"{poses}/pose"))
-    if source.optional_group(kinematics, schema.KNOWN_NAMES) is not None:
+    if source.optional_group(kinematics) is not None:
         time_s = _read_table_times(source, f"{kinematics}/time_s")
         address = f"{kinematics}/angle_deg"
-        angle_rad = read_array(source, address, (len(time_s),), ANGLE, schema.KNOWN_NAMES)
+        angle_rad = read_array(source, address, (len(time_s),), ANGLE)
         angle_rad = angle_rad * _sense(source, address, absent=1.0)
         _warn_if_apart(source, address, np.interp(start_s, time_s, angle_rad), first_rad)
         return CircularOrbit(geometry, EncoderTable(time_s, angle_rad, source.name(f"{kinematics}/time_s")))
@@ -71,7 +71,7 @@ def read_trajectory(
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
     """Gantry angles in radians of the used frames, from rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
-    angle_rad = read_array(source, address, used.shape, ANGLE, schema.KNOWN_NAMES)[used]
+    angle_rad = read_array(source, address, used.shape, ANGLE)[used]
     # The end angle turns as the start angle does, unless it says so itself.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
@@ -146,7 +146,7 @@ def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.n
 
 
 def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
-    time_s = read_array(source, address, (None,), TIME, schema.KNOWN_NAMES)
+    time_s = read_array(source, address, (None,), TIME)
     if len(time_s) < 2:
         raise InputError(source.name(address), f"{len(time_s)} samples", "at least 2")
     if np.any(np.diff(time_s) <= 0):

@@ -49,7 +49,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     projections, bad = _convert(source.name(header.data_address), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
     kept = mask[used] if mask is not None and mask.ndim == 3 else mask
-    return replace(header.scan, projections=projections, pixel_mask=_united(kept, bad), reference=reference)
+    return replace(header.scan, projections=projections, pixel_mask=united(kept, bad), reference=reference)
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
@@ -203,7 +203,7 @@ def _convert(
     return np.ascontiguousarray(projections, dtype=np.float32), bad
 
 
-def _united(mask: np.ndarray | None, bad: np.ndarray | None) -> np.ndarray | None:
+def united(mask: np.ndarray | None, bad: np.ndarray | None) -> np.ndarray | None:
     """Union of two masks, each (v, u) or (P, v, u) or None; a mask that marks nothing adds nothing."""
     if bad is None or not np.any(bad):
         return mask

@@ -15,44 +15,6 @@ PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")
 ROTATES = ("gantry", "sample")
 
-# What the reader looks for: a name outside this set that nearly is one of them is a misspelling.
-KNOWN_NAMES = frozenset(
-    {
-        "data",
-        "image_key",
-        "image_key_control",
-        "x_pixel_size",
-        "y_pixel_size",
-        "distance",
-        "count_time",
-        "detector_readout_time",
-        "frame_start_time",
-        "pixel_mask",
-        "rotation_angle",
-        "rotation_angle_end",
-        "name",
-        "title",
-        "readout_axis",
-        "readout_direction",
-        "detector_offset",
-        "detector_model",
-        "pulse_start",
-        "pulse_length",
-        "lag",
-        "saturation_level",
-        "saturation_share",
-        "kinematics",
-        "poses",
-        "grid",
-        "reference",
-        "provenance",
-        "time_s",
-        "angle_deg",
-        "pose",
-        "volume",
-    }
-)
-
 # Standard fields that would move the geometry and that this package does not read.
 IGNORED = (
     f"{DETECTOR}/transformations",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, top_row_first
+from phyradgs_cl.report.pictures.png import base64_of, bytes_of, png_bytes, top_row_first
 from phyradgs_cl.report.pictures.preview import grey_range
 
 LONGEST_EDGE = 192  # pixels of a slice in the page
@@ -90,7 +89,7 @@ def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Map
         place = grid.first_centre_mm[axis], grid.voxel_size_mm[axis]
         height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
         pictures = {
-            key: [_base64(_picture(v, axis, i, windows[key].least, windows[key].most)) for i in indices]
+            key: [base64_of(_picture(v, axis, i, windows[key].least, windows[key].most)) for i in indices]
             for key, v in layers.items()
         }
         first = windows["result"]
@@ -111,10 +110,6 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
     """A slice as a grey PNG, black ``low`` and white ``high``."""
     return png_bytes(top_row_first(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
-
-
-def _base64(png: bytes) -> str:
-    return base64.b64encode(png).decode("ascii")
 
 
 def _reduced(image: Volume) -> Volume:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping
 
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.markup import Markup, element, joined, json_block
-from phyradgs_cl.report.pictures.png import data_uri, diverging
+from phyradgs_cl.report.pictures.png import base64_of, data_uri, diverging
 from phyradgs_cl.report.pictures.slices import Plane, Window
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
@@ -116,7 +115,7 @@ def _choice(layers: list[str]) -> Markup:
 def _data(planes: list[Plane], windows: Mapping[str, Window]) -> dict[str, object]:
     """What the script needs: slices and where they are, windows with the decimals that 256 steps deserve, colours."""
     layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
-    colours = base64.b64encode(diverging().tobytes()).decode("ascii") if "difference" in windows else None
+    colours = base64_of(diverging().tobytes()) if "difference" in windows else None
     return {"planes": {plane.name: _plane_data(plane) for plane in planes}, "windows": layers, "colours": colours}
 
 

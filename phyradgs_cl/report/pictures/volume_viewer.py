@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_volume
 from phyradgs_cl.report.pictures.preview import grey_range
@@ -18,7 +19,7 @@ def view_volume(path: Path) -> None:
     Raises:
         InputError: napari is not installed; not a volume file of ours.
     """
-    napari = _napari()
+    napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
     add_volume(napari.Viewer(title=f"{path.name} – phyradgs"), read_volume(path), path.stem)
@@ -43,12 +44,3 @@ def add_volume(viewer: Any, stored: StoredVolume, name: str) -> None:
     # napari 0.9 has moved its overlays
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
     overlays.scale_bar.visible = True
-
-
-def _napari() -> Any:
-    try:
-        import napari
-    except ImportError as error:
-        expected, remedy = "the package napari, 0.5.4 or later", "pip install 'napari[all]'"
-        raise InputError("phyradgs view", "no napari", expected, remedy) from error
-    return napari

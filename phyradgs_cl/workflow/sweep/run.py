@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -117,16 +118,8 @@ class _Batch:
             for name, found in pool.results(make_run, by_name, look):
                 yield lost_line(by_name[name], found.reason) if isinstance(found, Lost) else found
 
-    def _say(
-        self,
-        running: int = 0,
-        line: Line | None = None,
-        name: str = "",
-        progress: Progress | None = None,
-        dashboard: str = "",
-    ) -> None:
-        told = SweepProgress(self.done, self.total, self.failed, running, line, name, progress, dashboard)
-        self.report(told)
+    def _say(self, **more: Any) -> None:
+        self.report(SweepProgress(self.done, self.total, self.failed, **more))
 
 
 def _results_file(folder: Path) -> Path:

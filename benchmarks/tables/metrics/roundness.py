@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics.beads import REACH, Array, Bead, levels, resolved, surroundings
+from tables.metrics.beads import REACH, Array, Bead, levels, resolved, surroundings
 
 RAYS = 72
 _STEPS_PER_VOXEL = 8

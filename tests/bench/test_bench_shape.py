@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erfc
+from tables.metrics import Bead, edge_sharpness, roundness
+from tables.metrics.beads import resolved
+from tables.metrics.edge import RISE_PER_SIGMA, bead_edge, blurred_ball
+from tables.metrics.roundness import bead_sections
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics import Bead, edge_sharpness, roundness
-from phyradgs_cl.metrics.beads import resolved
-from phyradgs_cl.metrics.edge import RISE_PER_SIGMA, bead_edge, blurred_ball
-from phyradgs_cl.metrics.roundness import bead_sections
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 GRID = Grid.cube(64, 32.0)  # half a millimetre per voxel

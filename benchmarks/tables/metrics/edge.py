@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics.beads import Array, Bead, levels, resolved, surroundings
+from tables.metrics.beads import Array, Bead, levels, resolved, surroundings
 
 RISE_PER_SIGMA = 2.5631031310892007  # between the 10th and the 90th percentile of a normal distribution
 
