@@ -1,7 +1,7 @@
 """Why the balls of the sphere phantom come out too dense from fly-scans: one thing changed at a time.
 
-The scans are those of `python benchmarks/tables phantom`, and for comparison free of noise and jitter, and with line
-integrals averaged over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the balls
+The scans are those of `python benchmarks/tables phantom`; for comparison free of noise and jitter, and with line integrals
+averaged over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the balls
 over the true one, less 1; that of the total is of the whole volume.
 """
 
