@@ -1,6 +1,6 @@
 """Why the beads of the sphere phantom come out too dense from fly-scans: one thing changed at a time.
 
-The scans are those of `phyradgs bench phantom`, and for comparison free of noise and jitter, and with line integrals
+The scans are those of `python benchmarks/tables phantom`; for comparison free of noise and jitter, and with line integrals
 averaged over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the beads
 over the true one, less 1; that of the total is of the whole volume.
 """

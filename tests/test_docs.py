@@ -105,7 +105,7 @@ def test_the_reference_names_every_command_option_and_public_name() -> None:
 def test_the_site_builds_without_a_broken_link(tmp_path) -> None:
     """Strictly: a link, an anchor or a page that is nowhere ends the build."""
     root = DOCS.parent
-    arguments = ["build", "--strict", "--quiet", "--config-file", str(root / "mkdocs.yml")]
+    arguments = ["build", "--strict", "--config-file", str(root / "mkdocs.yml")]  # --quiet hides warnings from --strict
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", *arguments, "--site-dir", str(tmp_path / "site")],
         capture_output=True,

@@ -17,7 +17,7 @@ class Rates:
     """(first, last) rate of each kind of parameter, in internal units (half-sides of the volume).
 
     The default rates are two to ten times the published ones, which are made for 20,000 iterations and more: at
-    3,000 they leave 1 to 2 dB on the table (docs/benchmarks.md).
+    3,000 they leave 1 to 2 dB on the table (docs/results/settings.md).
     """
 
     position: tuple[float, float] = (2e-3, 2e-4)
