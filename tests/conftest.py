@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -13,11 +14,30 @@ import pytest
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent / "benchmarks")]
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thread of PoCL's, as what it starts has
+    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
+
+from quick import is_quick  # noqa: E402
+
 from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
 from phyradgs_cl.acquisition.cells import TimeCells  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 Cloud = Callable[..., np.ndarray]
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if is_quick(item.nodeid.partition("tests/")[2]):
+            item.add_marker("quick")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    """Workers send what a test has printed as UTF-8, which not every name of a file is."""
+    report = yield
+    report.sections = [(title, said.encode(errors="backslashreplace").decode()) for title, said in report.sections]
+    return report
 
 
 @pytest.fixture(autouse=True)
