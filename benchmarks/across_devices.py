@@ -29,8 +29,14 @@ from phyradgs_cl.acquisition.cells import (
 from phyradgs_cl.api import simulate
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation, TvDescent, TvProx
-from phyradgs_cl.operators import DeviceCells, RayOperator, SplatProjector, backproject, backproject_lines
-from phyradgs_cl.operators.splats import voxelise
+from phyradgs_cl.operators import (
+    DeviceCells,
+    RayOperator,
+    SplatProjector,
+    backproject,
+    backproject_lines,
+    voxelise,
+)
 from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.optim import DeviceAdam
 from phyradgs_cl.reconstructors import method_options, reconstruct

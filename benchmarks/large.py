@@ -22,8 +22,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, 
 from phyradgs_cl.acquisition.cells import static_cells
 from phyradgs_cl.estimate import peak_host_bytes
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import RayOperator, backproject
-from phyradgs_cl.operators.splats import voxelise
+from phyradgs_cl.operators import RayOperator, backproject, voxelise
 from phyradgs_cl.runtime import Runtime, bytes_of
 
 

@@ -27,20 +27,21 @@ from pathlib import Path
 import numpy as np
 from files import imported, write_nxtomo, write_rtk, write_tiffs
 from kinds import FAULTS, GOOD, Kind
-from objects import VOXEL_MM, density
+from objects import VOXEL_MM, another, density
 from recording import SHEPP_LOGAN, counted, shepp_logan, transmissions
 
 
-def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str]) -> dict[str, object]:
-    """Makes one scan and its truth; returns the manifest's line."""
+def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str], seed: int) -> dict[str, object]:
+    """Makes one scan and its truth; returns the manifest's line. ``seed``: of noise; not 0: other stored volumes too."""
     setup, panel = kind.setup, kind.counting
-    shape = None if kind.scanned == SHEPP_LOGAN else density(kind.scanned, volumes)
+    scanned = another(kind.scanned, seed)
+    shape = None if scanned == SHEPP_LOGAN else density(scanned, volumes)
     passed, scale = transmissions(setup, shape, panel.peak)
     truth = scale * (shepp_logan() if shape is None else shape)
     name = f"{group}/{kind.name}.h5"
     target, source = out / name, out / "source" / kind.name
     part = target.with_suffix(".part.h5")
-    rng = np.random.default_rng(zlib.crc32(kind.name.encode()))
+    rng = np.random.default_rng([zlib.crc32(kind.name.encode()), *([seed] if seed else [])])
     if kind.form in ("attenuation", "transmission"):
         write_nxtomo(
             part, kind.name, kind.statement, -np.log(passed) if kind.form == "attenuation" else passed
@@ -62,7 +63,7 @@ def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str]) -
         "file": name,
         "group": group,
         "kind": kind.name,
-        "object": kind.scanned,
+        "object": scanned,
         "planted": kind.planted,
         "right": kind.right,
         "names": kind.names,
@@ -79,6 +80,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--volumes", type=Path, required=True)
     parser.add_argument("--only", action="append", help="a scan's name; repeatable")
+    parser.add_argument("--seed", type=int, default=0, help="other noise, and stored volumes in each other's place")
     parser.add_argument("--phyradgs", default="phyradgs", help="the command that imports")
     options = parser.parse_args()
     for folder in ("good", "fault", "truth", "source"):
@@ -91,7 +93,7 @@ def main() -> None:
             if kind.name in there or (options.only and kind.name not in options.only):
                 continue
             started = time.perf_counter()
-            line = make(kind, group, options.out, options.volumes, shlex.split(options.phyradgs))
+            line = make(kind, group, options.out, options.volumes, shlex.split(options.phyradgs), options.seed)
             with manifest.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
             print(f"{line['file']}: {time.perf_counter() - started:.1f} s", file=sys.stderr, flush=True)

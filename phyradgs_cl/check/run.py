@@ -10,18 +10,26 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.angles import check_angles
-from phyradgs_cl.check.coarse import FINE, QUICK, coarse
-from phyradgs_cl.check.coverage import check_coverage
-from phyradgs_cl.check.dead_pixels import check_dead_pixels
-from phyradgs_cl.check.exposure import check_exposure
-from phyradgs_cl.check.finding import FEWEST_COLUMNS, SUSPICIOUS, Finding, too_narrow
-from phyradgs_cl.check.gain import best_level, check_gain, without_drift
-from phyradgs_cl.check.offset import CENTRE, Offset, best_offset, block_of, check_offset, rough_offset
-from phyradgs_cl.check.readout import check_readout
-from phyradgs_cl.check.rotation import SIGN, check_rotation, is_clear
-from phyradgs_cl.check.saturation import CountReader, check_saturation
-from phyradgs_cl.check.timing import check_timing
+from phyradgs_cl.check.coarse import FINE, QUICK, coarse, some_frames
+from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
+from phyradgs_cl.check.questions.angles import check_angles
+from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
+from phyradgs_cl.check.questions.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
+from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
+from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
+from phyradgs_cl.check.questions.gain import GAIN, check_gain
+from phyradgs_cl.check.questions.offset import (
+    CENTRE,
+    Offset,
+    best_offset,
+    block_of,
+    check_offset,
+    rough_offset,
+)
+from phyradgs_cl.check.questions.readout import READOUT, check_readout
+from phyradgs_cl.check.questions.rotation import SIGN, check_rotation, is_clear
+from phyradgs_cl.check.questions.saturation import OVERFLOW, CountReader, check_saturation
+from phyradgs_cl.check.questions.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
@@ -35,6 +43,7 @@ class CheckResult:
     findings: list[Finding]
     offset_mm: float
     offset_spread_mm: float
+    is_consistent: bool = True
 
     @property
     def suspicious(self) -> list[Finding]:
@@ -45,43 +54,72 @@ def check(
     scan: Scan,
     rt: Runtime,
     counts: CountReader | None = None,
-    report: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[int, int, str], None] = lambda done, total, question: None,
 ) -> CheckResult:
     """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was.
+
+    ``report`` gets how many questions are answered, of how many, and the one that is asked next.
 
     Raises:
         InputError: every pixel is masked; NaN or infinity where none is.
     """
     scan = prepared(_usable(scan), InputOptions())
-    total = 8 + (scan.is_fly and scan.shutter.readout_s > 0) + (scan.is_fly and scan.shutter.exposure_s > 0)
+    asks_readout = scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0
+    asks_exposure = scan.shutter.exposure_s > 0
+    names = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, GAIN]
+    names += [READOUT] * asks_readout + [EXPOSURE] * asks_exposure
     found: list[Finding] = []
 
     def add(finding: Finding) -> Finding:
         found.append(finding)
-        report(len(found), total)
+        report(len(found), len(names), names[len(found)] if len(found) < len(names) else "")
         return finding
 
+    report(0, len(names), names[0])
     add(check_timing(scan))
     add(check_angles(scan))
-    add(check_saturation(scan, counts))
+    saturation = add(check_saturation(scan, counts))
+
+    def leave_the_rest() -> CheckResult:
+        cause = found[-1]
+        for name in names[len(found) :]:
+            add(Finding(name, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))
+        return CheckResult(found, math.nan, math.nan, False)
+
+    if saturation.unit == OVERFLOW:
+        return leave_the_rest()
     finding, dead = check_dead_pixels(scan)
+    if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as still as a dead one
+        finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
     add(finding)
     scan = _without(scan, dead)
-    add(check_coverage(scan))
+    if add(check_coverage(scan)).unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
+        return leave_the_rest()
     quick = coarse(scan, QUICK)
-    is_reversed, offset, centre = _turning(rt, quick, add)
+    fits = check_consistency(rt, quick)
+    add(fits.finding)
+    if not fits.is_sound:
+        return leave_the_rest()
+    quick = some_frames(quick, fits.kept)
+    is_reversed, offset, centre = _turning(rt, quick, add, fits.sees_angles)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     quick = _under(quick, is_reversed, offset, centre)
-    drift, level = _gain(rt, quick, add)
-    if scan.is_fly and scan.shutter.readout_s > 0:
-        fine = _under(coarse(scan, FINE), is_reversed, offset, centre)
-        add(check_readout(rt, without_drift(fine, drift, level)))
-    if scan.is_fly and scan.shutter.exposure_s > 0:
-        add(check_exposure(rt, without_drift(quick, drift, level)))
+    add(check_gain(rt, quick))
+    if asks_readout:
+        fine = _under(some_frames(coarse(scan, FINE), fits.kept), is_reversed, offset, centre)
+        add(check_readout(rt, fine) if fits.sees_angles else _looks_alike(READOUT))
+    if asks_exposure:
+        add(check_exposure(rt, quick) if fits.sees_angles else _looks_alike(EXPOSURE))
     return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
 
 
-def _turning(rt: Runtime, quick: Scan, add: Callable[[Finding], Finding]) -> tuple[bool, Offset, Finding]:
+def _looks_alike(question: str) -> Finding:
+    return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks the same from every angle")
+
+
+def _turning(
+    rt: Runtime, quick: Scan, add: Callable[[Finding], Finding], sees_angles: bool
+) -> tuple[bool, Offset, Finding]:
     """(whether the gantry turns the other way, where its axis is on the panel, what was found about the axis).
 
     A panel of few columns says neither: its reconstructions fit whatever the shift.
@@ -89,7 +127,10 @@ def _turning(rt: Runtime, quick: Scan, add: Callable[[Finding], Finding]) -> tup
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         add(too_narrow(SIGN, "standard errors"))
         return False, Offset(math.nan, math.nan, np.empty(0)), add(too_narrow(CENTRE, "pixels"))
-    turned = reversed_rotation(quick)
+    if not sees_angles:
+        add(_looks_alike(SIGN))
+        return False, Offset(math.nan, math.nan, np.empty(0)), add(_looks_alike(CENTRE))
+    turned, block = reversed_rotation(quick), block_of(quick)
     stated, other = rough_offset(rt, quick), rough_offset(rt, turned)
     was_clear = is_clear(stated, other)
     if not was_clear:
@@ -98,7 +139,6 @@ def _turning(rt: Runtime, quick: Scan, add: Callable[[Finding], Finding]) -> tup
     offset = other if is_reversed else stated
     if was_clear:
         offset = best_offset(rt, turned if is_reversed else quick, offset)
-    block = block_of(quick)
     return is_reversed, offset, add(check_offset(offset, block, quick.geometry.pixel_size_mm[1] / block))
 
 
@@ -113,15 +153,6 @@ def _usable(scan: Scan) -> Scan:
         return scan
     checks.finite("projections", p[valid])
     return replace(scan, projections=np.where(finite, p, 0).astype(np.float32))
-
-
-def _gain(rt: Runtime, scan: Scan, add: Callable[[Finding], Finding]) -> tuple[float, float]:
-    """(logarithm of the gain's growth, constant) to be taken out of the line integrals; zeros where the gain is steady."""
-    finding = add(check_gain(rt, scan))
-    if finding.verdict != SUSPICIOUS:
-        return 0.0, 0.0
-    drift = math.log1p(finding.value)
-    return drift, best_level(rt, without_drift(scan, drift))
 
 
 def _without(scan: Scan, dead: np.ndarray) -> Scan:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.trajectory import Trajectory
+from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
 
 _MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at the plane y = 0
 
@@ -78,3 +81,68 @@ def exposed(scan: Scan, factor: float) -> Scan:
 def shifted(scan: Scan, pixels: float) -> Scan:
     """The panel moved along u by ``pixels`` of the scan as it was recorded, whatever it was binned to."""
     return with_path(scan, shift_px=pixels)
+
+
+@dataclass(frozen=True, eq=False)
+class Changed:
+    """Poses of ``base`` after ``change`` (frame, poses (..., 12)) → poses."""
+
+    base: Trajectory
+    change: Callable[[int, np.ndarray], np.ndarray]
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Poses (..., 12) at times (...)."""
+        return self.change(frame, np.array(self.base.pose(frame, time_s)))
+
+
+def at_rest(scan: Scan) -> Scan:
+    """The gantry standing while it exposes."""
+    return replace(scan, is_fly=False)
+
+
+def read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
+    """Lines along ``axis`` read one after another in ``readout_s``."""
+    shutter = replace(scan.shutter, axis=axis, direction=direction, readout_s=readout_s)
+    return replace(scan, shutter=shutter, is_fly=True)
+
+
+def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
+    """Frames turned about z by ``angle_rad`` (F,), the gantry ``speed`` times as fast within them."""
+    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
+    first_rad = azimuth_rad(np.concatenate(starts))
+
+    def change(frame: int, pose: np.ndarray) -> np.ndarray:
+        since = wrapped(azimuth_rad(pose) - first_rad[frame])
+        return _rotated(pose, angle_rad[frame] + (speed - 1) * since)
+
+    return replace(scan, trajectory=Changed(scan.trajectory, change))
+
+
+def stretched(scan: Scan, v: float, u: float) -> Scan:
+    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel.
+
+    The box grows alike if it then fits what the panel sees better than as it is.
+    """
+    rows, columns = scan.geometry.detector_shape
+
+    def change(frame: int, pose: np.ndarray) -> np.ndarray:
+        pose[..., 3:6] -= (columns - 1) / 2 * (u - 1) * pose[..., 6:9] + (rows - 1) / 2 * (v - 1) * pose[..., 9:12]
+        pose[..., 6:9] *= u
+        pose[..., 9:12] *= v
+        return pose
+
+    seen_mm = u * columns * scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
+    share = max(scan.grid.size_mm[1:]) / seen_mm
+    grows = abs(math.log(share * u)) < abs(math.log(share))
+    z, y, x = scan.grid.voxel_size_mm
+    grid = replace(scan.grid, voxel_size_mm=(v * z, u * y, u * x)) if grows else scan.grid
+    return replace(scan, trajectory=Changed(scan.trajectory, change), grid=grid)
+
+
+def _rotated(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Poses (..., 12) turned about z by angles (...)."""
+    cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
+    vectors = pose.reshape(*pose.shape[:-1], 4, 3).copy()
+    x, y = vectors[..., 0].copy(), vectors[..., 1].copy()
+    vectors[..., 0], vectors[..., 1] = cos * x - sin * y, sin * x + cos * y
+    return vectors.reshape(pose.shape)

@@ -56,5 +56,9 @@ def bench_command(
     wish, folder = device_wish(device), output or Path("bench-results")
     asked = scheduler is not None or workers is not None
     pool = chosen_workers(scheduler, workers, device) if asked else None
-    grid = quick_grid(folder, lambda: Runtime(wish), seed=seed, iterations=iterations)
-    make_sweep(SweepJob(grid, folder, pool, wish if pool is None else None))
+
+    def prepared() -> SweepJob:
+        grid = quick_grid(folder, lambda: Runtime(wish), seed=seed, iterations=iterations)
+        return SweepJob(grid, folder, pool, wish if pool is None else None)
+
+    make_sweep(folder, prepared)

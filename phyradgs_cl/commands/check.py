@@ -42,17 +42,20 @@ def check_command(
     ] = None,
     device: Device = None,
 ) -> int:
-    """Look for what is wrong or suspicious in a scan: timing, angles, pixels, signs, gain, centre of rotation.
+    """Look for what is wrong or suspicious in a scan: timing, angles, pixels, order of frames,
+    signs, gain, centre of rotation.
 
+    Frames that do not fit together are named, and other questions then answered without them, or not at all.
     Ends with status 0 if nothing was found and 10 if something is suspicious.
     """
     wish = device_wish(device)
     target = _checked_output(scan, fix_offset, output)
     counts = CountReader()
-    with expecting(scan, "scan"):
-        loaded = read_scan(scan, counts)
     with Ticker("question") as ticker:
-        found = check(loaded, Runtime(wish), counts, ticker.show)
+        ticker.stage(f"reading {scan.name}")
+        with expecting(scan, "scan"):
+            loaded = read_scan(scan, counts)
+        found = check(loaded, Runtime(wish), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
     say(_as_json(found, scan) if as_json else _as_text(found))
     if target is not None:
         _write_copy(scan, target, found, quiet=as_json)
@@ -70,6 +73,9 @@ def _checked_output(scan: Path, fix_offset: bool, output: Path | None) -> Path |
 
 
 def _write_copy(scan: Path, target: Path, found: CheckResult, quiet: bool) -> None:
+    if not found.is_consistent:
+        remedy = "set right what is suspicious, and check again"
+        raise InputError("--fix-offset", "frames that do not fit together", "an offset that means something", remedy)
     if not (math.isfinite(found.offset_mm) and math.isfinite(found.offset_spread_mm)):
         raise InputError(
             "--fix-offset", "no offset that fits best", "a scan whose frames tell it", "leave it out"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -52,23 +53,24 @@ def sweep_command(
     """Reconstruct many scans with many settings: a resumable results file, volumes, and tables."""
     read = read_grid(read_config(grid, "GRID"), grid)
     where = chosen_workers(scheduler, workers, device)  # may say something, and an error has one line
-    make_sweep(SweepJob(read, output, where, device if where is None else None, checkpoint_every))
+    here = device if where is None else None
+    make_sweep(output, lambda: SweepJob(read, output, where, here, checkpoint_every))
 
 
-def make_sweep(job: SweepJob) -> None:
-    """Runs a sweep with progress, and says what was written."""
-    interrupted = f"interrupted: finished runs are in {job.folder / RESULTS}; repeat the command to go on"
+def make_sweep(folder: Path, prepared: Callable[[], SweepJob]) -> None:
+    """Runs the sweep that is ``prepared`` into ``folder``, with progress, and says what was written."""
+    interrupted = f"interrupted: finished runs are in {folder / RESULTS}; repeat the command to go on"
     signals.say_at_the_end(interrupted)
     try:
         with SweepTicker() as ticker:
-            written, failed = run_sweep(job, ticker)
+            written, failed = run_sweep(prepared(), ticker)
     except KeyboardInterrupt:
         complain(interrupted)
         raise typer.Exit(signals.status()) from None
     for path in written:
         say(str(path))
     if failed:
-        complain(f"{failed} runs failed: {job.folder / 'results.md'} says why; repeat the command to try again")
+        complain(f"{failed} runs failed: {folder / 'results.md'} says why; repeat the command to try again")
         raise typer.Exit(2)
 
 

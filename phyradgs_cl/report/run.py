@@ -18,6 +18,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +119,7 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
         with suppress(InputError):  # whatever else there is: it may be any file of this machine
             if file_kind(place) == "scan" and sha256_of(place) == known:
                 return place
-    notes.append(f"The scan {named} was not found, or has changed since; --scan names it.")
+    notes.append(f"The scan {plain_text(named)} was not found, or has changed since; --scan names it.")
     return None
 
 

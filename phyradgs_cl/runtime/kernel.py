@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import pyopencl as cl
+from phyradgs_cl.runtime.opencl import cl
 
 
 @dataclass(eq=False)

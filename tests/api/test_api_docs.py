@@ -28,6 +28,5 @@ def test_the_page_names_everything_and_nothing_else() -> None:
     table = TEXT.split("## A scan")[0]
     missing = [name for name in api.__all__ if f"`{name}" not in table]
     assert not missing
-    assert len(api.__all__) == 16 and "sixteen names" in table
     for name in re.findall(r"from phyradgs_cl\.api import (.*)", TEXT):
         assert set(re.split(r",\s*", name)) <= set(api.__all__)

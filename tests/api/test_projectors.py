@@ -20,7 +20,7 @@ from phyradgs_cl.api import (
 )
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import voxelise
 from phyradgs_cl.operators.twins.splat import splat_frame
 
 VOXELS = 5e-3  # of the peak: linear between voxels of a quarter σ and less: 0.3 % measured

@@ -9,11 +9,11 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, Saturation
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
-from phyradgs_cl.check.angles import check_angles
-from phyradgs_cl.check.coverage import check_coverage
-from phyradgs_cl.check.dead_pixels import check_dead_pixels
-from phyradgs_cl.check.saturation import check_saturation
-from phyradgs_cl.check.timing import check_timing, exposure_arc_rad
+from phyradgs_cl.check.questions.angles import check_angles
+from phyradgs_cl.check.questions.coverage import check_coverage
+from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
+from phyradgs_cl.check.questions.saturation import check_saturation
+from phyradgs_cl.check.questions.timing import check_timing, exposure_arc_rad
 
 
 def some_frames(scan, chosen):

@@ -224,10 +224,10 @@ def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(s
     body = """
         import phyradgs_cl.reconstructors.voxels.run as i
         from phyradgs_cl.errors import DeviceError
-        def iterate(loop):
+        def iterate(run):
             signal.raise_signal(signal.SIGINT)
             raise DeviceError("kernel rays.cl", "linker command failed", "a program that builds")
-        i._Loop._iterate = iterate
+        i._Iterations.step = iterate
     """
     output = tmp_path / "volume.h5"
     done = run_process(["reconstruct", str(scan), "--method", "sirt", "-o", str(output)], body)

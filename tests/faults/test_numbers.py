@@ -14,8 +14,7 @@ from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, SCALE
-from phyradgs_cl.operators import DeviceCells, DeviceGaussians, RayOperator, SplatProjector
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, RayOperator, SplatProjector, voxelise
 from phyradgs_cl.optim import DeviceAdam
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions

@@ -26,8 +26,7 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Protocol, Scan, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import DeviceCells, SplatProjector
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import DeviceCells, SplatProjector, voxelise
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate

@@ -12,11 +12,17 @@ from tolerances import BRICKS
 
 from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import RayOperator, RayProjector, Voxeliser, backproject, backproject_lines
+from phyradgs_cl.operators import (
+    RayOperator,
+    RayProjector,
+    Voxeliser,
+    backproject,
+    backproject_lines,
+    voxelise,
+)
 from phyradgs_cl.operators.bricks import cut
 from phyradgs_cl.operators.rays import launches as rays
 from phyradgs_cl.operators.splats import binning
-from phyradgs_cl.operators.splats.voxelise import voxelise
 from phyradgs_cl.runtime import Room
 
 SHAPE = (7, 37)

@@ -20,8 +20,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, 
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import RayProjector
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import RayProjector, voxelise
 from phyradgs_cl.operators.twins.rays import joseph_adjoint, joseph_image, ray_frame
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z, shepp_logan

@@ -15,8 +15,7 @@ from tolerances import (
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
-from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceGaussians, Voxeliser
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceGaussians, Voxeliser, voxelise
 from phyradgs_cl.operators.twins.splat import voxel_field
 from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 

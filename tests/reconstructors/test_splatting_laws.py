@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, PerRow, Pro
 from phyradgs_cl.detector import attenuation_to_counts, counts_to_attenuation
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.result import Progress

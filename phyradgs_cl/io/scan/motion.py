@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -17,6 +18,7 @@ from phyradgs_cl.acquisition import (
     Scan,
     SpeedRamp,
 )
+from phyradgs_cl.acquisition.trajectory import ConstantSpeed, sampled
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5.datasets import new_group, read_array, read_attribute, write_number
 from phyradgs_cl.io.hdf5.source import Hdf5Source
@@ -24,6 +26,7 @@ from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 
 _log = logging.getLogger(__name__)
+_KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # what files can hold
 _RAMP_ERROR_RAD = 1e-9
 _MOST_RAMP_SAMPLES = 500_000
 _SUSPECT_RAD = math.radians(5.0)
@@ -72,6 +75,15 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
     # The end angle turns as the start angle does, unless it says so itself.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
+
+
+def storable(scan: Scan) -> Scan:
+    """The scan with a trajectory that files can hold: one of one's own becomes a table, to a ten-thousandth of a pixel."""
+    path = scan.trajectory
+    if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
+        return scan
+    error_mm = 1e-4 * min(scan.geometry.pixel_size_mm)
+    return replace(scan, trajectory=sampled(path, scan.frame_start_s, scan.shutter.span_s, error_mm))
 
 
 def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:

@@ -17,7 +17,7 @@ from phyradgs_cl.io.hdf5.grid import write_grid
 from phyradgs_cl.io.hdf5.new import new_hdf5
 from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.scan import schema
-from phyradgs_cl.io.scan.motion import write_motion
+from phyradgs_cl.io.scan.motion import storable, write_motion
 from phyradgs_cl.text import plain_text
 
 _log = logging.getLogger(__name__)
@@ -35,7 +35,8 @@ def write_scan(
 
     Args:
         path: the HDF5 file; one that exists is replaced.
-        scan: geometry, timing, masks, reference, and the line integrals unless ``data`` is given.
+        scan: geometry, timing, masks, reference, and the line integrals unless ``data`` is given. A trajectory of one's own
+            is sampled into a table of poses.
         data: (F, v, u) float32 or uint16 raw frames, flats and darks included, in place of them.
         image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid; it has as many 0 as ``scan`` has frames.
         quantity: what ``data`` holds: "attenuation", "transmission" or "counts".
@@ -46,6 +47,7 @@ def write_scan(
     """
     frames, key = _checked_frames(scan, data, image_key, quantity)
     _check_expressible(scan)
+    scan = storable(scan)
     with written_beside(path) as temporary, new_hdf5(temporary) as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         entry = new_group(file, "entry", "NXentry")

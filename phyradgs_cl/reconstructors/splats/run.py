@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
-from phyradgs_cl.operators.splats.voxelise import voxelise
+from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import Population, control_density
 from phyradgs_cl.reconstructors.checkpoint import check_cloud, count_of, restore_generator
 from phyradgs_cl.reconstructors.result import State, state_arrays

@@ -49,7 +49,7 @@ def exposure_arc_rad(scan: Scan) -> float:
     frame = scan.frames // 2
     start_s = float(scan.frame_start_s[frame])
     ends = azimuth_rad(scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s])))
-    return abs(float(_wrapped(ends[1:] - ends[:1])[0]))
+    return abs(float(wrapped(ends[1:] - ends[:1])[0]))
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
@@ -74,8 +74,8 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
         times_s = starts_s[frame] + np.array([0.0, span_s])
         first, last = azimuth_rad(scan.trajectory.pose(frame, times_s))
         following = azimuth_rad(scan.trajectory.pose(frame + 1, starts_s[frame + 1 : frame + 2]))[0]
-        moved[frame] = _wrapped(last - first) * (starts_s[frame + 1] - starts_s[frame]) / span_s
-        stepped[frame] = moved[frame] + _wrapped(following - first - moved[frame])
+        moved[frame] = wrapped(last - first) * (starts_s[frame + 1] - starts_s[frame]) / span_s
+        stepped[frame] = moved[frame] + wrapped(following - first - moved[frame])
     apart = float(np.median(np.abs(stepped - moved))) / max(float(np.median(np.abs(stepped))), 1e-9)
     text = f"the angles between frames are {100 * apart:.2f} % from those that the speed in the frames gives"
     if apart <= _APART:
@@ -93,5 +93,6 @@ def _worst(*findings: Finding) -> Finding:
     return wrong[0] if wrong else max(findings, key=lambda f: f.value / f.threshold)
 
 
-def _wrapped(angle: np.ndarray | float) -> np.ndarray:
+def wrapped(angle: np.ndarray | float) -> np.ndarray:
+    """Angles (...) in radians, in [-π, π)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

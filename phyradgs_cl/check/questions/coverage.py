@@ -14,7 +14,10 @@ _LARGEST_SHARE = 0.1  # of the largest line integral
 _DISPLACED = 0.1  # of the panel's width: from here a panel is shifted on purpose
 _NOISES = 4.0
 _OPAQUE = 30.0  # line integral: nothing comes through
+_INVERTED = 0.9  # of the largest value: from here the sides are not air but the brightest there is
+_BRIGHT = 0.05  # of the pixels: how many may be brighter than the flats
 _FRAMES = 0.1  # of all: how many may touch a border
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units: line integrals mean nothing then
 _QUESTION = "coverage"
 
 
@@ -35,12 +38,22 @@ def check_coverage(scan: Scan) -> Finding:
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
         advice = "was the object in the beam? Are the values line integrals, larger where more is in the way?"
-        return Finding(_QUESTION, SUSPICIOUS, largest, noise, "line integral", text, advice)
+        return Finding(_QUESTION, SUSPICIOUS, largest, noise, NO_OBJECT, text, advice)
+    air = float(np.median(p[:, :, [0, -1]]))
+    if air > _INVERTED * largest:
+        text = f"values are largest, {air:.3g}, beside the object"
+        advice = "are these transmissions, or inverted images? Say which: import --quantity, or quantity of the data"
+        return Finding(_QUESTION, SUSPICIOUS, air, _INVERTED * largest, NO_OBJECT, text, advice)
     if largest > _OPAQUE:
         text = f"line integrals reach {largest:.3g}: one photon in {math.exp(min(largest, 700)):.1g} comes through"
         advice = "are these counts, or transmission? Say which: import --quantity, or quantity of the data"
-        return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, "line integral", text, advice)
+        return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, OPAQUE, text, advice)
     threshold = max(_LARGEST_SHARE * largest, noise)
+    least = float(np.percentile(p if valid is None else p[valid], 100 * _BRIGHT))
+    if least < -threshold:
+        text = f"line integrals go down to {least:.3g}: pixels are brighter than the flats"
+        advice = "are the flats those of this scan, at its exposure and beam? Without flats: is the flat value right?"
+        return Finding(_QUESTION, SUSPICIOUS, -least, threshold, TOO_BRIGHT, text, advice)
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     allowed = _cut_on_purpose(scan)
     asked = {name: level for name, level in sides.items() if name != allowed}

@@ -15,7 +15,7 @@ from phyradgs_cl.check.variants import Path, shifted
 from phyradgs_cl.runtime import Runtime
 
 _SEARCH = (-2.0, -1.0, 0.0, 1.0, 2.0)  # coarse pixels
-_SEARCH_ITERATIONS = 6
+_SEARCH_ITERATIONS = 8
 _STEP = 0.25  # coarse pixels
 _MOST_STEPS = 8
 _TOLERATED = 0.2  # coarse pixels

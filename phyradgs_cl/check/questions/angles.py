@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.timing import azimuth_rad
+from phyradgs_cl.check.questions.timing import azimuth_rad
 
 _WIDE = 3.0  # times the median step
 _SAME_RAD = 1e-6

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.offset import Offset
+from phyradgs_cl.check.questions.offset import Offset
 from phyradgs_cl.check.statistics import gain, standing
 
-_ERRORS = 3.0
-_LEAST_GAIN, _CLEAR_GAIN = 1.02, 3.0
+_ERRORS = 4.0
+_LEAST_GAIN, _CLEAR_GAIN = 1.2, 3.0
 SIGN = "sign of rotation"
 
 
@@ -20,7 +20,7 @@ def is_clear(stated: Offset, other: Offset) -> bool:
 def check_rotation(stated: Offset, other: Offset) -> Finding:
     """Coarse reconstructions with the angles as they are and turned round, each with its own best panel shift.
 
-    Three standard errors decide, and a residual that is 2 % smaller: a mirror image in a narrow fan fits as well.
+    Four standard errors decide, and 20 % of the squared residual: a mirror image in a narrow fan fits as well.
     """
     errors, ratio = standing(stated.residuals, other.residuals), gain(stated.residuals, other.residuals)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"

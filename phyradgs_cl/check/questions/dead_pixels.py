@@ -38,8 +38,9 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     frames = np.asarray(scan.projections)[chosen]
     apart = _apart(frames) & ~(_shared(frames) & _near_axis(scan))
     dead = (_constant(frames) | apart) & ~known
-    share = float(dead.sum() / max(int((~known).sum()), 1))
-    text = f"{int(dead.sum())} pixels ({100 * share:.3g} %) that the mask does not have"
+    count = int(dead.sum())
+    share = count / max(int((~known).sum()), 1)
+    text = f"{count} pixels ({100 * share:.3g} %) that the mask does not have"
     if share <= _SHARE:
         return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text), dead
     row, column = (int(i[0]) for i in np.nonzero(dead))

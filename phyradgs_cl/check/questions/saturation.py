@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from phyradgs_cl.acquisition import Saturation, Scan
-from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.detector import clustered_share, counts_to_attenuation
 
 _SHARE = 1e-3  # of the pixels at one end
+_AGAIN = 3  # frames
 _ZERO = 1e-6  # line integral
+_CLIFF = 0.75  # of the brightest transmission, from a pixel to the next
+_CLIFFS = 5e-4  # of the pixels
+OVERFLOW = "overflow"  # unit of a finding after which line integrals mean nothing
 _QUESTION = "saturation"
 
 
@@ -39,8 +44,8 @@ class CountReader:
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     """The share of pixels that sit, with all their neighbours, at the same extreme value; 0.1 % is suspicious.
 
-    Noise that is cut off at 0 puts single pixels there, saturation whole areas. A line integral of exactly 0 is not
-    asked: it is air in simulated and in clipped scans.
+    Noise that is cut off at 0 puts single pixels there, saturation whole areas. Areas of exactly 0 are
+    air in simulated scans, and saturation where the flats are saturated too: they cannot tell.
     """
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
         return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
@@ -50,13 +55,24 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     masked = (
         np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)
     )
+    cliffs = _cliffs(p, masked)
+    if cliffs > _CLIFFS:
+        text = f"from a pixel to the next {100 * cliffs:.3g} % go from brightest to darkest"
+        advice = "did counts overflow (65,536 becomes 0)? Read the frames as unsigned, or lower the exposure"
+        return Finding(_QUESTION, SUSPICIOUS, cliffs, _CLIFFS, OVERFLOW, text, advice)
     lowest, highest = float(p[~masked].min()), float(p[~masked].max())
+    inverted = float(np.median(p[:, :, [0, -1]])) == highest  # air is at the wrong end: not for this question to say
+    at_own_least = 0.0 if inverted else _at_own_least(p, masked)
     ends = {
-        "least": (0.0 if abs(lowest) < _ZERO else clustered_share((p == lowest) & ~masked), lowest),
-        "largest": (clustered_share((p == highest) & ~masked) if highest > _ZERO else 0.0, highest),
+        "least": (max(clustered_share((p == lowest) & ~masked & (abs(lowest) > _ZERO)), at_own_least), lowest),
+        "largest": (clustered_share((p == highest) & ~masked) if highest > _ZERO and not inverted else 0.0, highest),
     }
     name, (share, value) = max(ends.items(), key=lambda item: item[1][0])
     text = f"{100 * share:.3g} % of the pixels lie together at the {name} line integral, {value:.4g}"
+    zeros = clustered_share((np.abs(p) < _ZERO) & ~masked)
+    if share <= _SHARE < zeros:
+        text = f"{100 * zeros:.3g} % of the pixels lie together at 0: air without noise, or flats that are clipped too"
+        return Finding(_QUESTION, CANNOT_TELL, zeros, _SHARE, "share of pixels", text, "look at the raw counts")
     if share <= _SHARE:
         return Finding(_QUESTION, OK, share, _SHARE, "share of pixels", text)
     advice = {
@@ -70,3 +86,23 @@ def _clipped(found: Saturation, remedy: str) -> Finding:
     text = f"{100 * found.share:.3g} % of the pixels lie together at {found.level:g} counts"
     advice = f"the detector is saturated there: {remedy}"
     return Finding(_QUESTION, SUSPICIOUS, found.share, _SHARE, "share of pixels", text, advice)
+
+
+def _cliffs(p: np.ndarray, masked: np.ndarray) -> float:
+    """The share of pixels (F, v, u) that are as bright as any beside one that is dark; one or two dead ones aside."""
+    if p.shape[2] < 2:
+        return 0.0
+    transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
+    brightest = float(np.percentile(transmission[:: max(1, len(p) // 20)], 99))
+    jumps = np.abs(np.diff(median_filter(transmission, size=(1, 1, 5)), axis=2)) > _CLIFF * brightest
+    return float(np.median(jumps.mean((1, 2))))  # of most frames: a few that are odd are another question
+
+
+def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
+    """The share of pixels (F, v, u) that are at their own least value again and again: counts clipped before the flats.
+
+    Pixels that never change are dead, and line integrals of 0 are air in scans without noise.
+    """
+    least = p.min(0)
+    at = (p == least) & ~masked & (np.abs(least) > _ZERO) & (p.max(0) > least)
+    return clustered_share(at & (at.sum(0) >= _AGAIN))

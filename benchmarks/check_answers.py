@@ -1,0 +1,113 @@
+"""Asks `phyradgs check` about a folder of good scans and of scans with planted faults: a line of JSON a scan, resumable.
+
+    python benchmarks/check_answers.py FOLDER RESULTS.jsonl [--only PART,...]
+    python benchmarks/check_answers.py --table RESULTS.jsonl
+
+FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl``, a line a scan, which says what is
+planted, which questions may rightly be suspicious (``right``), and, where nothing can tell it, why (``undecidable``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from scans import append, read_lines
+
+from phyradgs_cl import __version__
+from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, CountReader, check
+from phyradgs_cl.errors import PhyradgsError
+from phyradgs_cl.io import read_scan
+from phyradgs_cl.runtime import Runtime
+
+FACTS = ("file", "group", "kind", "object", "planted", "right", "undecidable")
+
+
+def run_all(folder: Path, results: Path, only: list[str], device: str | None) -> None:
+    rt = Runtime(device)
+    done = {line["file"] for line in read_lines(results)}
+    for scan in read_lines(folder / "manifest.jsonl"):
+        name = str(scan["file"])
+        if name not in done and any(part in name for part in only):
+            append(results, {key: scan[key] for key in FACTS} | run_one(rt, folder / name))
+
+
+def run_one(rt: Runtime, path: Path) -> dict[str, object]:
+    started, cpu_started = time.perf_counter(), time.process_time()
+    try:
+        counts = CountReader()
+        found = check(read_scan(path, counts), rt, counts)
+    except PhyradgsError as error:
+        return {"findings": [], "error": str(error), "version": __version__}
+    return {
+        "findings": [finding.facts() for finding in found.findings],
+        "seconds": round(time.perf_counter() - started, 2),
+        "cpu_seconds": round(time.process_time() - cpu_started, 2),
+        "device": rt.device.name,
+        "version": __version__,
+    }
+
+
+def outcome(line: dict[str, Any]) -> str:
+    """silent or false alarm on a good scan; on another found, cannot tell, or missed, and whether another cause is blamed.
+
+    ``leaves no trace`` is a fault that no frame can show and about which nothing was said: neither an alarm nor a doubt.
+    """
+    said = {f["question"]: f["verdict"] for f in line["findings"]}
+    suspicious = {question for question, verdict in said.items() if verdict == SUSPICIOUS}
+    beside = suspicious - set(line["right"])
+    if line["group"] == "good":
+        return "false alarm" if beside else "silent"
+    unsure = any(said.get(question) == CANNOT_TELL for question in line["right"])
+    if suspicious & set(line["right"]) or "error" in line:
+        answer = "found"
+    else:
+        answer = "cannot tell" if unsure else "leaves no trace" if line["undecidable"] else "missed"
+    return f"{answer}, wrong cause blamed" if beside else answer
+
+
+def words(line: dict[str, Any]) -> str:
+    """What was said: the suspicious findings, else why those that should know cannot tell."""
+    if "error" in line:
+        return f"refused: {line['error']}"
+    chosen = [f for f in line["findings"] if f["verdict"] == SUSPICIOUS]
+    if not chosen and line["undecidable"]:
+        return str(line["undecidable"])
+    chosen = chosen or [f for f in line["findings"] if f["verdict"] == CANNOT_TELL and f["question"] in line["right"]]
+    return "; ".join(f"**{f['question']}** {f['text']}" for f in chosen).replace("|", "/")
+
+
+def table(path: Path) -> str:
+    """Markdown: a row a scan and the sums."""
+    lines = read_lines(path)
+    text = ["| planted | object | answer | in words |", "| --- | --- | --- | --- |"]
+    sums: dict[tuple[str, str], int] = {}
+    for line in sorted(lines, key=lambda line: line["group"] == "good"):
+        answer = outcome(line)
+        sums[line["group"], answer] = sums.get((line["group"], answer), 0) + 1
+        if line["group"] != "good" or answer != "silent":
+            text.append(f"| {line['planted']} | {line['object']} | {answer} | {words(line)} |")
+    good = [line["planted"] for line in lines if line["group"] == "good" and outcome(line) == "silent"]
+    text += ["", f"Silent on good scans: {'; '.join(good)}.", ""]
+    text += [f"- {group}: {answer} {count}" for (group, answer), count in sorted(sums.items())]
+    return "\n".join(text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder of scans")
+    parser.add_argument("results", type=Path, nargs="?", help="JSON lines, appended to")
+    parser.add_argument("--only", default="", help="comma-separated parts of file names")
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--table", action="store_true", help="print the table of the results file given as FOLDER")
+    arguments = parser.parse_args()
+    if arguments.table:
+        print(table(arguments.folder))
+    else:
+        run_all(arguments.folder, arguments.results, arguments.only.split(","), arguments.device)
+
+
+if __name__ == "__main__":
+    main()

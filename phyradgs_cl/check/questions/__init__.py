@@ -1,0 +1,1 @@
+"""One question a file: from a scan, or from fits to it, to a finding."""

@@ -1,0 +1,272 @@
+"""Do the frames fit together under what the file says of their order, angles and geometry?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.coarse import some_frames
+from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.frames import alike, odd_ones
+from phyradgs_cl.check.questions.offset import best_offset, rough_offset
+from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
+from phyradgs_cl.check.statistics import standing
+from phyradgs_cl.check.variants import Path, reversed_rotation, shifted, stretched, turned, with_path
+from phyradgs_cl.runtime import Runtime
+
+_LARGEST = 0.35  # residual over that of the frames in a random order: right scans of every kind leave 0.02 to 0.23
+_NEEDS_LOOK = 0.1
+_DRAWS = 2
+_FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32
+_CLEAR = 0.5  # squared residual of another order, step or size over the stated one's
+_ERRORS = 4.0
+_SYMMETRIC = 2.0  # residual in a random order over the stated one's
+_SAME = 0.03  # residual in a random order over the frames' own spread: less of both, and every angle looks alike
+_OUTLIER = 4.0  # residual of a frame over the usual one's
+_MOST_OUTLIERS = 0.2  # of the frames
+CONSISTENCY = "consistency"
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """The finding; the frames (indices) that fit together; whether other questions can be asked of them.
+
+    sees_angles: whether an object can be told from itself turned.
+    """
+
+    finding: Finding
+    kept: np.ndarray
+    is_sound: bool
+    sees_angles: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """Another order, step or size: what it is, what to do, and the scan under it."""
+
+    text: str
+    advice: str
+    scan: Callable[[], Scan]
+
+
+def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
+    """The residual of a coarse ``scan``, over that of its frames in a random order; and whatever explains them far better.
+
+    A wrong sign of rotation or a shifted panel has a question of its own: the best of these is what other causes, an
+    order or step of angles or a size of pixels, have to halve. Frames that stand out of the rest are left out first.
+    """
+    everything = np.arange(scan.frames)
+    if scan.frames < _FEWEST_FRAMES or _pixels(scan) < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
+        text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels a frame"
+        return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
+    kept, notes = _without_odd(scan)
+    unshifted, part = _best_turning(rt, some_frames(scan, kept))
+    stated = fit(system_of(rt, part))
+    left, part, stated, more = _without_outliers(rt, part, stated)
+    kept, unshifted, notes = kept[left], some_frames(unshifted, left), notes + more
+    spread = float(np.asarray(part.projections, np.float64).var()) * part.frames
+    random = _random_order(rt, part)
+    share = float(np.sqrt(stated.total / max(random, 1e-30)))
+    sees_angles = share * _SYMMETRIC < 1 or random > _SAME**2 * spread
+    text = f"residual {share:.2g} of that of the frames in a random order"
+    if not sees_angles:
+        text = "the frames look the same from every angle: their order and angles leave no trace"
+        verdict = SUSPICIOUS if notes else CANNOT_TELL
+        finding = _finding(verdict, share, "; ".join([*notes, text]), _about(notes))
+        return Consistency(finding, kept, True, False)
+    most = min(_CLEAR * stated.total, _LARGEST**2 * random)
+    cause = _cause(rt, unshifted, stated, most, looks_closely=share > _NEEDS_LOOK)
+    if cause is not None:
+        finding = _finding(SUSPICIOUS, share, "; ".join([*notes, cause.text]), cause.advice)
+        return Consistency(finding, kept, False, True)
+    if share > _LARGEST:
+        text = f"frames do not fit together, cause not found: {text}"
+        advice = "compare order, angles, distances and pixel sizes, flats and the panel's tilt with the scanner's log"
+        return Consistency(_finding(SUSPICIOUS, share, "; ".join([*notes, text]), advice), kept, False, True)
+    finding = _finding(SUSPICIOUS if notes else OK, share, "; ".join([*notes, text]), _about(notes))
+    return Consistency(finding, kept, True, True)
+
+
+def _pixels(scan: Scan) -> float:
+    """How many pixels of a frame may be used, on average."""
+    pixels = scan.projections[0].size
+    return pixels if scan.pixel_mask is None else float((np.asarray(scan.pixel_mask) == 0).mean()) * pixels
+
+
+def _finding(verdict: str, share: float, text: str, advice: str) -> Finding:
+    return Finding(CONSISTENCY, verdict, share, _LARGEST, "share", text, advice)
+
+
+def _about(notes: list[str]) -> str:
+    if not notes:
+        return ""
+    return "leave these frames out (image_key 3), or set them right; the other questions were asked without them"
+
+
+def _without_odd(scan: Scan) -> tuple[np.ndarray, list[str]]:
+    """(frames that do not stand out by themselves, what was said of the others)."""
+    odd, twice = odd_ones(scan.projections, scan.pixel_mask), alike(scan)
+    notes = [f"frame {_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
+    notes += [f"frame {_number(scan, f)} is frame {_number(scan, f - 1)} recorded twice" for f in twice]
+    return np.setdiff1d(np.arange(scan.frames), [*odd, *twice]), notes
+
+
+def _number(scan: Scan, frame: int) -> int:
+    """A frame's number in the file, from 0."""
+    path = scan.trajectory
+    return int(path.frames[frame]) if isinstance(path, Path) and path.frames is not None else int(frame)
+
+
+def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan]:
+    """The scan as it is, or turned the other way where that leaves far less; the same with its panel shifted, likewise."""
+    ways = [scan, reversed_rotation(scan)]
+    roughs = [rough_offset(rt, way) for way in ways]
+    best = int(np.argmin([rough.residuals.sum() for rough in roughs]))
+    offset = best_offset(rt, ways[best], roughs[best])
+    if not np.isfinite(offset.pixels):
+        return scan, scan
+    other = shifted(ways[best], offset.pixels)
+    is_better = fitted(rt, other).sum() < _CLEAR * fitted(rt, scan).sum()
+    return (ways[best], other) if is_better else (scan, scan)
+
+
+def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Scan, Fit, list[str]]:
+    """(frames (indices) without those whose residual is far above the others', the scan of them, its fit, what to say).
+
+    The worst goes first; where one in five would go, it is not a few frames but something that all share.
+    """
+    everything = left = np.arange(scan.frames)
+    current = stated
+    out: list[int] = []
+    while len(out) < _MOST_OUTLIERS * scan.frames:
+        size = np.sqrt(current.squares)
+        worst = int(np.argmax(size))
+        if size[worst] < _OUTLIER * np.median(size):
+            break
+        out.append(int(left[worst]))
+        left = np.delete(left, worst)
+        current = fit(system_of(rt, some_frames(scan, left)))
+    if not out or len(out) >= _MOST_OUTLIERS * scan.frames:
+        return everything, scan, stated, []
+    part = some_frames(scan, left)
+    names = [_number(scan, f) for f in out]
+    note = f"frame{'s' if len(out) > 1 else ''} {', '.join(map(str, sorted(names)))} (from 0) do not fit the others"
+    if len(out) == 2 and _fit_exchanged(rt, scan, out, stated):
+        note = f"frames {min(names)} and {max(names)} (from 0) fit if their order is exchanged"
+    return left, part, current, [note]
+
+
+def _fit_exchanged(rt: Runtime, scan: Scan, pair: list[int], stated: Fit) -> bool:
+    order = np.arange(scan.frames)
+    order[pair] = order[pair[::-1]]
+    return fitted(rt, replace(scan, projections=scan.projections[order])).sum() < _CLEAR * stated.total
+
+
+def _random_order(rt: Runtime, scan: Scan) -> float:
+    """Squared residual of the frames in orders that mean nothing."""
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(scan.frames) for _ in range(_DRAWS)]
+    return float(np.mean([fitted(rt, replace(scan, projections=scan.projections[o])).sum() for o in orders]))
+
+
+def _cause(rt: Runtime, scan: Scan, stated: Fit, most: float, looks_closely: bool) -> Cause | None:
+    """What explains the frames best, where its squared residual is below ``most``: of frames that then fit together."""
+    best, least = None, most
+    for cause in _causes(scan, looks_closely):
+        squares = fitted(rt, cause.scan())
+        if squares.sum() < least and standing(stated.squares, squares) <= -_ERRORS:
+            best, least = cause, float(squares.sum())
+    return best
+
+
+def _causes(scan: Scan, looks_closely: bool) -> Iterator[Cause]:
+    yield from _arcs(scan)
+    yield from _sizes(scan)
+    if looks_closely:
+        yield from _orders(scan)
+        yield from _missing(scan)
+
+
+def _orders(scan: Scan) -> Iterator[Cause]:
+    path = with_path(scan).trajectory
+    numbers = np.arange(scan.frames) if path.frames is None else path.frames
+    count = int(numbers[-1]) + 1
+    starts = np.interp(np.arange(count), numbers, scan.frame_start_s)
+    for first in (0, 1):
+        lexical = np.array(sorted(range(first, count + first), key=str)) - first
+        if (lexical == np.arange(count)).all():
+            continue
+        true = lexical[numbers]
+
+        def ordered(true: np.ndarray = true) -> Scan:
+            return replace(with_path(scan, frames=true), frame_start_s=starts[true])
+
+        text = "frames fit in another order: that of names without leading zeros (1, 10, 11, ... 2)"
+        yield Cause(text, "sort the frames by number, not by name, and import them again", ordered)
+
+
+def _azimuths(scan: Scan) -> np.ndarray:
+    """Angle of each frame's start from the first one's (F,), as the trajectory counts it where it does."""
+    base = with_path(scan).trajectory.base
+    if hasattr(base, "angle_rad"):
+        path = with_path(scan).trajectory
+        numbers = np.arange(scan.frames) if path.frames is None else path.frames
+        at = [float(base.angle_rad(int(n), np.array([scan.frame_start_s[f]]))[0]) for f, n in enumerate(numbers)]
+        return np.array(at) - at[0]
+    pose = np.concatenate([scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)])
+    return np.unwrap(azimuth_rad(pose)) - azimuth_rad(pose[:1])
+
+
+def _arcs(scan: Scan) -> Iterator[Cause]:
+    from_first = _azimuths(scan)
+    path = with_path(scan).trajectory
+    sense = -1.0 if path.is_reversed else 1.0
+    total_deg = float(np.rad2deg(abs(from_first[-1])))
+    radian = float(np.degrees(1.0))
+    named = {
+        radian: "angles in radians were taken for degrees",
+        1 / radian: "angles in degrees were taken for radians",
+        0.5: "the step of the angles is half of what is stated",
+        2.0: "the step of the angles is twice what is stated",
+    }
+    for percent in (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5):
+        than_stated = f"{abs(percent)} % {'smaller' if percent < 0 else 'larger'} than stated"
+        named[1 + percent / 100] = f"the step of the angles is about {than_stated}"
+    for factor, text in named.items():
+        span = f"the frames span {factor * total_deg:.4g}°, not {total_deg:.4g}°"
+        advice = f"{span}: correct rotation_angle, its unit or its step"
+        turn = sense * (factor - 1) * from_first
+        yield Cause(text, advice, partial(turned, scan, turn, factor))
+
+
+def _sizes(scan: Scan) -> Iterator[Cause]:
+    v, u = scan.geometry.pixel_size_mm
+    if abs(v / u - 1) > 0.02:
+        text, advice = "pixel sizes fit if v and u are exchanged", "exchange x_pixel_size and y_pixel_size"
+        yield Cause(text, advice, partial(stretched, scan, u / v, v / u))
+    for factor in (0.5, 0.8, 0.9, 1.1, 1.25, 2.0, 1e-3, 1e3):
+        if not 0.02 < factor * scan.geometry.detector_shape[1] * u / scan.geometry.source_to_detector_mm < 3:
+            continue
+        text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
+        advice = "correct pixel sizes (binning? unit?) or distances (unit? source to panel?)"
+        yield Cause(text, advice, partial(stretched, scan, factor, factor))
+
+
+def _missing(scan: Scan) -> Iterator[Cause]:
+    """Frames that are missing, or there twice, with later ones moved up or back by a step."""
+    steps = wrapped(np.diff(_azimuths(scan)))
+    step = float(np.median(steps)) * (-1.0 if with_path(scan).trajectory.is_reversed else 1.0)
+    for at in np.unique(np.linspace(1, scan.frames - 1, 15).round().astype(int)):
+        later = (np.arange(scan.frames) >= at) * step
+        number = _number(scan, int(at))
+        text = f"a frame is missing near frame {number} (from 0): later ones fit one step further on"
+        advice = "find the missing frame, or shift the angles behind it by a step"
+        yield Cause(text, advice, partial(turned, scan, later))
+        text = f"a frame is there twice near frame {number} (from 0): later ones fit one step before"
+        advice = "take the frame out, so that later ones get their own angles"
+        yield Cause(text, advice, partial(turned, scan, -later))
