@@ -10,20 +10,11 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
-
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def good_scan(cli, tmp_path_factory):
-    path = tmp_path_factory.mktemp("good") / "scan.h5"
-    options = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--jitter-deg", "0.1"]
-    assert cli.run(["simulate", *options, "--time-samples", "2", "-o", str(path)]) == 0
-    return path
+def good_scan(simulated):
+    options = "--phantom jaw --size 8 --detector 12 --views 4 --jitter-deg 0.1 --time-samples 2"
+    return simulated(*options.split())
 
 
 # name: (address below /entry, what is put there instead, words of the refusal); tests/io has all that a scan can have wrong

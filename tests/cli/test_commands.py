@@ -16,31 +16,12 @@ import pytest
 
 from phyradgs_cl.__main__ import load_cli
 
-SIMULATE = [
-    "simulate",
-    "--phantom",
-    "jaw",
-    "--size",
-    "16",
-    "--detector",
-    "24",
-    "--views",
-    "6",
-    "--time-samples",
-    "4",
-]
+SIMULATE = ["simulate", "--phantom", "jaw", "--size", "16", "--detector", "24", "--views", "6", "--time-samples", "4"]
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory):
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert cli.run([*SIMULATE, "--noise", "tigre", "-o", str(path)]) == 0
-    return path
+def scan(simulated):
+    return simulated(*SIMULATE[1:], "--noise", "tigre")
 
 
 def test_help_shows_every_command_with_an_example(cli, capsys):
@@ -87,33 +68,9 @@ def test_a_method_that_ends_by_itself_says_when_and_why(cli, scan, tmp_path, cap
 
 def test_columns_and_intensity_and_jitter_are_simulated(cli, tmp_path):
     path = tmp_path / "scan.h5"
-    options = [
-        "--readout",
-        "columns",
-        "--readout-direction",
-        "-1",
-        "--detector-model",
-        "intensity",
-        "--jitter-deg",
-        "0.2",
-    ]
-    assert (
-        cli.run(
-            [
-                *SIMULATE,
-                *options,
-                "--noise",
-                "beer",
-                "--peak",
-                "3",
-                "--detector-offset",
-                "0.1,-0.2",
-                "-o",
-                str(path),
-            ]
-        )
-        == 0
-    )
+    options = ["--readout", "columns", "--readout-direction", "-1", "--detector-model", "intensity", "--jitter-deg", "0.2"]
+    options += ["--noise", "beer", "--peak", "3", "--detector-offset", "0.1,-0.2"]
+    assert cli.run([*SIMULATE, *options, "-o", str(path)]) == 0
     with h5py.File(path) as file:
         own = file["entry/phyradgs"]
         assert own["readout_axis"][()].decode() == "columns"
@@ -263,19 +220,8 @@ def test_volume_files_are_simulated_at_their_own_resolution(cli, tmp_path):
     with h5py.File(source, "w") as file:
         file["volume"] = volume
     path = tmp_path / "scan.h5"
-    options = [
-        "--volume",
-        str(source),
-        "--size",
-        "12",
-        "--detector",
-        "20",
-        "--views",
-        "4",
-        "--protocol",
-        "static",
-    ]
-    assert cli.run(["simulate", *options, "-o", str(path)]) == 0
+    options = ["--size", "12", "--detector", "20", "--views", "4", "--protocol", "static"]
+    assert cli.run(["simulate", "--volume", str(source), *options, "-o", str(path)]) == 0
     with h5py.File(path) as file:
         reference = file["entry/phyradgs/reference/volume"][()]
     block = (volume / 255).reshape(12, 2, 12, 2, 12, 2).mean((1, 3, 5))

@@ -8,7 +8,6 @@ import h5py
 import numpy as np
 import typer
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.workflow import load_scan
 
@@ -43,8 +42,8 @@ def write_foreign(path: Path) -> None:
         file["exchange/theta"] = np.arange(4) * 90.0
 
 
-def test_every_command_does_its_work(tmp_path, monkeypatch, capsys) -> None:
-    cli, windows = load_cli(), []
+def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None:
+    windows = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("phyradgs_cl.workflow.quick.VOXELS", 8)
     monkeypatch.setattr("phyradgs_cl.workflow.quick.PIXELS", 12)
@@ -62,6 +61,6 @@ def test_every_command_does_its_work(tmp_path, monkeypatch, capsys) -> None:
         assert read_volume(tmp_path / name).volume.any(), name
 
 
-def test_no_command_is_left_out() -> None:
-    known = set(typer.main.get_command(load_cli().app).commands)
+def test_no_command_is_left_out(cli) -> None:
+    known = set(typer.main.get_command(cli.app).commands)
     assert {line.split()[0] for line, _ in COMMANDS} == known
