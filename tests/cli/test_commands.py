@@ -4,11 +4,10 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,6 +16,12 @@ import pytest
 from phyradgs_cl.__main__ import load_cli
 
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "16", "--detector", "24", "--views", "6", "--time-samples", "4"]
+
+
+def facts_of(volume: Path) -> dict[str, Any]:
+    """The provenance of a volume, as it is stored."""
+    with h5py.File(volume) as file:
+        return json.loads(file["entry/provenance/json"][()])
 
 
 @pytest.fixture(scope="module")
@@ -140,12 +145,9 @@ def test_the_command_line_wins_over_the_config_file(cli, scan, tmp_path):
     config = tmp_path / "run.toml"
     config.write_text("iterations = 7\ngaussians = 50\nmotion = 'static'\n[rates]\nposition = [1e-3, 1e-4]\n")
     output = tmp_path / "volume.h5"
-    assert (
-        cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config), "--iterations", "4"])
-        == 0
-    )
-    with h5py.File(output) as file:
-        options = json.loads(file["entry/provenance/json"][()])["options"]
+    given = ["--config", str(config), "--iterations", "4"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), *given]) == 0
+    options = facts_of(output)["options"]
     assert options["iterations"] == 4
     assert options["gaussians"] == 50
     assert options["motion"]["name"] == "static"
@@ -164,8 +166,7 @@ def test_numbers_of_a_config_may_be_written_as_whole_floats(cli, scan, tmp_path)
     config, output = tmp_path / "run.toml", tmp_path / "volume.h5"
     config.write_text("device = 0\nseed = 3.0\nstrips = 2.0\nsub_intervals = 3\niterations = 2.0\n")
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config)]) == 0
-    with h5py.File(output) as file:
-        facts = json.loads(file["entry/provenance/json"][()])
+    facts = facts_of(output)
     motion = facts["options"]["motion"]
     assert (motion["name"], motion["strips"], motion["sub_intervals"]) == ("micro-views", 2, 3)
     assert (facts["seed"], facts["options"]["iterations"]) == (3, 2)
@@ -175,8 +176,7 @@ def test_more_gaussians_than_voxels_are_said_and_kept(cli, scan, tmp_path, caplo
     output = tmp_path / "volume.h5"
     asked = ["--iterations", "1", "--gaussians", "100000"]
     assert cli.run(["reconstruct", str(scan), "-o", str(output), *asked]) == 0
-    with h5py.File(output) as file:
-        facts = json.loads(file["entry/provenance/json"][()])
+    facts = facts_of(output)
     assert facts["gaussians_asked"] == 100_000
     assert 0 < facts["gaussians_first"] < 16**3
     assert [r.getMessage() for r in caplog.records if "asked for" in r.getMessage()] == [
@@ -228,30 +228,6 @@ def test_volume_files_are_simulated_at_their_own_resolution(cli, tmp_path):
     np.testing.assert_allclose(reference, block, atol=1e-6)
 
 
-def test_ctrl_c_keeps_the_volume_and_resume_ends_with_the_same_bits(cli, scan, tmp_path):
-    whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
-    common = ["--iterations", "600", "--gaussians", "400"]
-    assert cli.run(["reconstruct", str(scan), "-o", str(whole), *common]) == 0
-    command = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(stopped), *common]
-    started = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    time.sleep(2.5)
-    started.send_signal(signal.SIGINT)
-    _, errors = started.communicate(timeout=120)
-    if started.returncode == 130 and stopped.exists():
-        assert "--resume" in errors
-        assert Path(f"{stopped}.checkpoint.npz").exists()
-        assert cli.run(["reconstruct", str(scan), "-o", str(stopped), *common, "--resume"]) == 0
-    else:  # the signal came before the first or after the last iteration: then nothing, or everything, is there
-        assert started.returncode in (0, 130)
-        if not stopped.exists():
-            assert cli.run(["reconstruct", str(scan), "-o", str(stopped), *common]) == 0
-    assert not Path(f"{stopped}.checkpoint.npz").exists()
-    with h5py.File(whole) as a, h5py.File(stopped) as b:
-        np.testing.assert_array_equal(
-            a["entry/reconstruction/volume"][()], b["entry/reconstruction/volume"][()]
-        )
-
-
 def test_devices_names_the_choice_and_the_reason(cli, capsys):
     assert cli.run(["devices"]) == 0
     text = capsys.readouterr().out
@@ -272,8 +248,7 @@ def test_assignments_win_over_the_file_and_switches_over_both(cli, scan, tmp_pat
     config.write_text("method = 'sart'\niterations = 7\nrelaxation = 0.1\norder = 'ordered'\n")
     given = ["--set", "relaxation=0.5", "--set", "order=random", "--set", "iterations=5", "--iterations", "2"]
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config), *given]) == 0
-    with h5py.File(output) as file:
-        options = json.loads(file["entry/provenance/json"][()])["options"]
+    options = facts_of(output)["options"]
     assert (options["relaxation"], options["order"], options["iterations"]) == (0.5, "random", 2)
 
 
@@ -282,7 +257,6 @@ def test_an_assignment_reaches_into_a_table_of_the_file(cli, scan, tmp_path):
     config.write_text("iterations = 2\n[rates]\nposition = [1e-3, 1e-4]\ndensity = [1e-2, 1e-3]\n")
     given = ["--config", str(config), "--set", "rates.position=[2e-3, 2e-4]"]
     assert cli.run(["reconstruct", str(scan), "-o", str(output), *given]) == 0
-    with h5py.File(output) as file:
-        rates = json.loads(file["entry/provenance/json"][()])["options"]["rates"]
+    rates = facts_of(output)["options"]["rates"]
     assert rates["position"] == [2e-3, 2e-4]
     assert rates["density"] == [1e-2, 1e-3]
