@@ -83,7 +83,7 @@ docs: $(VENV)/.installed-test
 stress: $(VENV)/.installed-test
 	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/workflow/test_watch_kills.py tests/faults tests/corpus tests/laws
 
-# Environments beside the first, one a target: what each has beside pytest, and the extras of pyproject.toml.
+# Environments beside the first, one per target: what each has beside pytest, and the extras of pyproject.toml.
 EXTRAS_browser   := cpu,test
 PACKAGES_browser := playwright
 EXTRAS_cluster   := cpu,test,cluster

@@ -1,10 +1,10 @@
-"""Asks `phyradgs check` about a folder of good scans and of scans with planted faults: a line of JSON a scan, resumable.
+"""Asks `phyradgs check` about a folder of good scans and of scans with planted faults: one line of JSON per scan, resumable.
 
     python benchmarks/check_answers.py FOLDER RESULTS.jsonl [--only PART,...]
     python benchmarks/check_answers.py --table RESULTS.jsonl
 
-FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl``, a line a scan, which says what is
-planted, which questions may rightly be suspicious (``right``), and, where nothing can tell it, why (``undecidable``).
+FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl``, one line per scan, which says what
+is planted, which questions may rightly be suspicious (``right``), and, where nothing can tell it, why (``undecidable``).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def words(line: dict[str, Any]) -> str:
 
 
 def table(path: Path) -> str:
-    """Markdown: a row a scan and the sums."""
+    """Markdown: one row per scan and the sums."""
     lines = read_lines(path)
     text = ["| planted | object | answer | in words |", "| --- | --- | --- | --- |"]
     sums: dict[tuple[str, str], int] = {}

@@ -1,4 +1,4 @@
-"""Plants faults in scans of a folder of volumes and asks `phyradgs check` about them: a line of JSON a scan, resumable.
+"""Plants faults in scans of a folder of volumes and asks `phyradgs check` about them: one line of JSON per scan, resumable.
 
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl [--names a,b] [--size 64] [--seeds 7] [--faults none,rotation]
     python benchmarks/check_faults.py --table RESULTS.jsonl

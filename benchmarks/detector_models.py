@@ -5,7 +5,7 @@
 
 Rapid fly-scans (25 frames of 14.4 degrees, rows read out) of 48 cubed voxels on 72 squared pixels, counts of 1e5 photons
 and electronic noise of 10 unless an effect says otherwise. Iterative methods take every line at 5 times of its own;
-phyradgs is exact in time, and with micro-views (8x5) where that is said. Results are a line a run: the command goes on
+phyradgs is exact in time, and with micro-views (8x5) where that is said. Results are one line per run: the command goes on
 where it was interrupted.
 
 Effects: intensity (peak line integral 4 and 6; ignored: line integrals are averaged), pulse (all lines share one flash;

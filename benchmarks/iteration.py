@@ -4,7 +4,7 @@
 
 Kernel times are OpenCL events, the rest is the host's clock. Motions take turns, round by round; medians over rounds of
 the mean iteration. "gaps" is what an iteration takes beyond its kernels: launches, copies, Python. Density control is one
-round of it, on the host, and counts with a hundredth an iteration (control.every).
+round of it, on the host, and counts with a hundredth per iteration (control.every).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def make_run(rt: Runtime, scan: Scan, motion: Motion, count: int) -> SplatRun:
 
 
 def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
-    """Milliseconds an iteration, by stage."""
+    """Milliseconds per iteration, by stage."""
     rt.kernel_seconds()
     started = time.perf_counter()
     for _ in range(iterations):
@@ -71,7 +71,7 @@ def control_ms(run: SplatRun) -> float:
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument(
-        "--size", type=int, default=128, help="voxels a side; the panel has twice as many pixels"
+        "--size", type=int, default=128, help="voxels per side; the panel has twice as many pixels"
     )
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--rounds", type=int, default=5)

@@ -61,7 +61,7 @@ def measured(rt: Runtime, call: Callable[[], np.ndarray]) -> tuple[np.ndarray, F
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--voxels", type=int, default=256, help="a side")
-    parser.add_argument("--detector", type=int, default=512, help="pixels a side")
+    parser.add_argument("--detector", type=int, default=512, help="pixels per side")
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--memory", default="64MiB")

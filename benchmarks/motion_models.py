@@ -1,4 +1,4 @@
-"""Accuracy and cost of the splats' motion models: quality of whole reconstructions, time an iteration, and a figure.
+"""Accuracy and cost of the splats' motion models: quality of whole reconstructions, time per iteration, and a figure.
 
     python benchmarks/motion_models.py run VOLUMES RESULTS.jsonl [--size 64] [--names a,b] [--motions 8x5,static]
     python benchmarks/motion_models.py cost COST.json [--size 64]
@@ -130,7 +130,7 @@ def table(lines: list[Line]) -> str:
 
 
 def cost(arguments: Namespace) -> dict[str, object]:
-    """Median milliseconds an iteration by motion, and the ratio to ``REFERENCE``."""
+    """Median milliseconds per iteration by motion, and the ratio to ``REFERENCE``."""
     rt = Runtime(arguments.device)
     scan = foot_scan(rt, arguments.size)
     runs = {name: fresh_run(rt, scan, name) for name in arguments.motions.split(",")}
@@ -195,7 +195,7 @@ def figure(lines: list[Line], costs: dict, errors: dict, path: Path) -> None:
             axes.plot(
                 costs["motions"]["static"]["ms"], values["static"], "s", color="#8a6d1a", label="static"
             )
-        axes.set_xlabel("milliseconds an iteration")
+        axes.set_xlabel("milliseconds per iteration")
         axes.legend()
     left.set_yscale("log")
     left.set_ylabel("error of a frame, %")

@@ -4,9 +4,9 @@
 
 In an environment with the extra [mpi]. Every number of ranks is a run of mpiexec on this machine; where the device is its
 processor, a rank has one thread of PoCL, and times are seconds of the processor, not of the clock. Splats exact in time, 25
-frames. Strong: four frames a step whatever the ranks. Weak: a frame a rank. Of every part the least of the steps counts, on
-the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks than
-processors, or others at work on them, they say nothing.
+frames. Strong: four frames per step whatever the ranks. Weak: one frame per rank. Of every part the least of the steps
+counts, on the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks
+than processors, or others at work on them, they say nothing.
 
 The model. A step of B frames on R ranks takes
 
@@ -133,9 +133,9 @@ def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
     for name in ("add", "largest"):
         setattr(ranks, name, clock.part(getattr(ranks, name), "sending"))
     rows = [clock.step(run) for _ in range(WARM)]
-    before = ranks.exchanged_bytes
+    before = ranks.sent_bytes
     rows = [clock.step(run) for _ in range(steps)]
-    return 1e3 * np.array(rows), (ranks.exchanged_bytes - before) // steps
+    return 1e3 * np.array(rows), (ranks.sent_bytes - before) // steps
 
 
 def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str | None, out: Path) -> None:
@@ -143,7 +143,7 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
     rt = Runtime(device, profile=True, ranks=ranks)
     run = started(rt, gaussians, pixels, batch)
     rows, nbytes = measure(run, steps)
-    everyone = ranks.join(rows[None])
+    everyone = ranks.allgather(rows[None])
     if ranks.rank == 0:
         facts = {
             "gaussians": run.cloud.count,
@@ -224,7 +224,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--pixels", type=int, default=128)
     parser.add_argument("--steps", type=int, default=12)
-    parser.add_argument("--batch", type=int, default=0, help="frames a step of one run, within mpiexec")
+    parser.add_argument("--batch", type=int, default=0, help="frames per step of one run, within mpiexec")
     parser.add_argument("--out", type=Path, default=None, help="where rank 0 writes, within mpiexec")
     arguments = parser.parse_args()
     gaussians, pixels, steps = (

@@ -110,7 +110,7 @@ def run_all(arguments: argparse.Namespace) -> None:
 
 
 def draw(lines: Sequence[dict], path: Path) -> None:
-    """A panel a volume; a line a method, from its longest run, and a dot at the end of every run."""
+    """A panel per volume; one line per method, from its longest run, and a dot at the end of every run."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of a line of JSON a run."""
+"""What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of one line of JSON per run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def make_scan(
 ) -> Scan:
     """The scan of a volume file as `phyradgs bench` makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
 
-    ``size`` counts the reference's voxels a side, half the detector's pixels; ``away`` multiplies the distances of source
+    ``size`` counts the reference's voxels per side, half the detector's pixels; ``away`` multiplies the distances of source
     and detector, which leaves the magnification.
     """
     detector = 2 * size
@@ -32,7 +32,7 @@ def make_scan(
 
 
 def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
-    """Volumes as `phyradgs bench` finds them: those of ``names`` (with commas), else all; twice ``size`` voxels a side."""
+    """Volumes as `phyradgs bench` finds them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
     return find_volumes(Path(folder), names.split(",") if names else None, size)
 
 

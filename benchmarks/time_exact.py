@@ -252,7 +252,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--singles", type=int, default=24, help="random Gaussians whose errors are averaged")
     parser.add_argument("--cloud", type=int, default=2000, help="Gaussians of the Shepp-Logan cloud")
-    parser.add_argument("--samples", type=int, default=200, help="times a row of the reference")
+    parser.add_argument("--samples", type=int, default=200, help="times per row of the reference")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", type=Path, default=None)

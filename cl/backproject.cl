@@ -53,7 +53,8 @@ __kernel void backproject(
 __kernel void backproject_upright(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
-    const int4 shape, const int4 origin, const int volume_pitch, const int block, /* voxels along z a work-item, <= BLOCK_VOXELS */
+    const int4 shape, const int4 origin, const int volume_pitch,
+    const int block, /* voxels along z per work-item, <= BLOCK_VOXELS */
     __global float *volume)
 {
     if (get_global_id(0) >= shape.x)

@@ -1,4 +1,4 @@
-/* Which splats touch which tile: a stable counting sort without atomics. Chunks of splats are counted a
+/* Which splats touch which tile: a stable counting sort without atomics. Chunks of splats are counted per
    tile, the counts are summed up, then every chunk writes its entries; the order in a list is the order of
    the splats, so sums over a list always run the same way. */
 

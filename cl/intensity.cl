@@ -2,12 +2,10 @@
 
    The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame is -ln(sum w_k exp(-p_k)) and
    its derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Twin: detector/average.py. */
-#include "common/lanes.h"
-
-#define LOG2E 1.44269504089f
+#include "common/intensity.h"
 
 /* p_k of a pixel from w_k p_k */
-#define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) / weights[(size_t)(k) * lines + v])
+#define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) * unit / weights[(size_t)(k) * lines + v])
 
 __kernel void intensity_merge(
     __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
@@ -22,26 +20,27 @@ __kernel void intensity_merge(
         return;
     const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
     const vi inside = V_INT((vf)(u) + V_IOTA) < width;
-    vf least = (vf)(MAXFLOAT); /* the brightest cell is taken out, so that nothing overflows */
+    vf least = (vf)(MAXFLOAT); /* of the brightest cell: nothing overflows */
     for (int k = 0; k < layer_count; ++k)
         if (weights[(size_t)k * lines + v] > 0.0f)
             least = min(least, SEEN(k));
-    vf total = (vf)(0.0f);
+    intensity_t sum = intensity_from(least);
+    int any = 0;
     for (int k = 0; k < layer_count; ++k) {
         const float weight = weights[(size_t)k * lines + v];
-        vf light = (vf)(0.0f);
-        if (weight > 0.0f)
-            light = exp2((least - SEEN(k)) * (unit * LOG2E));
-        total += weight * light;
-        V_STORE(light, shares + (size_t)k * layer_size + at);
+        if (!(weight > 0.0f))
+            continue;
+        intensity_add(&sum, weight, SEEN(k));
+        any = 1;
     }
-    const vi lit = total > 0.0f;
-    const vf inv = V_PICK(0.0f, 1.0f / total, lit & inside);
+    const vf brighter = intensity_brighter(sum);
     for (int k = 0; k < layer_count; ++k) {
-        __global float *share = shares + (size_t)k * layer_size + at;
-        V_STORE(V_LOAD(share) * inv, share);
+        vf share = (vf)(0.0f);
+        if (weights[(size_t)k * lines + v] > 0.0f)
+            share = V_PICK(0.0f, exp(least - SEEN(k) - brighter), inside);
+        V_STORE(share, shares + (size_t)k * layer_size + at);
     }
-    V_STORE(V_PICK(0.0f, least - log(total) / unit, lit & inside), merged + at);
+    V_STORE(V_PICK(0.0f, any ? (least - brighter) / unit : (vf)(0.0f), inside), merged + at);
 }
 
 /* dL/dlayers from dL/dmerged */

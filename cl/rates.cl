@@ -1,7 +1,7 @@
 /* What the device can do at best, measured: multiply-adds on registers. Copies are the driver's own. */
 #include "common/lanes.h"
 
-/* 8 independent chains of multiply-adds a work-item, so that latency does not count: 16 LANES `steps` operations */
+/* 8 independent chains of multiply-adds per work-item, so that latency does not count: 16 LANES `steps` operations */
 __kernel void multiply_add(const int steps, const float factor, __global float *out)
 {
     const vf a = (vf)(factor), b = (vf)(1.0f - factor);

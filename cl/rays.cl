@@ -1,6 +1,7 @@
 /* Ray-driven projector by Joseph's method and its exactly matched adjoint, over all time cells of many frames in
-   one launch each. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample a plane of the ray's main
+   one launch each. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample per plane of the ray's main
    axis. Frames are padded rows, volumes too, with a border of zeros in y and z. Twin: operators/twins/rays.py. */
+#include "common/intensity.h"
 #include "common/ray.h"
 #include "common/ray_window.h"
 
@@ -28,8 +29,8 @@ __kernel void rays_forward(
     __global const float *body = volume + IMAGE_GUARD + (sy + sz) * BORDER;
     const size_t line = (size_t)frame_list[n] * lines + v;
     const vi real = VI_IOTA + u < width;
-    vf total = (vf)(0.0f);            /* of w p, or of w (p - first) */
-    vf light = (vf)(0.0f), first = (vf)(0.0f); /* of w (exp(first - p) - 1), with p of the line's first cell */
+    vf total = (vf)(0.0f);
+    intensity_t sum = intensity_from(total);
     int any = 0;
     for (int c = line_cells[2 * line]; c < line_cells[2 * line + 1]; ++c) {
         if (v < cell_lines[2 * c] || v >= cell_lines[2 * c + 1])
@@ -65,15 +66,13 @@ __kernel void rays_forward(
             total += cell[RAY_WEIGHT] * p;
             continue;
         }
-        first = any ? first : p;
+        if (!any)
+            sum = intensity_from(p);
         any = 1;
-        total += cell[RAY_WEIGHT] * (p - first);
-        light += cell[RAY_WEIGHT] * expm1(min(first - p, 80.0f)); /* 80: finite in float32 */
+        intensity_add(&sum, cell[RAY_WEIGHT], p);
     }
-    if (average != AVERAGE_LOG && any) {
-        const vf brighter = log1p(max(light, -0.9999999f));
-        total = average == AVERAGE_GAP ? total + brighter : first - brighter;
-    }
+    if (average != AVERAGE_LOG && any)
+        total = average == AVERAGE_GAP ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
     __global float *pixels = image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u;
     if (add)
         total += V_LOAD(pixels);
@@ -83,7 +82,7 @@ __kernel void rays_forward(
 #if !RAY_VOXEL_ITEMS
 /* Adjoint for CPUs: a work-item owns a brick of voxels. It follows the rays that may meet its brick, plane by plane as
    the projector does, and adds their shares into a tile of its own; a border of one voxel catches what belongs to
-   neighbours, who find it themselves. One writer a voxel in a fixed order: no atomics. */
+   neighbours, who find it themselves. One writer per voxel in a fixed order: no atomics. */
 #define TILE_X (BRICK_X + 2)
 #define TILE_Y (BRICK_Y + 2)
 #define TILE_Z (BRICK_Z + 2)

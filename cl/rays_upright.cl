@@ -77,7 +77,7 @@ __kernel void rays_upright(
     __global const int *frame_list,
     const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int block,                  /* lines a work-item, <= UPRIGHT_LINES */
+    const int block,                  /* lines per work-item, <= UPRIGHT_LINES */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
     const int u = (int)get_global_id(0), n = (int)get_global_id(2);

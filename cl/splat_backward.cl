@@ -1,6 +1,6 @@
 /* Adjoint of the splat, first pass: a Gaussian walks its own footprint in every time cell and keeps the
    sums that the chain rule needs. Gathers only, no atomics: results repeat bit for bit.
-   splat_backward_rows: a work-item a Gaussian, vectors along its lines (CPUs).
+   splat_backward_rows: one work-item per Gaussian, vectors along its lines (CPUs).
    splat_backward_group: GROUP work-items share the pixels of a Gaussian (GPUs). */
 #include "common/footprint.h"
 #include "common/splat_sums.h"
@@ -96,7 +96,7 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
     __global const float *cells,      /* (C, CELL) */                                                                \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                       \
     const int time_pitch, const float4 path_limits,                                                                  \
-    __global const float *images,     /* dL/dp: guard, then (lines, pitch), padding zero; LAYERED: one a layer */    \
+    __global const float *images,     /* dL/dp: guard, then (lines, pitch), padding zero; LAYERED: one per layer */    \
     const int count, const int cell_count, const int lines, const int pitch, const float cutoff2,                    \
     __global float *sums              /* (stride, C, SUMS) */
 

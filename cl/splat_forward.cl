@@ -5,7 +5,7 @@
 #include "common/footprint.h"
 #include "common/tile.h"
 
-/* adds a splat to the pixels of a line; with motion one loop a rule, so that nothing is asked per pixel */
+/* adds a splat to the pixels of a line; with motion one loop per rule, so that nothing is asked per pixel */
 #define ADD_PIXELS(rule)                                                                            \
     for (int u = line.u_lo; u <= line.u_hi; u += LANES) {                                           \
         const moving_pixel p = moving_at(line.s, (float)u + V_IOTA, footprint_du(line, u), limit);  \

@@ -223,7 +223,7 @@ __kernel void splat_prepare(
         v_min = VI_PICK(v_min, min(v_min, v_lo), drawn);
         v_max = VI_PICK(v_max, max(v_max, v_hi), drawn);
 
-        /* from one row a field to one record a Gaussian */
+        /* from one row per field to one record per Gaussian */
         float fields[FIELDS * LANES];
         int bounds[6 * LANES];
         VI_STORE(v_lo, bounds + 4 * LANES);

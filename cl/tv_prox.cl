@@ -1,5 +1,5 @@
 /* Proximal map of the isotropic total variation by fast gradient projection on the dual (Beck and Teboulle, IEEE
-   Trans. Image Process. 18 (2009) 2419). Volumes (nz, ny, nx) without padding; the dual has three planes, one an axis,
+   Trans. Image Process. 18 (2009) 2419). Volumes (nz, ny, nx) without padding; the dual has three planes, one per axis,
    with forward differences that end at the last voxel. A work-item takes one voxel. Twin: objective/tv_prox.py. */
 
 __kernel void tv_primal(

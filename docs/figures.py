@@ -142,7 +142,7 @@ def splat_figure() -> None:
 
 
 def _quadrature(row: np.ndarray, pose: np.ndarray, columns: int) -> np.ndarray:
-    """Line integrals along the middle row by 4000 midpoints a ray (the rotation is the identity)."""
+    """Line integrals along the middle row by 4000 midpoints per ray (the rotation is the identity)."""
     pixel = pose[3:6] + np.arange(columns)[:, None] * pose[6:9] + pose[9:12]
     ray = pixel - pose[:3]
     share = (np.arange(4000) + 0.5) / 4000
@@ -155,7 +155,7 @@ def _quadrature(row: np.ndarray, pose: np.ndarray, columns: int) -> np.ndarray:
 
 
 def sampling_figure() -> None:
-    """Shepp-Logan, rapid protocol, one frame: relative RMS error against 1536 times a line."""
+    """Shepp-Logan, rapid protocol, one frame: relative RMS error against 1536 times per line."""
     count = 96
     geometry = ConeGeometry(5.0, 7.0, (count, count), (4 / count, 4 / count))
     protocol = make_protocol("rapid", start_deg=30.0)
@@ -185,7 +185,7 @@ def sampling_figure() -> None:
         chosen = default_time_samples(protocol, Grid.cube(voxels, 2.0))
         axes.axvline(chosen, color="0.7", lw=0.8, ls=":")
         axes.text(chosen, static * 1.5, f"{voxels}³", ha="center", fontsize=7, color="0.4")
-    axes.set(xscale="log", yscale="log", xlabel="times a line (N)", ylabel="relative RMS error of a frame")
+    axes.set(xscale="log", yscale="log", xlabel="times per line (N)", ylabel="relative RMS error of a frame")
     axes.legend(fontsize=7)
     save(figure, "time_sampling.png")
     print(

@@ -48,7 +48,7 @@ class Estimate:
     host_bytes: int
     device_bytes: int
     iterations: int
-    seconds_an_iteration: float
+    seconds_per_iteration: float
     trial_iterations: int
     trial_seconds: float
     around_s: float = 0.0
@@ -56,8 +56,8 @@ class Estimate:
     def text(self) -> str:
         """Two lines: time, and memory."""
         parts = []
-        if self.seconds_an_iteration > 0:
-            parts.append(f"{self.iterations} iterations of {1e3 * self.seconds_an_iteration:.3g} ms")
+        if self.seconds_per_iteration > 0:
+            parts.append(f"{self.iterations} iterations of {1e3 * self.seconds_per_iteration:.3g} ms")
         if self.around_s > 0:
             parts.append(f"{duration(self.around_s)} to read, compare and write")
         each = f" ({', '.join(parts)})" if parts else ""

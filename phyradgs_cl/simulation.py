@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 class SimulationOptions:
     """How to simulate. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    time_samples: midpoint samples a line in its own exposure; 0 chooses them so that the edge of the volume
+    time_samples: midpoint samples per line in its own exposure; 0 chooses them so that the edge of the volume
     moves at most half a voxel of ``grid`` between two of them (see docs/mathematics.md for the error).
     dose: photons of a pixel without object, on a line that sees the whole pulse. lag: λ of detector/lag.py.
     """
@@ -67,7 +67,7 @@ class SimulationOptions:
             raise InputError("--noise", repr(self.noise), f"one of {', '.join(NOISES)}")
         checks.within("--peak", self.peak, 0, LARGEST_PEAK)
         checks.within("--electronic-noise (counts)", self.electronic_noise, 0, LARGEST_ELECTRONIC_NOISE)
-        checks.within("--dose (photons a pixel)", self.dose, SMALLEST_DOSE, LARGEST_DOSE)
+        checks.within("--dose (photons per pixel)", self.dose, SMALLEST_DOSE, LARGEST_DOSE)
         checks.within("--lag", self.lag, 0, LARGEST_LAG)
         checks.within("--jitter-deg", self.jitter_deg, 0, 360)
         checks.within("--time-samples", self.time_samples, 0, 10_000)
@@ -306,7 +306,7 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom by name in the box of the scanner, to be reconstructed with ``size`` voxels a side.
+    """A phantom by name in the box of the scanner, to be reconstructed with ``size`` voxels per side.
 
     Closed forms are integrated exactly; procedural phantoms are drawn at twice ``size`` and projected at that
     resolution, and the truth is their block mean. Pixels see ``pixel_samples``² rays over their area.

@@ -91,9 +91,9 @@ def test_estimates_are_checked(tmp_path) -> None:
 def test_bias_of_balls_is_resumed(tmp_path) -> None:
     lines = tmp_path / "lines.jsonl"
     words = (str(lines), "--size", "XS", "--trials", "stop-and-shoot")
-    assert "| stop-and-shoot | fista-tv |" in run("ball_bias.py", *words)
+    assert "| stop-and-shoot | fista-tv |" in run("bead_bias.py", *words)
     first = lines.read_text()
-    run("ball_bias.py", *words)
+    run("bead_bias.py", *words)
     assert lines.read_text() == first and first.count("\n") == 1
 
 

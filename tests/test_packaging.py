@@ -57,8 +57,9 @@ def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     assert {f"phyradgs_cl/{name}" for name in NEEDED} <= names
-    modules = {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "phyradgs_cl").rglob("*.py")}
-    assert modules <= names
+    for kind in ("*.py", "*.pyi", "py.typed"):
+        modules = {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "phyradgs_cl").rglob(kind)}
+        assert modules and modules <= names
     outside = [n for n in names if not n.startswith(("phyradgs_cl/", "phyradgs_cl-"))]
     assert not outside, "the wheel would install more than one package"
     assert not [n for n in names if "__pycache__" in n]

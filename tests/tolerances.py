@@ -31,7 +31,7 @@ SPLAT_MOVING = 1e-5  # measured 2e-6
 TIME_RULE = 2.2
 # float32 may decide differently about pixels this close to the edge of the path's outline
 CUTOFF_EDGE_MOVING = 1e-3
-MOVING_GRADIENT = 1e-4  # goal 1e-3; at rest 3e-7, at 50 pixels a segment 3e-6
+MOVING_GRADIENT = 1e-4  # goal 1e-3; at rest 3e-7, at 50 pixels per segment 3e-6
 # error over that of a quarter as many segments: straight paths and constant conics are second order (0.09)
 SEGMENTS_ORDER = 0.16
 EXACT_OVER_MICRO_VIEWS = 1 / 3  # goal of the design at equal time; at the default bound 0.1 to 0.2
@@ -48,7 +48,7 @@ GRADIENT = 1e-4  # goal 1e-3; float32 sums over a footprint leave 1e-6 to 2e-5
 FINITE_DIFFERENCE_STEP = 1e-6  # in units of 1: truncation 1e-10, cancellation 1e-10 in float64
 
 # --- micro-views against the brute force ------------------------------------------------------------------------
-MICRO_VIEWS_FINE = 1e-2  # a strip a line, 12 sub-intervals: strip middles miss by up to half a line (4.4e-3)
+MICRO_VIEWS_FINE = 1e-2  # one strip per line, 12 sub-intervals: strip middles miss by up to half a line (4.4e-3)
 MICRO_VIEWS_ORDER = 8.0  # one micro-view (static) must be so much worse, or the test saw no motion (13 to 18)
 
 # --- voxeliser and rays --------------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.
 # --- rays through a neural field ---------------------------------------------------------------------------------
 RAY_SAMPLES = 1e-3  # goal; of the peak (smooth fields, one draw) or of the norm (sharp edge, mean of draws)
 RAY_SAMPLES_SHARP = (
-    0.05  # of the norm, one draw: a step inside an interval is counted or not (0.02; 0.03 a sample)
+    0.05  # of the norm, one draw: a step inside an interval is counted or not (0.02; 0.03 per sample)
 )
 
 # --- FDK -----------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ Shepp-Logan), rendered at moments 0.6 degrees apart; every line averages intensi
 photons, flats and darks; h5py writes docs/formats.md by the letter. A few scans are TIFF folders or RTK's files, which
 `phyradgs import` reads; the folders stay in OUT/source. DIR holds NAME_128.h5 with a dataset `volume` (z, y, x).
 
-OUT/good and OUT/fault get the scans, OUT/truth the attenuation (z, y, x) in 1/mm of each, OUT/manifest.jsonl a line each:
+OUT/good and OUT/fault get the scans, OUT/truth the attenuation (z, y, x) in 1/mm of each, OUT/manifest.jsonl one line each:
 file, group, kind, object, what was planted, which questions are right to alarm, which words `consistency` should say, why
 a fault cannot be decided. A scan that is in the manifest is not made again.
 """

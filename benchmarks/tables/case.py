@@ -1,4 +1,4 @@
-"""Cases: one object scanned by one protocol with one seed, on a moving and on a standing gantry, and how to score it."""
+"""Cases: one object scanned by one protocol with one seed, on a moving and on a gantry at rest, and how to score it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Case(Interface):
         ...
 
 
-def standing(protocol: Protocol) -> Protocol:
+def stop_and_shoot(protocol: Protocol) -> Protocol:
     """The stop-and-shoot protocol at the mid-window angles of a fly-scan."""
     return replace(protocol, is_fly=False)
 
@@ -96,7 +96,7 @@ class SyntheticCase:
         if acquisition not in self._scans:
             moving = acquisition == FLY
             options = SimulationOptions(
-                protocol=self._protocol if moving else standing(self._protocol),
+                protocol=self._protocol if moving else stop_and_shoot(self._protocol),
                 readout_axis=self._axis,
                 noise="tigre",
                 seed=self._seed,

@@ -63,7 +63,7 @@ def bench_command(
             "-o",
             parser=file_parser("-o"),
             metavar="DIR",
-            help=f"Folder for {RESULTS} (a line a run), tables, figures and slices.",
+            help=f"Folder for {RESULTS} (one line per run), tables, figures and slices.",
             show_default="bench-results",
         ),
     ] = None,

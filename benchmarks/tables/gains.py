@@ -35,11 +35,11 @@ def gain_over_static(lines: Sequence[Line], protocol: str, row: Row) -> Gain | N
 
     Only volumes and seeds that were run with both count. None for a static row, and where no such pair was run.
     """
-    standing = row.standing()
-    if standing.run == row.run:
+    static_row = row.static()
+    if static_row.run == row.run:
         return None
     moving = _by_scan(lines_of_run(lines, protocol, row.run, FLY))
-    static = _by_scan(lines_of_run(lines, protocol, standing.run, FLY))
+    static = _by_scan(lines_of_run(lines, protocol, static_row.run, FLY))
     both = sorted(set(moving) & set(static))
     static_summary = summarise([static[scan] for scan in both])
     moving_summary = summarise([moving[scan] for scan in both])
@@ -50,7 +50,7 @@ def gain_over_static(lines: Sequence[Line], protocol: str, row: Row) -> Gain | N
         scan = (volume, seed)
         gains[volume].append(moving[scan]["metrics"]["psnr_db"] - static[scan]["metrics"]["psnr_db"])
     means = [float(np.mean(each)) for each in gains.values()]
-    still = _by_scan(lines_of_run(lines, protocol, standing.run, STILL))
+    still = _by_scan(lines_of_run(lines, protocol, static_row.run, STILL))
     return Gain(
         static=static_summary,
         moving=moving_summary,

@@ -44,7 +44,7 @@ def refuse_other_objects(
             found = f"runs of {facts['source']} from before its contents changed"
         else:
             continue
-        raise InputError(str(results), found, "one object a name", "choose another -o or rename the volume")
+        raise InputError(str(results), found, "one object per name", "choose another -o or rename the volume")
 
 
 def _name(facts: Mapping[str, object]) -> tuple[object, ...]:

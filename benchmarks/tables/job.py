@@ -187,7 +187,7 @@ def plan_runs(job: BenchJob) -> list[PlannedRun]:
 def _with_options(job: BenchJob) -> list[tuple[str, Row, Any]]:
     """(acquisition, row, options) of every case: options are checked here, before any work."""
     rows = [row for row in job.chosen_rows if not row.lacks(job.bench_size.voxels)]
-    wanted = [(FLY, row) for row in rows] + [(STILL, row.standing()) for row in rows]
+    wanted = [(FLY, row) for row in rows] + [(STILL, row.static()) for row in rows]
     unique = {(acquisition, row.run): row for acquisition, row in reversed(wanted)}
     size = job.bench_size
     return [

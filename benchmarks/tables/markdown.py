@@ -95,9 +95,9 @@ def _row_cells(
 ) -> list[str]:
     moving = lines_of_run(lines, protocol, row.run, FLY)
     volumes = {line["volume"] for line in moving}
-    standing = lines_of_run(lines, protocol, row.standing().run, STILL)
+    static = lines_of_run(lines, protocol, row.static().run, STILL)
     summary = summarise(moving)
-    still = summarise([line for line in standing if line["volume"] in volumes or not volumes])
+    still = summarise([line for line in static if line["volume"] in volumes or not volumes])
     label = row.label
     if summary is None and (lacks := row.lacks(job.bench_size.voxels)):
         label += f" ({lacks})"
@@ -206,7 +206,7 @@ _PHANTOM_NOTE = (
     "Double-layer sphere phantom in a 200 mm box on a C-arm (DSO 785 mm, DSD 1200 mm, shifted panel), averaged in "
     "intensity, raw counts with 50,000 photons and σ 10, corrected by flats and darks; the gantry wanders by 0.1° and "
     "the encoder knows. The pseudo-truth is R2-Gaussian from 64 stop-and-shoot projections. Out of round is "
-    "(r_max − r_min)/r_mean of the half-level contours in three sections of every ball; rise is the 10–90 % distance of "
-    "the balls' edges; shift is how far contours are displaced; bias is that of means inside. Stop-and-shoot numbers "
+    "(r_max − r_min)/r_mean of the half-level contours in three sections of every bead; rise is the 10–90 % distance of "
+    "the beads' edges; shift is how far contours are displaced; bias is that of means inside. Stop-and-shoot numbers "
     "compare with the truth, the paper's with a pseudo-truth of its own."
 )

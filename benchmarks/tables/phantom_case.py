@@ -1,7 +1,7 @@
 """The paper's real-phantom study, simulated: a double-layer sphere phantom on a C-arm, scored against a pseudo-truth.
 
 64 stop-and-shoot projections reconstructed with R2-Gaussian are the reference that a real study has; the true
-phantom is known here as well, and the balls give roundness, edge sharpness and bias.
+phantom is known here as well, and the beads give roundness, edge sharpness and bias.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_scanner, with_detector_count
-from phyradgs_cl.metrics import Ball, compare, edge_sharpness, regional_bias, roundness
+from phyradgs_cl.metrics import Bead, compare, edge_sharpness, regional_bias, roundness
 from phyradgs_cl.phantoms import EllipsoidPhantom, sphere_phantom
 from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
-from tables.case import FLY, HeldOutViews, Images, Measure, standing
+from tables.case import FLY, HeldOutViews, Images, Measure, stop_and_shoot
 from tables.raw_counts import Panel, measured_attenuation
 from tables.sizes import BenchSize
 
@@ -28,9 +28,9 @@ PSEUDO_VIEWS = 64
 PANEL = Panel()
 JITTER_DEG = 0.1  # wander of the gantry about constant speed; the encoder sees it
 DETECTOR_OFFSET_MM = (1.3, -2.1)
-# Balls of 0.04/mm, as aluminium has near 80 keV, in a holder of 0.006/mm.
+# Beads of 0.04/mm, as aluminium has near 80 keV, in a holder of 0.006/mm.
 _ATTENUATION_FACTOR = 4.0
-HOLDER, BALLS = 1, 2
+HOLDER, BEADS = 1, 2
 
 
 class PhantomCase:
@@ -61,7 +61,7 @@ class PhantomCase:
         return self._scans[acquisition]
 
     def measure(self, volume: np.ndarray) -> dict[str, float]:
-        """Numbers against the pseudo-truth (…_pseudo) and the truth, on held-out views, and of the balls' shape."""
+        """Numbers against the pseudo-truth (…_pseudo) and the truth, on held-out views, and of the beads' shape."""
         if self._views is None:
             where = (self.geometry, self.grid, self._protocol, self._axis)
             self._views = HeldOutViews(self._rt, self._source, *where)
@@ -70,18 +70,18 @@ class PhantomCase:
 
     def shape(self, volume: np.ndarray) -> dict[str, float]:
         """Roundness, edge rise and bias of a volume (z, y, x)."""
-        balls = balls_of(self.phantom)
+        beads = beads_of(self.phantom)
         bias = regional_bias(volume, self.truth, self._labels())
         return {
-            **roundness(volume, self.grid, balls),
-            **edge_sharpness(volume, self.grid, balls),
-            "bias_balls": bias.get(BALLS, np.nan),
+            **roundness(volume, self.grid, beads),
+            **edge_sharpness(volume, self.grid, beads),
+            "bias_balls": bias.get(BEADS, np.nan),
             "bias_holder": bias.get(HOLDER, np.nan),
         }
 
     def slices(self, volume: np.ndarray) -> Images:
-        """The axial slice through the upper layer of balls and the middle coronal one."""
-        layer_mm = max(ball.centre_mm[2] for ball in balls_of(self.phantom))
+        """The axial slice through the upper layer of beads and the middle coronal one."""
+        layer_mm = max(bead.centre_mm[2] for bead in beads_of(self.phantom))
         z_mm = self.grid.axes_mm()[0]
         return [volume[int(np.abs(z_mm - layer_mm).argmin())], volume[:, volume.shape[1] // 2]]
 
@@ -97,16 +97,16 @@ class PhantomCase:
         return {name: value for name, value in numbers.items() if not name.endswith("_pseudo")}
 
     def _labels(self) -> np.ndarray:
-        """(z, y, x): 1 in voxels of holder alone, 2 in those of balls alone, 0 in mixed ones and air."""
+        """(z, y, x): 1 in voxels of holder alone, 2 in those of beads alone, 0 in mixed ones and air."""
         holder = self.phantom.ellipsoids[0].attenuation_per_mm
-        ball = holder + self.phantom.ellipsoids[1].attenuation_per_mm
+        bead = holder + self.phantom.ellipsoids[1].attenuation_per_mm
         labels = np.zeros(self.truth.shape, np.int8)
         labels[np.isclose(self.truth, holder, rtol=1e-4)] = HOLDER
-        labels[np.isclose(self.truth, ball, rtol=1e-4)] = BALLS
+        labels[np.isclose(self.truth, bead, rtol=1e-4)] = BEADS
         return labels
 
     def _measured(self, acquisition: str) -> Scan:
-        protocol = self._protocol if acquisition == FLY else standing(self._protocol)
+        protocol = self._protocol if acquisition == FLY else stop_and_shoot(self._protocol)
         if acquisition == PSEUDO:
             protocol = replace(protocol, views=PSEUDO_VIEWS)
         options = SimulationOptions(
@@ -141,6 +141,6 @@ def phantom_in(grid: Grid) -> EllipsoidPhantom:
     return EllipsoidPhantom(tuple(bodies), phantom.name)
 
 
-def balls_of(phantom: EllipsoidPhantom) -> list[Ball]:
-    """The balls of the sphere phantom: every body but the first, which holds them."""
-    return [Ball(e.centre_mm, e.semi_axes_mm[0]) for e in phantom.ellipsoids[1:]]
+def beads_of(phantom: EllipsoidPhantom) -> list[Bead]:
+    """The beads of the sphere phantom: every body but the first, which holds them."""
+    return [Bead(e.centre_mm, e.semi_axes_mm[0]) for e in phantom.ellipsoids[1:]]

@@ -12,7 +12,7 @@ from phyradgs_cl.neural import NeuralOptions, has_accelerator, has_torch
 from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
-_MOST_NEURAL_VOXELS = 128  # a side, on a CPU: beyond it a run takes hours
+_MOST_NEURAL_VOXELS = 128  # per side, on a CPU: beyond it a run takes hours
 KINDS = ("table1", "table2", "phantom")
 
 
@@ -40,8 +40,8 @@ class Row:
         counts = f"{self.strips}x{self.sub_intervals}" if self.motion == "micro-views" else ""
         return " ".join(part for part in (self.method, self.motion, counts, self.variant) if part)
 
-    def standing(self) -> Row:
-        """The row of the same method for a gantry that stands still."""
+    def static(self) -> Row:
+        """The row of the same method with a static model, for a gantry at rest."""
         return Row(self.still or self.label, self.method, variant=self.variant, changes=self.changes)
 
     def options(self, gaussians: int, iterations: int) -> Any:
@@ -70,7 +70,7 @@ class Row:
         return self._has(SplatOptions)
 
     def lacks(self, voxels: int) -> str:
-        """What this machine lacks to run the row at so many voxels a side, as PyTorch or a GPU for it; else nothing."""
+        """What this machine lacks to run the row at so many voxels per side, as PyTorch or a GPU for it; else nothing."""
         if not self._has(NeuralOptions):
             return ""
         if not has_torch():

@@ -1,4 +1,4 @@
-"""Runs a benchmark: whatever the results file lacks, one line a run, and then the tables."""
+"""Runs a benchmark: whatever the results file lacks, one line per run, and then the tables."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def lines_of(job: BenchJob, lines: Sequence[Line]) -> list[Line]:
     Names, protocols and rows restrict them where the job gives any; volumes and seeds of earlier jobs are included.
     """
     size = job.bench_size
-    runs = {row.run for row in job.chosen_rows} | {row.standing().run for row in job.chosen_rows}
+    runs = {row.run for row in job.chosen_rows} | {row.static().run for row in job.chosen_rows}
     chosen: dict[tuple[object, ...], Line] = {}
     for line in lines:
         fits = (

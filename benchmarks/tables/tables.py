@@ -128,4 +128,4 @@ def _record(job: BenchJob, protocol: str, row: Row, acquisition: str, summary: S
 def _all_rows(job: BenchJob) -> list[Row]:
     """The rows of a table and the static ones behind their stop-and-shoot runs, each run once."""
     rows = job.chosen_rows
-    return list({row.run: row for row in [*(row.standing() for row in rows), *rows]}.values())
+    return list({row.run: row for row in [*(row.static() for row in rows), *rows]}.values())

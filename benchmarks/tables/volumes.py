@@ -15,7 +15,7 @@ _COUNTED = re.compile(r"(?P<name>.+)_(?P<count>\d+)")
 def find_volumes(folder: Path, names: Sequence[str] | None, voxels: int) -> dict[str, Path]:
     """Name to file of the volumes in ``folder``, in alphabetical order, or those of ``names``.
 
-    Files are NAME_COUNT.h5 or NAME.h5. Of one name, the file with twice ``voxels`` a side is taken, else the largest.
+    Files are NAME_COUNT.h5 or NAME.h5. Of one name, the file with twice ``voxels`` per side is taken, else the largest.
 
     Raises:
         InputError: no such folder, no volume in it, a name that is not there.

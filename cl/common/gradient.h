@@ -31,7 +31,7 @@ static inline void gradient_store(__global float *out, const int stride, const i
     }
 }
 
-/* sums (.., 16) of LANES Gaussians that lie `step` floats apart, turned into one vector a field */
+/* sums (.., 16) of LANES Gaussians that lie `step` floats apart, turned into one vector per field */
 static inline void gather_sums(__global const float *sums, const size_t step, const int fields, __private float *buffer)
 {
     for (int lane = 0; lane < LANES; ++lane)

@@ -3,7 +3,7 @@
    compiler no choice of rounding, so a ray has the same samples wherever it is followed. */
 #include "common/lanes.h"
 
-#define RAY_CELL 16    /* floats a cell */
+#define RAY_CELL 16    /* floats per cell */
 #define RAY_SOURCE 0
 #define RAY_D00 3      /* from source to pixel (0, 0) */
 #define RAY_EU 6

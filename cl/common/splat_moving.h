@@ -25,7 +25,7 @@
 
 /* constants of a moving splat along one line; z = along - speed * middle */
 typedef struct {
-    float z1, z0, c1, c0, shift, b1, b0, inv_kappa, gain, half_path, d0, d1, d2;
+    float z1, z0, c1, c0, shift, b1, b0, inv_kappa, amplitude, half_path, d0, d1, d2;
     int rule;
 } moving_line;
 
@@ -54,9 +54,9 @@ ALWAYS_INLINE moving_line moving_on_line(__global const float *rec, __global con
     s.d1 = cell[CELL_DU] + cell[CELL_DUV] * v;
     s.d2 = cell[CELL_DUU];
     s.rule = moving_rule(2.0f * s.half_path, limits);
-    s.gain = rec[REC_AMP] * weight;
+    s.amplitude = rec[REC_AMP] * weight;
     if (s.rule == CLOSED)
-        s.gain *= ROOT_HALF_PI / (2.0f * s.half_path);
+        s.amplitude *= ROOT_HALF_PI / (2.0f * s.half_path);
     return s;
 }
 
@@ -124,9 +124,9 @@ ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_
     if (rule == CLOSED) {
         const vf k = ROOT_HALF * SQUARE_ROOT(p.rq);
         const vf m = erf_between((-s.half_path - p.z) * k, (s.half_path - p.z) * k);
-        return s.gain * SQUARE_ROOT(p.d2) * falling_exp2(p.c2 * p.fall) * m;
+        return s.amplitude * SQUARE_ROOT(p.d2) * falling_exp2(p.c2 * p.fall) * m;
     }
-    const vf factor = s.gain * SQUARE_ROOT(p.d2 * p.rq);
+    const vf factor = s.amplitude * SQUARE_ROOT(p.d2 * p.rq);
     if (rule == 1)
         return factor * moving_exp(p.z, p);
     const float step = s.half_path * (rule == 2 ? GAUSS_2 : GAUSS_3);

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.shutter import Shutter
@@ -41,11 +42,11 @@ class TimeCells:
     time_s: np.ndarray
     line_start: np.ndarray
     line_stop: np.ndarray
-    weight: np.ndarray
+    weight: NDArray[np.float64]
     lines: int
     axis: str = "rows"
     end_poses: np.ndarray | None = None
-    line_times: np.ndarray | None = None
+    line_times: NDArray[np.float64] | None = None
 
     @property
     def count(self) -> int:
@@ -314,7 +315,8 @@ def _turns_rad(pose: np.ndarray) -> np.ndarray:
         2 * np.arcsin(np.linalg.norm(np.diff(x, axis=0), axis=1).clip(0, 2) / 2)
         for x in (u_hat, normal, source)
     ]
-    return np.max(steps, axis=0)
+    largest: np.ndarray = np.max(steps, axis=0)
+    return largest
 
 
 def _single_cell(

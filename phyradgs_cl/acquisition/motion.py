@@ -15,6 +15,8 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
 
 
@@ -26,11 +28,7 @@ class Motion(Interface):
         ...
 
 
-def _name(name: str) -> Any:
-    return field(default=name, init=False, repr=False)
-
-
-def _place(scan: Scan, frame: int) -> tuple[Any, ...]:
+def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int]:
     """What the builders of cells begin with."""
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
@@ -39,7 +37,7 @@ def _place(scan: Scan, frame: int) -> tuple[Any, ...]:
 class Static:
     """One pose per frame, at the middle of its lit span: a gantry that stands still."""
 
-    name: str = _name("static")
+    name: str = field(default="static", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         return cells.static_cells(*_place(scan, frame))
@@ -49,7 +47,7 @@ class Static:
 class StaticStart:
     """One pose per frame, its first."""
 
-    name: str = _name("static-start")
+    name: str = field(default="static-start", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         return cells.static_start_cells(*_place(scan, frame))
@@ -59,7 +57,7 @@ class StaticStart:
 class MicroViews:
     """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper."""
 
-    name: str = _name("micro-views")
+    name: str = field(default="micro-views", init=False, repr=False)
     strips: int = 8
     sub_intervals: int = 5
 
@@ -77,7 +75,7 @@ class MicroViews:
 class PerRow:
     """Every line at its own ``sub_intervals`` exact times; what the simulator uses."""
 
-    name: str = _name("per-row")
+    name: str = field(default="per-row", init=False, repr=False)
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
@@ -93,7 +91,7 @@ class PerRow:
 class LineMiddles:
     """Every line at the middle of its own exposure: ``per-row`` of a method that has one pose per line."""
 
-    name: str = _name("per-row")
+    name: str = field(default="per-row", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         return PerRow(1).cells(scan, frame)
@@ -107,7 +105,7 @@ class Exact:
     average over time.
     """
 
-    name: str = _name("exact")
+    name: str = field(default="exact", init=False, repr=False)
     segments: int = 0
     time_error: float = 0.005
 
@@ -142,7 +140,7 @@ def motion_of(motion: str | Motion) -> Motion:
 
 def motion_facts(motion: Motion) -> dict[str, object]:
     """Name and fields of a model, for a result's facts; what JSON has no word for as Python prints it."""
-    own = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
+    own: dict[str, Any] = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
     plain = {key: value if isinstance(value, int | float | str) else repr(value) for key, value in own.items()}
     return {"name": str(getattr(motion, "name", type(motion).__name__)), **plain}
 

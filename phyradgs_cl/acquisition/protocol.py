@@ -63,7 +63,8 @@ class Protocol:
         return np.arange(self.views) * self.step_deg / self.exposure_deg * self.exposure_s
 
     def angle_start_rad(self) -> np.ndarray:
-        return np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
+        start_rad: np.ndarray = np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
+        return start_rad
 
     def orbit(
         self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
@@ -71,7 +72,7 @@ class Protocol:
         """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan.
 
         Jitter is a smooth wander of the true gantry about constant speed, recorded by the encoder
-        (standard deviation ``jitter_deg``, one knot a frame).
+        (standard deviation ``jitter_deg``, one knot per frame).
         """
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)

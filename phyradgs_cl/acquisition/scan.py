@@ -9,7 +9,7 @@ import numpy as np
 from phyradgs_cl.acquisition.field_of_view import field_of_view_mm, misses
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.shutter import Shutter
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 
@@ -39,7 +39,7 @@ class Scan:
 
     projections: np.ndarray
     geometry: ConeGeometry
-    trajectory: CircularOrbit | PoseTable
+    trajectory: Trajectory
     shutter: Shutter
     frame_start_s: np.ndarray
     grid: Grid

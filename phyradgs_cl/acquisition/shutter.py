@@ -92,7 +92,7 @@ class Shutter:
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
-        return np.clip(time_s, start_s, start_s + length_s)
+        return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
         """How many lines a (rows, columns) detector has along the readout axis."""

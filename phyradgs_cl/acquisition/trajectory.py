@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
@@ -19,6 +20,12 @@ class Trajectory(Protocol):
     """Anything that knows where the gantry is: poses (..., 12) of a frame at times (...) in seconds."""
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray: ...
+
+
+class Kinematics(Protocol):
+    """Anything that knows the gantry's angles (...) of a frame at times (...) in seconds."""
+
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ class EncoderTable:
     """Measured θ(t): linear between samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
 
     time_s: np.ndarray
-    angle_rad_table: np.ndarray
+    angle_rad_table: NDArray[np.float64]
     culprit: str = "encoder table"
 
     def __post_init__(self) -> None:
@@ -90,15 +97,15 @@ class FrameSweeps:
         first, last = float(self.angle_start_rad[frame]), float(self.angle_end_rad[frame])
         if self.exposure_s <= 0:
             return np.full(t.shape, first)
-        return first + (last - first) * (t - self.start_s[frame]) / self.exposure_s
+        return first + (last - first) * (t - float(self.start_s[frame])) / self.exposure_s
 
 
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
-    """A circular geometry driven by a kinematics object (anything with ``angle_rad(frame, time_s)``)."""
+    """A circular geometry whose gantry turns as its kinematics say."""
 
     geometry: ConeGeometry
-    kinematics: ConstantSpeed | SpeedRamp | EncoderTable | FrameSweeps
+    kinematics: Kinematics
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         return self.geometry.pose(self.kinematics.angle_rad(frame, time_s))
@@ -118,6 +125,7 @@ class PoseTable:
     time_s: np.ndarray
     table: np.ndarray
     culprit: str = "pose table"
+    _frames: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         time_s = np.asarray(self.time_s, np.float64)
@@ -139,13 +147,13 @@ class PoseTable:
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         t = np.asarray(time_s, np.float64)
         _check_covered(self.culprit, frame, t, self.time_s)
-        frames: np.ndarray = self._frames  # type: ignore[attr-defined]
-        in_body = np.einsum("tji,tkj->tki", frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
+        in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp knows no slack
         body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
-        turns = scipy.spatial.transform.Rotation.from_matrix(frames)
+        turns = scipy.spatial.transform.Rotation.from_matrix(self._frames)
         turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
-        return np.einsum("tij,tkj->tki", turn, body).reshape(*t.shape, POSE_LENGTH)
+        turned: np.ndarray = np.einsum("tij,tkj->tki", turn, body)
+        return turned.reshape(*t.shape, POSE_LENGTH)
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:

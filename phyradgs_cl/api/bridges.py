@@ -65,7 +65,7 @@ def as_torch(operator: Linear | Projector) -> Callable[[Any], Any]:
 
 
 def _linear_function(torch: Any, operator: Linear, array: Any, tensor: Any) -> Callable[[Any], Any]:
-    class Forward(torch.autograd.Function):  # type: ignore[misc]
+    class Forward(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, volume: Any) -> Any:
             return tensor(operator.forward(array(volume)), volume)
@@ -74,7 +74,7 @@ def _linear_function(torch: Any, operator: Linear, array: Any, tensor: Any) -> C
         def backward(ctx: Any, by_frames: Any) -> Any:
             return Adjoint.apply(by_frames)
 
-    class Adjoint(torch.autograd.Function):  # type: ignore[misc]
+    class Adjoint(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, frames: Any) -> Any:
             return tensor(operator.adjoint(array(frames)), frames)
@@ -87,7 +87,7 @@ def _linear_function(torch: Any, operator: Linear, array: Any, tensor: Any) -> C
 
 
 def _splat_function(torch: Any, projector: Projector, array: Any, tensor: Any) -> Callable[[Any], Any]:
-    class Splat(torch.autograd.Function):  # type: ignore[misc]
+    class Splat(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, rows: Any) -> Any:
             ctx.save_for_backward(rows)

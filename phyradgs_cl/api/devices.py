@@ -16,5 +16,5 @@ def runtime_of(device: Device) -> Runtime:
 
 @lru_cache(maxsize=4)
 def _runtime_by_name(name: str | None) -> Runtime:
-    """One Runtime a device, so that programs are built once."""
+    """One Runtime per device, so that programs are built once."""
     return Runtime(name)

@@ -1,4 +1,4 @@
-"""What is wrong or suspicious in a scan, before anyone waits for a reconstruction: a file a question."""
+"""What is wrong or suspicious in a scan, before anyone waits for a reconstruction: one file per question."""
 
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.questions.saturation import CountReader

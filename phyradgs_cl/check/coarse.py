@@ -9,19 +9,19 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, Shutter
-from phyradgs_cl.check.variants import with_path
+from phyradgs_cl.check.variants import path_of, with_path
 from phyradgs_cl.fields import Grid
 
 _MOST_FRAMES = 60
 _LEAST_VALID = 0.5  # of a block's pixels
-_MOST_VOXELS = 64  # a side
+_MOST_VOXELS = 64  # per side
 _SMOOTH = 0.8  # of a block: standard deviation
 _KEPT_COLUMNS = 12  # of blocks, where the panel has as many
 
 
 @dataclass(frozen=True)
 class Level:
-    """How coarse: at most ``columns`` pixels along the detector's longer side, ``voxels`` a pixel at the axis."""
+    """How coarse: at most ``columns`` pixels along the detector's longer side, ``voxels`` per pixel at the axis."""
 
     columns: int
     voxels: float
@@ -66,7 +66,7 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 def some_frames(scan: Scan, chosen: np.ndarray) -> Scan:
     """The chosen frames (indices), their trajectory counting them as they were."""
-    path = with_path(scan).trajectory
+    path = path_of(scan)
     numbers = chosen if path.frames is None else path.frames[chosen]
     mask = scan.pixel_mask
     return replace(

@@ -1,4 +1,4 @@
-"""What a check found: one answer a question, with the number it rests on."""
+"""What a check found: one answer per question, with the number it rests on."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ _DRAWS = 200
 _TINY = 1e-30
 
 
-def standing(stated: np.ndarray, other: np.ndarray) -> float:
+def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
     """By how many standard errors the stated hypothesis explains the frames (F,) better than the other.
 
     Squared residuals are compared frame by frame, relative to the stated one's, so that what makes a frame hard to explain
@@ -21,7 +21,7 @@ def standing(stated: np.ndarray, other: np.ndarray) -> float:
     return float(difference.mean()) / error if error > 0 else 0.0
 
 
-def gain(stated: np.ndarray, other: np.ndarray) -> float:
+def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
     """Residual (F,) squared of the other over that of the stated hypothesis, of all frames together."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 

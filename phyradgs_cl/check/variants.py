@@ -53,14 +53,18 @@ class Path:
         return pose
 
 
+def path_of(scan: Scan) -> Path:
+    """The scan's trajectory as a path that can be changed."""
+    path = scan.trajectory
+    if isinstance(path, Path):
+        return path
+    offset_u_mm = scan.geometry.detector_offset_mm[1] if isinstance(path, CircularOrbit) else 0.0
+    return Path(path, scan.geometry.detector_shape[1], offset_u_mm)
+
+
 def with_path(scan: Scan, **changes: Any) -> Scan:
     """The scan with changed fields of its ``Path``."""
-    path = scan.trajectory
-    if not isinstance(path, Path):
-        on_circle = isinstance(path, CircularOrbit)
-        offset_u_mm = scan.geometry.detector_offset_mm[1] if on_circle else 0.0
-        path = Path(path, scan.geometry.detector_shape[1], offset_u_mm)
-    return replace(scan, trajectory=replace(path, **changes))
+    return replace(scan, trajectory=replace(path_of(scan), **changes))
 
 
 def reversed_rotation(scan: Scan) -> Scan:
@@ -96,7 +100,7 @@ class Changed:
 
 
 def at_rest(scan: Scan) -> Scan:
-    """The gantry standing while it exposes."""
+    """The gantry at rest while it exposes."""
     return replace(scan, is_fly=False)
 
 

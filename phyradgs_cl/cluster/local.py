@@ -1,4 +1,4 @@
-"""A scheduler and workers on this machine, a process a worker, each with a device of its own."""
+"""A scheduler and workers on this machine, one process per worker, each with a device of its own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DASHBOARD = f"{_HOST}:8787"
 def local_cluster(workers: Workers) -> Any:
     """Starts them; what is returned closes them. A worker that dies is replaced by its nanny.
 
-    There is no limit of memory a worker: Dask would kill a run that is larger than its share, again and again.
+    There is no limit of memory per worker: Dask would kill a run that is larger than its share, again and again.
     """
     package = distributed()
     spec = {number: _worker(package, device) for number, device in enumerate(workers.devices())}

@@ -20,7 +20,7 @@ class Workers:
     Args:
         scheduler: ``local`` for workers of this machine; else the address of a Dask scheduler (``tcp://host:8786``) or
             the JSON file that one has written (``dask scheduler --scheduler-file``).
-        count: of local workers; None is one a device.
+        count: of local workers; None is one per device.
         device: what a worker's device is asked for by; several with commas are given out in turn. Only for local
             workers: others say it themselves, by the environment variable PHYRADGS_DEVICE.
     """
@@ -57,7 +57,7 @@ class Workers:
 
 
 def _wishes(device: str | None) -> list[str]:
-    """One a device: those with commas between them; all GPUs for ``gpu`` and for none on a machine with GPUs."""
+    """One per device: those with commas between them; all GPUs for ``gpu`` and for none on a machine with GPUs."""
     if device is None or device.lower() == "gpu":
         best, _ = choose_device(device)
         if best.kind != "gpu":

@@ -1,1 +1,1 @@
-"""The commands of the command line, a file each: options in, one call into the library, a result printed."""
+"""The commands of the command line, one file each: options in, one call into the library, a result printed."""

@@ -39,7 +39,7 @@ def bench_command(
             "-o",
             parser=file_parser("-o"),
             metavar="DIR",
-            help=f"Folder for scans, {RESULTS} (a line a run), volumes and tables.",
+            help=f"Folder for scans, {RESULTS} (one line per run), volumes and tables.",
             show_default="bench-results",
         ),
     ] = None,

@@ -87,7 +87,7 @@ def _write_copy(scan: Path, target: Path, found: CheckResult, quiet: bool) -> No
 
 
 def _as_text(found: CheckResult) -> str:
-    """A line a question, what to do below it, and the sum."""
+    """A line per question, what to do below it, and the sum."""
     lines: list[str] = []
     for finding in found.findings:
         lines.append(f"{finding.verdict:12s} {finding.question:19s} {finding.text}")

@@ -30,7 +30,7 @@ def export_command(
         ),
     ] = None,
     to: Annotated[
-        Export | None,  # type: ignore[valid-type]
+        Export | None,
         typer.Option(
             "--to",
             help="nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians.",

@@ -68,7 +68,7 @@ Scheduler = Annotated[
     ),
 ]
 WorkerCount = Annotated[
-    int | None, typer.Option(metavar="N", help="Local workers, each a process.", show_default="one a device")
+    int | None, typer.Option(metavar="N", help="Local workers, each a process.", show_default="one per device")
 ]
 
 # which voxels; Any, as the numbers are checked where they are used
@@ -104,7 +104,7 @@ RoiMm = Annotated[
 
 # what a reconstruction is asked for; commands that speak of one share these words
 Method = Annotated[
-    MethodName | None,  # type: ignore[valid-type]
+    MethodName | None,
     typer.Option(
         case_sensitive=False,
         help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
@@ -156,7 +156,7 @@ Batch = Annotated[
     int | None,
     typer.Option(
         metavar="B",
-        help="Frames a step, for splats.",
+        help="Frames per step, for splats.",
         show_default="as many as ranks",
         rich_help_panel=RANKS,
     ),
@@ -200,5 +200,5 @@ IgnoreLag = Annotated[
 ]
 MedianFilter = Annotated[
     int | None,
-    typer.Option(help="Median filter of the frames: 3 or 5 pixels a side, 0 none.", show_default="0"),
+    typer.Option(help="Median filter of the frames: 3 or 5 pixels per side, 0 none.", show_default="0"),
 ]

@@ -21,7 +21,7 @@ def takes_part(arguments: Sequence[str]) -> bool:
     if launched().rank == 0:
         return True
     # who writes there knows that there may be nothing, as in a process of a window
-    sys.stdout = sys.stderr = None  # type: ignore[assignment]
+    sys.stdout = sys.stderr = None
     return tuple(arguments[:1]) in {(name,) for name in SHARING}
 
 

@@ -79,8 +79,7 @@ def reconstruct_command(
 
     def runtime() -> Runtime:
         with settings.naming_origins():
-            chosen = {"profile": profile, "memory": settings.memory, "ranks": ranks}
-            runtimes.append(Runtime(settings.device, **chosen))
+            runtimes.append(Runtime(settings.device, profile=profile, memory=settings.memory, ranks=ranks))
         ticker.stage("building kernels")
         return runtimes[-1]
 

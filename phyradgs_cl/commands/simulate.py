@@ -104,7 +104,7 @@ def simulate_command(
         ),
     ] = Noise.none,
     dose: Annotated[
-        float | None, typer.Option(help="Photons a pixel without object, for --noise.", show_default="10000")
+        float | None, typer.Option(help="Photons per pixel without object, for --noise.", show_default="10000")
     ] = None,
     electronic_noise: Annotated[
         float | None,

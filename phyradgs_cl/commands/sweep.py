@@ -31,7 +31,7 @@ def sweep_command(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="DIR", help=f"Folder for {RESULTS} (a line a run), volumes and tables."
+            "--output", "-o", metavar="DIR", help=f"Folder for {RESULTS} (one line per run), volumes and tables."
         ),
     ],
     scheduler: Scheduler = None,
@@ -87,7 +87,7 @@ def chosen_workers(scheduler: str | None, count: int | None, device: str | None)
 
 
 class SweepTicker:
-    """Progress of a sweep: a line a finished run, a counter for all, and for the iterations of a run made here."""
+    """Progress of a sweep: one line per finished run, a counter for all, and for the iterations of a run made here."""
 
     def __init__(self) -> None:
         self.all, self.one, self.name = Ticker("run"), Ticker("iteration"), ""

@@ -5,7 +5,7 @@ from phyradgs_cl.detector.attenuation import (
     counts_to_attenuation,
     frames_to_attenuation,
 )
-from phyradgs_cl.detector.average import average
+from phyradgs_cl.detector.average import average, intensity_average
 from phyradgs_cl.detector.lag import add_lag, lagged, remove_lag, without_lag
 from phyradgs_cl.detector.noise import (
     beer_lambert_counts,
@@ -28,6 +28,7 @@ __all__ = [
     "counts_to_attenuation",
     "find_saturation",
     "frames_to_attenuation",
+    "intensity_average",
     "lagged",
     "noise_level",
     "remove_lag",

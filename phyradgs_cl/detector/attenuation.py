@@ -131,8 +131,7 @@ def _calibration(
         remedy = "add flat frames, or store transmission or attenuation"
         raise InputError("image_key", "no flat (key 1) among counts", "at least one flat frame", remedy)
     flat = flats.mean(axis=0, dtype=np.float64)
-    has_dark = darks is not None and len(darks) > 0
-    dark = darks.mean(axis=0, dtype=np.float64) if has_dark else np.zeros(flat.shape)
+    dark = np.zeros(flat.shape) if darks is None or len(darks) == 0 else darks.mean(axis=0, dtype=np.float64)
     return dark, flat - dark
 
 

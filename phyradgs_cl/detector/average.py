@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -38,10 +40,21 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
     finite("line integrals", values)
     if (weights < 0).any() or abs(weights.sum() - 1) > _WEIGHT_TOLERANCE:
         raise InputError("weight", f"sum {weights.sum():g}, least {weights.min():g}", "not negative, sum 1")
-    return np.tensordot(weights, values, axes=1) if model == "log" else _intensity(values, weights)
+    return np.tensordot(weights, values, axes=1) if model == "log" else intensity_average(values, weights)[0]
 
 
-def _intensity(p: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    used = weight > 0
-    least = p[used].min(axis=0)  # the brightest time: its exponential becomes 1, the others smaller
-    return least - np.log(np.tensordot(weight[used], np.exp(least - p[used]), axes=1))
+def intensity_average(
+    p: Iterable[np.ndarray], weights: Iterable[np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """−ln Σ w exp(−p) over S times, and each time's share w exp(−p) / Σ w exp(−p), without overflow.
+
+    p: S arrays, whose precision is that of the result. weights: S numbers or arrays that broadcast with them, sum 1;
+    where all are 0, average and shares are 0.
+    """
+    pairs = list(zip(p, weights, strict=True))
+    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # of the brightest time
+    least = np.where(np.isfinite(least), least, 0)
+    seen = [w * np.exp(np.where(w > 0, least - q, 0)) for q, w in pairs]
+    total = np.sum(seen, axis=0)
+    inverse = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+    return least - np.log(np.where(total > 0, total, 1)), [part * inverse for part in seen]

@@ -18,7 +18,7 @@ _ROUNDING, _RELATIVE = 0.5, 2e-5  # noise in counts, and of the ceiling, that is
 _WHITE = 0.5  # least ratio of two estimates that agree on white noise and differ by far on smooth structure
 
 
-def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.generic]) -> Saturation:
+def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
     """The largest count of projections (P, v, u), and the share of their pixels that is clipped there.
 
     Clipped are whole areas at the largest count, unless they may as well be air without noise: that lies together at one
@@ -49,7 +49,7 @@ def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
     return count / pixels if inner and touching / inner > _TOUCHING else 0.0
 
 
-def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.generic], level: float) -> bool:
+def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level: float) -> bool:
     """Whether the clipped pixels would have to be air of another brightness than the flats."""
     hit = np.zeros(frames.shape[1:], bool)
     for frame in frames:

@@ -1,6 +1,6 @@
-"""A DICOM series: a folder of CT images, one a slice, in Hounsfield units or in 1/mm with a rescale slope.
+"""A DICOM series: a folder of CT images, one per slice, in Hounsfield units or in 1/mm with a rescale slope.
 
-Attributes of the CT Image module (DICOM PS3.3, A.3 and C.8.2): position and orientation in LPS, 16 bits a voxel.
+Attributes of the CT Image module (DICOM PS3.3, A.3 and C.8.2): position and orientation in LPS, 16 bits per voxel.
 """
 
 from __future__ import annotations

@@ -26,11 +26,11 @@ def gaussians_of(stored: StoredVolume, culprit: str) -> dict[str, np.ndarray]:
 def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
     """Four arrays by their names, no pickle."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **cloud)
+        np.savez(file, **cloud)  # type: ignore[arg-type]
 
 
 def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:
-    """Binary PLY: a vertex a Gaussian, every number in the unit that the header's comments state."""
+    """Binary PLY: a vertex per Gaussian, every number in the unit that the header's comments state."""
     columns = [cloud["mean"], cloud["scale"], cloud["quaternion"], cloud["density"][:, None]]
     rows = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
     properties = "".join(f"property float {name}\n" for name in _PLY_NAMES)

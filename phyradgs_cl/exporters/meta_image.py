@@ -12,7 +12,7 @@ def write_meta_image(path: Path, volume: Placed) -> None:
     """One file, uncompressed."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         file.write(header(volume).encode("ascii"))
-        file.write(memoryview(volume.values.astype("<f4", copy=False)).cast("B"))
+        file.write(volume.values.astype("<f4", copy=False).data.cast("B"))
 
 
 def header(volume: Placed) -> str:

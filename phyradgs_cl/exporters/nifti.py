@@ -23,7 +23,7 @@ def write_nifti(path: Path, volume: Placed) -> None:
             "--to nii", f"{max(volume.shape_xyz)} voxels", f"at most {_LARGEST}", "use --to nrrd"
         )
     head = header(volume).tobytes() + bytes(VOXELS_AT - HEADER.itemsize)
-    data = memoryview(volume.values.astype("<f4", copy=False)).cast("B")
+    data = volume.values.astype("<f4", copy=False).data.cast("B")
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         if path.suffix.lower() == ".gz":
             with gzip.GzipFile(

@@ -2,6 +2,6 @@
 
 from phyradgs_cl.fields.gaussians import Activation, Gaussians
 from phyradgs_cl.fields.grid_choice import GridChoice
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields.volume import Grid, triple
 
-__all__ = ["Activation", "Gaussians", "Grid", "GridChoice"]
+__all__ = ["Activation", "Gaussians", "Grid", "GridChoice", "triple"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields.volume import MOST_VOXELS, Grid
+from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
 _LARGEST_MM = 1e9
 _ROUNDING = 1e-6  # of a voxel: a box that ends at a voxel's face ends there, whatever its decimals
@@ -73,7 +73,7 @@ class GridChoice:
         else:
             return grid
         voxel_mm = sides_mm / shape if self.voxel_mm is None else self.voxel_mm
-        return Grid(self._whole(shape), tuple(voxel_mm), tuple(box_mm.mean(1)))
+        return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
 
     def _counts(self, proportion: np.ndarray) -> np.ndarray:
         if isinstance(self.size, tuple):
@@ -85,15 +85,14 @@ class GridChoice:
         low, high = (box_mm.T - grid.box_mm[:, 0]) / grid.voxel_size_mm
         start = np.floor(low + _ROUNDING)
         shape = self._whole(np.maximum(np.ceil(high - _ROUNDING) - start, 1))
-        return grid.part(tuple(int(n) for n in start), shape)
+        return grid.part(triple(int(n) for n in start), shape)
 
     def _whole(self, shape: np.ndarray) -> tuple[int, int, int]:
         if np.prod(shape) > MOST_VOXELS:
             culprit = "--voxel-mm" if self.voxel_mm is not None else "--size" if self.size is not None else "--roi-mm"
             found = " × ".join(f"{n:.6g}" for n in shape)
             raise InputError(culprit, f"a grid of {found}", f"at most {MOST_VOXELS:.3g} voxels")
-        z, y, x = (int(n) for n in shape)
-        return z, y, x
+        return triple(int(n) for n in shape)
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +14,13 @@ from phyradgs_cl.errors import InputError
 MOST_VOXELS = 2**38
 """A terabyte of float32: what asks for more is damage."""
 _SAME_PLACE = 1e-3  # of a voxel: what grids stored in float32 need
+T = TypeVar("T")
+
+
+def triple(values: Iterable[T]) -> tuple[T, T, T]:
+    """Three values (z, y, x) as a tuple of that length."""
+    z, y, x = values
+    return z, y, x
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Scans and volumes in other programs' formats: read, checked as if by strangers, and turned into our conventions.
 
-`import_scan` and `load_volume` are the doors; one module a format.
+`import_scan` and `load_volume` are the doors; one module per format.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Scan]] = {
 
 
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
-    """A scan from a file or folder of another program, with line integrals, upright, in mm, s and radians.
+    """A scan from a file or folder of another program, with line integrals, row 0 the lowest, in mm, s and radians.
 
     Args:
         path: file or folder.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def put_together(
     reference: np.ndarray | None = None,
     lag: float = 0.0,
 ) -> Scan:
-    """A scan of line integrals, upright already; the grid is the cone's cube where none is given."""
+    """A scan of line integrals, row 0 the lowest already; the grid is the cone's cube where none is given."""
     return Scan(
         projections=integrals.values,
         geometry=geometry,
@@ -49,7 +50,7 @@ def put_together(
 
 def with_options(geometry: ConeGeometry, options: ImportOptions) -> ConeGeometry:
     """The geometry with the distances, pitches and offset that the user gives in place of the file's."""
-    changes = {
+    changes: dict[str, Any] = {
         "source_to_axis_mm": options.source_to_axis_mm,
         "source_to_detector_mm": options.source_to_detector_mm,
         "pixel_size_mm": options.pixel_size_mm,

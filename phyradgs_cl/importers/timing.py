@@ -61,15 +61,16 @@ def make_timing(
     exposure. Without them every frame is taken at rest, and what a user says of a turn in between is refused.
     """
     stored = stored or StoredTiming()
-    exposure_s = _first(options.exposure_s, stored.exposure_s, 0.0)
-    readout_s = _first(options.readout_s, stored.readout_s, 0.0)
+    exposure_s = _first(options.exposure_s, stored.exposure_s) or 0.0
+    readout_s = _first(options.readout_s, stored.readout_s) or 0.0
     direction = stored.direction if options.readout_direction is None else options.readout_direction
-    pulse_s = tuple(part * exposure_s for part in stored.pulse) if stored.pulse and exposure_s > 0 else None
+    start, length = stored.pulse or (0.0, 0.0)
+    pulse_s = (start * exposure_s, length * exposure_s) if stored.pulse and exposure_s > 0 else None
     shutter = Shutter(exposure_s, readout_s, options.readout_axis or stored.axis, direction, pulse_s)
     angle_at = options.angle_at or stored.angle_at
-    frame_time_s = _first(options.frame_time_s, stored.frame_time_s, None)
+    frame_time_s = _first(options.frame_time_s, stored.frame_time_s)
     if options.frame_time_s is None and stored.start_s is not None:
-        start_s = np.asarray(stored.start_s, np.float64)
+        start_s: np.ndarray = np.asarray(stored.start_s, np.float64)
         checks.shape(f"{culprit} start times", start_s, (frames,))
     elif frame_time_s is not None:
         start_s = np.arange(frames) * frame_time_s

@@ -14,7 +14,7 @@ from phyradgs_cl.importers.reading.bounded import read_json, read_npy
 from phyradgs_cl.importers.reading.meta_image import read_meta_image
 from phyradgs_cl.importers.reading.nifti import read_nifti
 from phyradgs_cl.importers.reading.nrrd import read_nrrd
-from phyradgs_cl.importers.reading.voxels import Voxels, upright
+from phyradgs_cl.importers.reading.voxels import Voxels, along_world_axes
 from phyradgs_cl.io import LoadedVolume
 
 
@@ -34,7 +34,7 @@ def load_volume(path: str | Path) -> LoadedVolume:
         InputError: not such a file, damaged, not three axes, oblique, Hounsfield units, NaN or infinity.
     """
     found = _format(path)
-    return upright(str(path), found[1](Path(path))) if found else io.load_volume(path)
+    return along_world_axes(str(path), found[1](Path(path))) if found else io.load_volume(path)
 
 
 def load_attenuation(path: str | Path) -> LoadedVolume:

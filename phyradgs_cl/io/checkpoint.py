@@ -37,7 +37,7 @@ def partial_path(output: str | Path) -> Path:
 def write_checkpoint(path: str | Path, arrays: dict[str, np.ndarray], fingerprint: str) -> None:
     """Writes arrays whole or not at all; ``fingerprint`` says as JSON which scan and options they are of."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, format=np.array(_FORMAT), fingerprint=np.array(fingerprint), **arrays)
+        np.savez(file, format=np.array(_FORMAT), fingerprint=np.array(fingerprint), **arrays)  # type: ignore[arg-type]
 
 
 def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Results files: JSON lines, one a run, only ever appended to.
+"""Results files: JSON lines, one per run, only ever appended to.
 
 A run that is killed while it writes leaves a damaged last line, which reading skips and the next append closes off.
 """

@@ -1,4 +1,4 @@
-"""One run an output: a lock file beside it that the operating system lets go of when its process ends, however it ends."""
+"""One run per output: a lock file beside it that the operating system lets go of when its process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
         lock.acquire(timeout=wait_s, poll_interval=_LOOK_EVERY_S)
     except Timeout:
         remedy = "wait for it, or choose another output"
-        raise BusyError(str(output), "another run at work on it", "one run an output", remedy) from None
+        raise BusyError(str(output), "another run at work on it", "one run per output", remedy) from None
     except OSError as error:
         found = f"{error.strerror or error} for its lock {path}"
         raise OutputError(str(output), found, "a folder that can be written", "choose another") from error

@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.hdf5.grid import default_grid
 from phyradgs_cl.io.hdf5.units import LENGTH
@@ -147,8 +147,8 @@ def _grid(volume: Fields) -> Grid:
         raise InputError(volume.name("shape"), checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
     if min(size_mm) < 1 / LENGTH.largest:
         raise InputError(volume.name("size_mm"), str(list(size_mm)), "three lengths above 0 (z, y, x)")
-    voxel_mm = tuple(side / n for side, n in zip(size_mm, shape, strict=True))
-    return Grid(tuple(int(n) for n in shape), voxel_mm, offset_mm)
+    voxel_mm = triple(side / n for side, n in zip(size_mm, shape, strict=True))
+    return Grid(triple(int(n) for n in shape), voxel_mm, offset_mm)
 
 
 def _triple(volume: Fields, key: str) -> tuple[float, float, float]:

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.fields import Gaussians, Grid, triple
 from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.hdf5.datasets import in_unit, new_group, read_array, read_values, read_word, write_number
 from phyradgs_cl.io.hdf5.facts import PROVENANCE, Schema, read_facts
@@ -147,7 +147,7 @@ def load_attenuation(
     return loaded
 
 
-def volume_summary(path: str | Path) -> dict[str, object]:
+def volume_summary(path: str | Path) -> dict[str, Any]:
     """Facts about a volume file, for people, without reading the voxels."""
     with open_hdf5(path) as source:
         _, grid = _checked(source)
@@ -254,7 +254,7 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
     known = [step for step in steps_mm if step is not None]  # one voxel has no spacing of its own
     usual = known[0] if known else 1.0
-    return Grid(tuple(shape), tuple(usual if s is None else s for s in steps_mm), tuple(centres_mm))
+    return Grid(triple(shape), triple(usual if s is None else s for s in steps_mm), triple(centres_mm))
 
 
 def _read_voxels(source: Hdf5Source) -> tuple[np.ndarray, Grid]:

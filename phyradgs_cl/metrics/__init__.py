@@ -1,6 +1,6 @@
 """How close a reconstruction is to the truth."""
 
-from phyradgs_cl.metrics.balls import Ball
+from phyradgs_cl.metrics.beads import Bead
 from phyradgs_cl.metrics.bias import regional_bias
 from phyradgs_cl.metrics.compare import compare
 from phyradgs_cl.metrics.edge import edge_sharpness
@@ -13,7 +13,7 @@ from phyradgs_cl.metrics.slices import slices_png
 from phyradgs_cl.metrics.ssim import ssim, ssim_map
 
 __all__ = [
-    "Ball",
+    "Bead",
     "compare",
     "compare_projections",
     "edge_sharpness",

@@ -1,7 +1,7 @@
-"""Edge sharpness: the distance over which a ball's edge rises from 10 % to 90 %.
+"""Edge sharpness: the distance over which a bead's edge rises from 10 % to 90 %.
 
-A ball blurred by an isotropic Gaussian has a radial profile in closed form, so σ, radius and the two levels follow
-from a fit to all voxels around the ball: below a voxel, insensitive to noise, and right for small balls too, whose
+A bead blurred by an isotropic Gaussian has a radial profile in closed form, so σ, radius and the two levels follow
+from a fit to all voxels around the bead: below a voxel, insensitive to noise, and right for small beads too, whose
 profile has no plateau. A straight edge blurred by σ rises from 10 % to 90 % within 2.563 σ. Voxels that average over
 their own width d add d²/12 to σ²: a perfect volume has a rise of about 0.74 voxel.
 """
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics.balls import Array, Ball, levels, resolved, surroundings
+from phyradgs_cl.metrics.beads import Array, Bead, levels, resolved, surroundings
 
 RISE_PER_SIGMA = 2.5631031310892007  # between the 10th and the 90th percentile of a normal distribution
 
 
 @dataclass(frozen=True)
 class Edge:
-    """The edge of one ball: its 10–90 % rise and radius in mm, its levels in the volume's unit."""
+    """The edge of one bead: its 10–90 % rise and radius in mm, its levels in the volume's unit."""
 
     rise_mm: float
     radius_mm: float
@@ -32,46 +32,46 @@ class Edge:
     outside: float
 
 
-def edge_sharpness(volume: NDArray[np.floating], grid: Grid, balls: Sequence[Ball]) -> dict[str, float]:
-    """Mean 10–90 % rise over the balls that the grid resolves.
+def edge_sharpness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -> dict[str, float]:
+    """Mean 10–90 % rise over the beads that the grid resolves.
 
     Args:
         volume: (z, y, x).
         grid: where its voxels are.
-        balls: known centres and radii.
+        beads: known centres and radii.
 
     Returns:
-        edge_rise_mm, NaN where no ball could be measured; edge_balls, how many were.
+        edge_rise_mm, NaN where no bead could be measured; edge_balls, how many were.
 
     Raises:
         InputError: a volume of another shape than the grid, NaN or infinity.
     """
     shape("volume", volume, grid.shape)
     finite("volume", volume)
-    rises = [ball_edge(volume, grid, ball).rise_mm for ball in resolved(balls, grid)]
+    rises = [bead_edge(volume, grid, bead).rise_mm for bead in resolved(beads, grid)]
     known = [rise for rise in rises if np.isfinite(rise)]
     return {"edge_rise_mm": float(np.mean(known)) if known else np.nan, "edge_balls": float(len(known))}
 
 
-def ball_edge(volume: NDArray[np.floating], grid: Grid, ball: Ball) -> Edge:
-    """The edge of one ball; NaN where nothing brighter or darker than its surroundings is found."""
-    distance, values = surroundings(volume, grid, ball)
-    inside, outside = levels(distance, values, ball.radius_mm)
+def bead_edge(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> Edge:
+    """The edge of one bead; NaN where nothing brighter or darker than its surroundings is found."""
+    distance, values = surroundings(volume, grid, bead)
+    inside, outside = levels(distance, values, bead.radius_mm)
     if not (np.isfinite(inside) and np.isfinite(outside)) or inside == outside:
         return Edge(np.nan, np.nan, inside, outside)
     contrast, voxel_mm = inside - outside, min(grid.voxel_size_mm)
 
     def residual(p: Array) -> Array:
-        radius, sigma, share, base = p * (ball.radius_mm, ball.radius_mm, 1.0, 1.0)
+        radius, sigma, share, base = p * (bead.radius_mm, bead.radius_mm, 1.0, 1.0)
         return base + share * blurred_ball(distance, radius, sigma) - (values - outside) / contrast
 
-    start = (1.0, min(0.5 * voxel_mm / ball.radius_mm, 0.9), 1.0, 0.0)
-    bounds = ((0.5, 0.02 * voxel_mm / ball.radius_mm, -5.0, -5.0), (1.5, 1.0, 5.0, 5.0))
+    start = (1.0, min(0.5 * voxel_mm / bead.radius_mm, 0.9), 1.0, 0.0)
+    bounds = ((0.5, 0.02 * voxel_mm / bead.radius_mm, -5.0, -5.0), (1.5, 1.0, 5.0, 5.0))
     radius, sigma, share, base = scipy.optimize.least_squares(residual, start, bounds=bounds).x
     if share <= 0:
         return Edge(np.nan, np.nan, inside, outside)
     levels_found = outside + contrast * (base + share), outside + contrast * base
-    return Edge(RISE_PER_SIGMA * sigma * ball.radius_mm, radius * ball.radius_mm, *levels_found)
+    return Edge(RISE_PER_SIGMA * sigma * bead.radius_mm, radius * bead.radius_mm, *levels_found)
 
 
 def blurred_ball(distance_mm: Array, radius_mm: float, sigma_mm: float) -> Array:

@@ -1,7 +1,7 @@
-"""Roundness: how circular the sections of balls are, the claim that pictures of a sphere phantom make by eye.
+"""Roundness: how circular the sections of beads are, the claim that pictures of a sphere phantom make by eye.
 
-In the central axial, coronal and sagittal section of every ball the contour at half level is followed ray by ray.
-As in metrology, radii are taken about the centre of the least-squares circle, so that a ball that is round but
+In the central axial, coronal and sagittal section of every bead the contour at half level is followed ray by ray.
+As in metrology, radii are taken about the centre of the least-squares circle, so that a bead that is round but
 displaced counts as round; the displacement is reported beside it.
 """
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics.balls import REACH, Array, Ball, levels, resolved, surroundings
+from phyradgs_cl.metrics.beads import REACH, Array, Bead, levels, resolved, surroundings
 
 RAYS = 72
 _STEPS_PER_VOXEL = 8
@@ -35,13 +35,13 @@ class Section:
     shift_mm: float
 
 
-def roundness(volume: NDArray[np.floating], grid: Grid, balls: Sequence[Ball]) -> dict[str, float]:
-    """Means over all sections of the balls that the grid resolves; 0 is round.
+def roundness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -> dict[str, float]:
+    """Means over all sections of the beads that the grid resolves; 0 is round.
 
     Args:
         volume: (z, y, x).
         grid: where its voxels are.
-        balls: known centres and radii.
+        beads: known centres and radii.
 
     Returns:
         roundness, (r_max − r_min)/r_mean; roundness_rms, RMS deviation/r_mean; centre_shift_mm, distance of the
@@ -53,7 +53,7 @@ def roundness(volume: NDArray[np.floating], grid: Grid, balls: Sequence[Ball]) -
     shape("volume", volume, grid.shape)
     finite("volume", volume)
     found = [
-        section for ball in resolved(balls, grid) for section in ball_sections(volume, grid, ball).values()
+        section for bead in resolved(beads, grid) for section in bead_sections(volume, grid, bead).values()
     ]
     known = np.array([(s.span, s.rms, s.shift_mm) for s in found if np.isfinite(s.span)])
     span, rms, shift_mm = known.mean(axis=0) if len(known) else (np.nan,) * 3
@@ -65,11 +65,11 @@ def roundness(volume: NDArray[np.floating], grid: Grid, balls: Sequence[Ball]) -
     }
 
 
-def ball_sections(volume: NDArray[np.floating], grid: Grid, ball: Ball) -> dict[str, Section]:
-    """The three central sections of one ball by name; NaN where less than three quarters of a contour exist."""
-    inside, outside = levels(*surroundings(volume, grid, ball), ball.radius_mm)
+def bead_sections(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> dict[str, Section]:
+    """The three central sections of one bead by name; NaN where less than three quarters of a contour exist."""
+    inside, outside = levels(*surroundings(volume, grid, bead), bead.radius_mm)
     return {
-        name: _section(half_level_radii(volume, grid, ball, axes, (inside, outside)))
+        name: _section(half_level_radii(volume, grid, bead, axes, (inside, outside)))
         for name, axes in SECTIONS.items()
     }
 
@@ -77,11 +77,11 @@ def ball_sections(volume: NDArray[np.floating], grid: Grid, ball: Ball) -> dict[
 def half_level_radii(
     volume: NDArray[np.floating],
     grid: Grid,
-    ball: Ball,
+    bead: Bead,
     axes: tuple[int, int],
     inside_outside: tuple[float, float],
 ) -> Array:
-    """Distances (RAYS,) in mm from the ball's centre to the half level, in the plane of two axes of (x, y, z).
+    """Distances (RAYS,) in mm from the bead's centre to the half level, in the plane of two axes of (x, y, z).
 
     Of several crossings that noise may make, the one nearest to the true radius; NaN on a ray without any.
     """
@@ -89,30 +89,30 @@ def half_level_radii(
     if not (np.isfinite(inside) and np.isfinite(outside)) or inside == outside:
         return np.full(RAYS, np.nan)
     step_mm = min(grid.voxel_size_mm) / _STEPS_PER_VOXEL
-    r_mm = np.arange(0.0, REACH * ball.radius_mm, step_mm)
-    share = (_along_rays(volume, grid, ball, axes, r_mm) - outside) / (inside - outside) - 0.5
+    r_mm = np.arange(0.0, REACH * bead.radius_mm, step_mm)
+    share = (_along_rays(volume, grid, bead, axes, r_mm) - outside) / (inside - outside) - 0.5
     before, after = share[:, :-1], share[:, 1:]
     crosses = (before > 0) & (after <= 0)
     where = r_mm[:-1] + step_mm * np.where(crosses, before / np.where(crosses, before - after, 1.0), 0.0)
-    miss = np.where(crosses, np.abs(where - ball.radius_mm), np.inf)
+    miss = np.where(crosses, np.abs(where - bead.radius_mm), np.inf)
     best = miss.argmin(axis=1)
     rows = np.arange(RAYS)
     return np.where(np.isfinite(miss[rows, best]), where[rows, best], np.nan)
 
 
 def _along_rays(
-    volume: NDArray[np.floating], grid: Grid, ball: Ball, axes: tuple[int, int], r_mm: Array
+    volume: NDArray[np.floating], grid: Grid, bead: Bead, axes: tuple[int, int], r_mm: Array
 ) -> Array:
     """Values (RAYS, len(r_mm)) from the centre outwards, interpolated by cubic splines."""
     angle = 2 * np.pi * np.arange(RAYS) / RAYS
     points = np.broadcast_to(
-        np.asarray(ball.centre_mm, np.float64)[:, None, None], (3, RAYS, r_mm.size)
+        np.asarray(bead.centre_mm, np.float64)[:, None, None], (3, RAYS, r_mm.size)
     ).copy()
     points[axes[0]] += np.cos(angle)[:, None] * r_mm
     points[axes[1]] += np.sin(angle)[:, None] * r_mm
     first, pitch = np.array(grid.first_centre_mm), np.array(grid.voxel_size_mm)
     index = (points[::-1] - first[:, None, None]) / pitch[:, None, None]
-    # A box around the ball: spline coefficients of the whole volume would be computed for every ball.
+    # A box around the bead: spline coefficients of the whole volume would be computed for every bead.
     low = [max(0, int(i.min()) - 8) for i in index]
     high = [min(n, int(i.max()) + 9) for i, n in zip(index, grid.shape, strict=True)]
     box = volume[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float64)

@@ -15,9 +15,9 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-CELLS_A_VOXEL = 1.0  # of the finest level
-SAMPLES_A_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
-SAMPLES_A_TIME = 1.2  # of each of several: what counts is the mean over their rays
+CELLS_PER_VOXEL = 1.0  # of the finest level
+SAMPLES_PER_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
+SAMPLES_PER_TIME = 1.2  # of each of several: what counts is the mean over their rays
 
 _RANGES = {
     "iterations": (0, 1_000_000),
@@ -45,8 +45,8 @@ _FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fra
 class NeuralOptions:
     """A field on a hash encoding and a small network, fitted to rays.
 
-    iterations: passes over all frames, of one step a frame. rays: pixels a step. samples: along a ray inside the volume,
-    0 for 1.5 a voxel of the longest side, 1.2 for each of several times. jitter: of the samples: one random shift
+    iterations: passes over all frames, of one step per frame. rays: pixels per step. samples: along a ray inside the volume,
+    0 for 1.5 per voxel of the longest side, 1.2 for each of several times. jitter: of the samples: one random shift
     a ``ray``, one a ``sample`` inside its own interval, ``none``. times: how many of a line's a step looks at, drawn anew
     for each pixel; 0: all of them. positive_only: pixels with a line integral above 0 only. voxel_points: along each side
     of a voxel, which is the field's mean over their cube.
@@ -103,13 +103,13 @@ class NeuralOptions:
         """Levels of the encoding for a volume of so many voxels along its longest side."""
         if self.levels or self.level_growth == 1:
             return max(self.levels, 1)
-        steps = math.log(CELLS_A_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
+        steps = math.log(CELLS_PER_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
         finest = math.log(_FINEST / self.base_resolution, self.level_growth)
         return 1 + max(math.ceil(min(steps, finest) - 1e-9), 0)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
         """Samples along each ray of a pixel of so many ``times``, for so many voxels along the longest side."""
-        density = SAMPLES_A_VOXEL if times == 1 else SAMPLES_A_TIME
+        density = SAMPLES_PER_VOXEL if times == 1 else SAMPLES_PER_TIME
         return self.samples or max(round(density * longest_voxels), 2)
 
     def times_for(self, count: int, model: str) -> int:

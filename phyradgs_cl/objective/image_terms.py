@@ -137,5 +137,6 @@ def image_loss(
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
-    rows = scipy.ndimage.correlate1d(image, WINDOW, axis=1, mode="constant")
-    return scipy.ndimage.correlate1d(rows, WINDOW, axis=0, mode="constant")
+    for axis in (1, 0):
+        image = scipy.ndimage.correlate1d(image, WINDOW, axis=axis, mode="constant")
+    return image

@@ -53,7 +53,7 @@ def tv_gradient(volume: np.ndarray) -> np.ndarray:
     volume = np.asarray(volume, np.float64)
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])
     unit = difference / (np.linalg.norm(difference, axis=0) + _SMALLEST)
-    gradient = unit.sum(axis=0)
+    gradient: np.ndarray = unit.sum(axis=0)
     for axis in range(3):
         ahead = np.diff(unit[axis], axis=axis, append=np.zeros_like(unit[axis].take([0], axis=axis)))
         gradient -= ahead + unit[axis]

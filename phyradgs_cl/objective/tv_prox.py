@@ -45,7 +45,8 @@ class TvProx:
     ) -> np.ndarray:
         """The map of a volume (z, y, x), float32, after ``iterations`` from the last dual."""
         if weight <= 0:
-            return np.maximum(volume, 0) if nonnegative else volume.copy()
+            same: np.ndarray = np.maximum(volume, 0) if nonnegative else volume.copy()
+            return same
         self.rt.write(self._observed, volume)
         self.rt.copy(self._dual, self._moved)
         step = np.float32(1 / (_lipschitz(self.axis_weights) * weight))
@@ -106,7 +107,7 @@ def differences(volume: np.ndarray, axis_weights: tuple[float, float, float]) ->
     result = np.zeros((3, *volume.shape))
     for axis, weight in enumerate(axis_weights):
         inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(3))
-        result[(axis, *inner)] = weight * np.diff(volume, axis=axis)
+        result[axis][inner] = weight * np.diff(volume, axis=axis)
     return result
 
 

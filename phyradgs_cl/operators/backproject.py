@@ -1,4 +1,4 @@
-"""Voxel-driven backprojection with FDK's distance weight, from one pose a frame or one pose a line.
+"""Voxel-driven backprojection with FDK's distance weight, from one pose per frame or one pose per line.
 
 Where memory is short the volume is made brick by brick, and views go to the device in smaller parts; neither changes a bit.
 """
@@ -13,11 +13,11 @@ import numpy as np
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
-from phyradgs_cl.operators.rays.launches import voxel_matrices
+from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import DeviceArray, Room, Runtime, with_smaller_bricks
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_A_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
+_VIEWS_PER_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28
 _VIEWS_SHARE = 0.25  # of the room
 _BLOCK_VOXELS = 128  # along z for a work-item of the upright kernel
@@ -69,12 +69,12 @@ class _Views:
     def bytes(self, count: int) -> int:
         """What so many of them take on the device."""
         _, rows, width = self.frames.shape
-        return 4 * count * (2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
+        return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
     def parts(self, room: Room) -> Iterator[slice]:
         """Views that go to the device in one piece."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
-        count = max(1, min(_VIEWS_A_LAUNCH, most_bytes // self.bytes(1)))
+        count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
         for first in range(0, len(self.frames), count):
             yield slice(first, min(first + count, len(self.frames)))
 
@@ -143,10 +143,10 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> int:
     depth = matrices[:, 8:12] @ corners.T
     if depth.min() <= 0 or np.abs(matrices[:, [2, 10]]).max() * nz > _UPRIGHT * depth.min():
         return 0
-    rows_a_voxel = (np.abs(matrices[:, 6:7]) / depth).max()
+    rows_per_voxel = (np.abs(matrices[:, 6:7]) / depth).max()
     if np.abs(matrices[:, 6]).min() == 0:
         return 0
-    return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_a_voxel, 1e-3)))
+    return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_per_voxel, 1e-3)))
 
 
 def _images(rt: Runtime, frames: np.ndarray, matrices: np.ndarray, weight: np.ndarray) -> _Arguments:

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) on the raw parameters of all Gaussians at once, with a rate a parameter row."""
+"""Adam (Kingma and Ba 2015) on the raw parameters of all Gaussians at once, with a rate per parameter row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
 
     m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t); ε is scaled along, which at 1e-15 is without effect.
     """
-    return rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step)
+    folded: np.ndarray = rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step)
+    return folded
 
 
 def adam_step(

@@ -53,7 +53,8 @@ class DensityControl:
         """Which of the scales (3, G) are no thinner than may be."""
         if self.prune_aspect <= 0:
             return np.ones(scale.shape[1], bool)
-        return scale.max(0) <= self.prune_aspect * scale.min(0)
+        allowed: np.ndarray = scale.max(0) <= self.prune_aspect * scale.min(0)
+        return allowed
 
     def is_due(self, iteration: int, iterations: int) -> bool:
         """Whether to act after ``iteration`` (counted from 1)."""
@@ -70,7 +71,7 @@ class Population:
 
     @property
     def count(self) -> int:
-        return self.raw.shape[1]
+        return int(self.raw.shape[1])
 
     def take(self, index: np.ndarray) -> Population:
         return Population(self.raw[:, index], self.moments[:, :, index])
@@ -129,7 +130,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
     """One child of each Gaussian (11, S): drawn from it, smaller, half as dense."""
-    child = rows.copy()
+    child: np.ndarray = rows.copy()
     local = rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE]
     child[g.MEAN] += rotate(rows[g.QUATERNION], local)
     child[g.SCALE] /= control.split_factor
@@ -141,4 +142,5 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Vectors (3, S) turned by unit quaternions (4, S), w x y z."""
     w, axis = quaternion[0], quaternion[1:]
     cross = 2 * np.cross(axis, vector, axis=0)
-    return vector + w * cross + np.cross(axis, cross, axis=0)
+    turned: np.ndarray = vector + w * cross + np.cross(axis, cross, axis=0)
+    return turned

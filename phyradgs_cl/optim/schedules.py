@@ -29,7 +29,7 @@ class Rates:
         checks.fields_within("rates.", self, _RANGES)
 
     def at(self, progress: float) -> np.ndarray:
-        """Rates (11,) a parameter row at ``progress`` (0 to 1) through the run."""
+        """Rates (11,) per parameter row at ``progress`` (0 to 1) through the run."""
         position, scale, rotation, density = (
             first * (last / first) ** progress
             for first, last in (self.position, self.scale, self.rotation, self.density)

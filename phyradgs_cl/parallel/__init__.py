@@ -1,4 +1,4 @@
-"""Several processes (ranks) at work on one scan: how they were launched, what they tell each other, who does what."""
+"""Several processes (ranks) at work on one scan: how they were launched, how they communicate, who does what."""
 
 from phyradgs_cl.parallel.communicator import Alone, Communicator
 from phyradgs_cl.parallel.ending import failing_together

@@ -11,23 +11,23 @@ import numpy as np
 class Communicator(Interface):
     """``size`` processes (ranks) with one scan. Every method but the last two is called by all of them, in one order.
 
-    ``exchanged_bytes``: what this rank has handed over so far.
+    ``sent_bytes``: what this rank has given to sums and gathers so far.
     """
 
     rank: int
     size: int
     local_rank: int
     local_size: int
-    exchanged_bytes: int
+    sent_bytes: int
 
-    def add(self, values: np.ndarray) -> None:
+    def allreduce_sum(self, values: np.ndarray) -> None:
         """Sums contiguous ``values`` over all ranks, in place: whole numbers, or numbers that are 0 on all ranks but one.
 
         Both are exact in any order of summation; for others there is ``exact_sum``.
         """
         ...
 
-    def largest(self, values: np.ndarray) -> None:
+    def allreduce_max(self, values: np.ndarray) -> None:
         """The largest of contiguous ``values`` over all ranks, in place."""
         ...
 
@@ -35,12 +35,12 @@ class Communicator(Interface):
         """Whether ``flag`` is set on any rank."""
         ...
 
-    def tell(self, value: Any) -> Any:
-        """Rank 0's ``value``, on every rank."""
+    def bcast(self, value: Any) -> Any:
+        """Broadcast: rank 0's ``value``, on every rank."""
         ...
 
-    def join(self, values: np.ndarray) -> np.ndarray:
-        """The arrays (n, ...) of all ranks joined along their first axis, in the order of the ranks."""
+    def allgather(self, values: np.ndarray) -> np.ndarray:
+        """The arrays (n, ...) of all ranks concatenated along their first axis, in the order of the ranks."""
         ...
 
     def all_fail(self) -> bool:
@@ -53,24 +53,24 @@ class Communicator(Interface):
 
 
 class Alone:
-    """One process: it has everything, and nobody to tell."""
+    """One process: it has everything, and nobody to send it to."""
 
     rank, size, local_rank, local_size = 0, 1, 0, 1
-    exchanged_bytes = 0
+    sent_bytes = 0
 
-    def add(self, values: np.ndarray) -> None:
+    def allreduce_sum(self, values: np.ndarray) -> None:
         pass
 
-    def largest(self, values: np.ndarray) -> None:
+    def allreduce_max(self, values: np.ndarray) -> None:
         pass
 
     def any(self, flag: bool) -> bool:
         return flag
 
-    def tell(self, value: Any) -> Any:
+    def bcast(self, value: Any) -> Any:
         return value
 
-    def join(self, values: np.ndarray) -> np.ndarray:
+    def allgather(self, values: np.ndarray) -> np.ndarray:
         return values
 
     def all_fail(self) -> bool:

@@ -1,6 +1,6 @@
 """Sums of floats that are the same bits whatever the order and the number of ranks.
 
-Numbers are turned to whole ones of 64 bits with a power of two a row as scale, the largest for which the sum cannot
+Numbers are turned to whole ones of 64 bits with a power of two per row as scale, the largest for which the sum cannot
 overflow: adding those is exact and associative. What a float32 has below 2⁻³⁷ of its row's largest (for 64 terms; its
 last bit at 2⁻²³ is the float's own) is rounded off.
 """
@@ -35,7 +35,7 @@ def exact_sum(
         whole = np.zeros((shape[0], block.stop - first), np.int64)
         for part in parts:
             whole += as_whole(part[:, block], shift, broken)
-        ranks.add(whole)
+        ranks.allreduce_sum(whole)
         total[:, block] = whole * np.ldexp(1.0, -shift)[:, None]
     total[broken] = np.nan
     return total
@@ -58,5 +58,5 @@ def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: i
         found = np.frexp(np.where(finite, largest, 0.0))[1].astype(np.int64)
         found[largest == 0] = -300
         exponents = np.maximum(exponents, np.where(finite, found, _NOT_FINITE))
-    ranks.largest(exponents)
+    ranks.allreduce_max(exponents)
     return exponents

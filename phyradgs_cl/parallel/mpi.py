@@ -49,12 +49,12 @@ class Mpi:
         self._failing = comm.Dup()  # where those who fail meet, whatever the others are at
         self.rank, self.size = comm.rank, comm.size
         self.local_rank, self.local_size = launch.local_rank, launch.local_size
-        self.exchanged_bytes = 0
+        self.sent_bytes = 0
 
-    def add(self, values: np.ndarray) -> None:
+    def allreduce_sum(self, values: np.ndarray) -> None:
         self._reduce(values, "SUM")
 
-    def largest(self, values: np.ndarray) -> None:
+    def allreduce_max(self, values: np.ndarray) -> None:
         self._reduce(values, "MAX")
 
     def _reduce(self, values: np.ndarray, name: str) -> None:
@@ -62,26 +62,26 @@ class Mpi:
 
         assert values.flags.c_contiguous, "a copy would be reduced, and lost"
         flat = values.reshape(-1)
-        self.exchanged_bytes += values.nbytes
+        self.sent_bytes += values.nbytes
         for first in range(0, flat.size, _MOST_VALUES):
             self._comm.Allreduce(MPI.IN_PLACE, flat[first : first + _MOST_VALUES], getattr(MPI, name))
 
     def any(self, flag: bool) -> bool:
         flags = np.array([flag], np.int32)
-        self.largest(flags)
+        self.allreduce_max(flags)
         return bool(flags[0])
 
-    def tell(self, value: Any) -> Any:
+    def bcast(self, value: Any) -> Any:
         return self._comm.bcast(value, 0)
 
-    def join(self, values: np.ndarray) -> np.ndarray:
+    def allgather(self, values: np.ndarray) -> np.ndarray:
         rows = np.ascontiguousarray(values)
-        self.exchanged_bytes += rows.nbytes
+        self.sent_bytes += rows.nbytes
         counts = self._comm.allgather(len(rows))
         width = int(np.prod(rows.shape[1:], dtype=np.int64))
-        joined = np.empty((sum(counts), *rows.shape[1:]), rows.dtype)
-        self._comm.Allgatherv(rows, [joined, [count * width for count in counts]])
-        return joined
+        gathered = np.empty((sum(counts), *rows.shape[1:]), rows.dtype)
+        self._comm.Allgatherv(rows, [gathered, [count * width for count in counts]])
+        return gathered
 
     def all_fail(self) -> bool:
         waiting = self._failing.Ibarrier()

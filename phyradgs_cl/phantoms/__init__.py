@@ -80,7 +80,7 @@ def make_phantom(name: str, half_size_mm: float, resolution: int = 128, seed: in
     Args:
         name: a key of `PHANTOMS`.
         half_size_mm: half the cube's side.
-        resolution: voxels a side, for voxel phantoms.
+        resolution: voxels per side, for voxel phantoms.
         seed: of the procedural phantoms' shape and texture.
 
     Raises:

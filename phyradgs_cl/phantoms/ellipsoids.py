@@ -72,7 +72,7 @@ class Ellipsoid:
 
     @property
     def half_box_mm(self) -> Array:
-        """(3,): half the sides (x, y, z) of the smallest upright box around the ellipsoid."""
+        """(3,): half the sides (x, y, z) of the smallest axis-aligned box around the ellipsoid."""
         return np.linalg.norm(np.asarray(self.rotation) * np.asarray(self.semi_axes_mm), axis=1)
 
 
@@ -179,7 +179,7 @@ def _chord_fraction(ellipsoid: Ellipsoid, start: Array, step: Array) -> Array:
 
 def _inside(ellipsoid: Ellipsoid, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
     cx, cy, cz = ellipsoid.centre_mm
-    # One term an axis before they broadcast: coordinates of a grid stay one-dimensional.
+    # One term per axis before they broadcast: coordinates of a grid stay one-dimensional.
     rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in ellipsoid.to_unit_ball]
     return rows[0] ** 2 + rows[1] ** 2 + rows[2] ** 2 <= 1.0
 

@@ -79,7 +79,7 @@ def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
 
 
 def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: Field) -> Field:
-    """First-order distance to an upright ellipsoid: exact on the surface and in sign."""
+    """First-order distance to an axis-aligned ellipsoid: exact on the surface and in sign."""
     return ratio_distance([(p - c) for p, c in zip((x, y, z), centre, strict=True)], semi_axes)
 
 
@@ -154,7 +154,7 @@ def texture(
     ex, ey, ez = (np.exp(1j * np.outer(axis, k[:, i])).astype(np.complex64) for i in range(3))
     ez = ez * (amplitude * np.exp(1j * phase)).astype(np.complex64)
     n = lattice.count
-    # cos(a + b + c) is the real part of a product: one matrix product a slice instead of n^3 cosines.
+    # cos(a + b + c) is the real part of a product: one matrix product per slice instead of n^3 cosines.
     noise = np.empty((n, n, n), dtype=np.float32)
     for i in range(n):
         noise[i] = ((ey * ez[i]) @ ex.T).real

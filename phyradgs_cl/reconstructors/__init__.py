@@ -5,11 +5,4 @@ They are imported when they are used: a command that only holds its signals does
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__,
-    submod_attrs={
-        "preprocess": ["InputOptions"],
-        "registry": ["METHODS", "Method", "input_options", "method_name", "method_options", "reconstruct"],
-        "result": ["Progress", "ProgressReport", "Reconstruction", "State", "ignore_progress"],
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.result import State, state_arrays
 
 _REMEDY = "start without --resume"
+T = TypeVar("T")
 
 
 def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:
@@ -50,7 +52,7 @@ def count_of(state: State, name: str, most: int) -> int:
     return int(found)
 
 
-def parsed(state: State, name: str, kind: type) -> object:
+def parsed(state: State, name: str, kind: type[T]) -> T:
     """What the JSON text of a state means, of type ``kind``."""
     (found,) = state_arrays(state, [name])
     check_array(name, found, (), np.str_)
@@ -68,7 +70,6 @@ def checked_history(state: State) -> tuple[list[dict[str, float]], float]:
     lines = parsed(state, "record", list)
     (seconds,) = state_arrays(state, ["seconds"])
     check_array("seconds", seconds, (), np.float64)
-    assert isinstance(lines, list)
     for line in lines:
         if not isinstance(line, dict) or not all(isinstance(v, (int, float)) for v in line.values()):
             raise _damaged("record", "a line that is no table of numbers", "what a run has written")

@@ -28,12 +28,18 @@ class Stepwise(Interface):
     """What ``measures`` says of how far the run is from its goal: loss or residual. It must stay finite."""
     remedy: str
     """What helps where it does not."""
-    iteration: int
-    """Iterations done. A step may make several, or a part of one."""
     iterations: int
     """Iterations to do."""
-    finished: str | None
-    """Why the method stops by itself, else None."""
+
+    @property
+    def iteration(self) -> int:
+        """Iterations done. A step may make several, or a part of one."""
+        ...
+
+    @property
+    def finished(self) -> str | None:
+        """Why the method stops by itself, else None."""
+        ...
 
     def step(self) -> None: ...
 

@@ -118,7 +118,7 @@ def _check_ranks(method: str, rt: Runtime) -> None:
         sharing = ", ".join(name for name, one in METHODS.items() if one.is_shared)
         found = f"{rt.ranks.size} ranks"
         raise InputError(f"--method {method}", found, f"one, or one of {sharing}", "start it without mpiexec")
-    device, first = rt.device.name, rt.ranks.tell(rt.device.name)
+    device, first = rt.device.name, rt.ranks.bcast(rt.device.name)
     if device != first:
         culprit = f"device of rank {rt.ranks.rank}"
         raise InputError(

@@ -21,7 +21,7 @@ State = Mapping[str, np.ndarray]
 class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``.
 
-    gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict a report;
+    gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted.
     """
@@ -30,7 +30,7 @@ class Reconstruction:
     grid: Grid
     gaussians: Gaussians | None = None
     record: list[dict[str, float]] = field(default_factory=list)
-    facts: dict[str, object] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl import __version__
+from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.report import sections
@@ -70,7 +71,7 @@ def report_page(run: Run, views: Sequence[View] = ()) -> str:
         "shutter": sections.shutter_section(run),
         "provenance": sections.provenance_section(run),
     }
-    there = {name: parts[name] for name in _HEADINGS if parts[name] is not None}
+    there = {name: part for name in _HEADINGS if (part := parts[name]) is not None}
     links = [element("a", name.capitalize(), href=f"#{name}") for name in there]
     skip = element("a", "To the content", href="#slices", class_="skip")
     body = joined(
@@ -117,7 +118,7 @@ def _title(run: Run) -> str:
 
 def _top(run: Run) -> list[Markup]:
     title = run.scan.title if run.scan is not None else run.path.name
-    motion = f", motion {run.motion.name}" if run.motion is not None else ""
+    motion = f", motion {motion_facts(run.motion)['name']}" if run.motion is not None else ""
     method = run.stored.provenance.get("method", "unknown method")
     told = f"{run.path.name}: {method}{motion}"
     if run.scan_path is not None:

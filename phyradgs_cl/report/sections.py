@@ -7,13 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, PerRow
+from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.report.charts.curve import convergence_charts
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
-from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, upright
-from phyradgs_cl.report.pictures.projections import TIMES_A_LINE, View
+from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
+from phyradgs_cl.report.pictures.projections import TIMES_PER_LINE, View
 from phyradgs_cl.report.pictures.slices import planes_of, windows_of
 from phyradgs_cl.report.pictures.viewer import viewer
 from phyradgs_cl.report.run import Run
@@ -105,7 +106,7 @@ def projections_section(run: Run, views: Sequence[View]) -> Markup | None:
     told = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
     told += f"blue −{number(limit)}, red +{number(limit)}. "
     if run.scan.is_fly:
-        told += f"Every line is computed from the volume at {TIMES_A_LINE} times of its own exposure."
+        told += f"Every line is computed from the volume at {TIMES_PER_LINE} times of its own exposure."
     else:
         told += "Every frame is computed from its one pose."
     rows = [_view(view, (low, high), limit, proportion) for view in views]
@@ -124,7 +125,7 @@ def provenance_section(run: Run) -> Markup:
 
 
 def facts_table(facts: Mapping[str, object]) -> Markup:
-    """A row a fact: name, value with unit."""
+    """A row per fact: name, value with unit."""
     rows = list(flattened(facts))[:_MOST_ROWS]
     cells = [(label(key), shown(value, unit(key))) for key, value in rows]
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in cells]
@@ -132,10 +133,10 @@ def facts_table(facts: Mapping[str, object]) -> Markup:
 
 
 def _view(view: View, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
-    residual = png_bytes(upright(bytes_of(view.residual, -limit, limit)), diverging())
+    residual = png_bytes(top_row_first(bytes_of(view.residual, -limit, limit)), diverging())
     pictures = [
-        ("measured", png_bytes(upright(bytes_of(view.measured, *window)))),
-        ("computed", png_bytes(upright(bytes_of(view.computed, *window)))),
+        ("measured", png_bytes(top_row_first(bytes_of(view.measured, *window)))),
+        ("computed", png_bytes(top_row_first(bytes_of(view.computed, *window)))),
         (f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)", residual),
     ]
     style = f"aspect-ratio: {proportion[0]:.6g} / {proportion[1]:.6g}"
@@ -163,7 +164,7 @@ def _motion_words(run: Run) -> str:
             words = "dashed lines bound the segments in which Gaussians move"
         case _:
             words = "the dashed line is the one pose of a frame"
-    return f"The run's motion is {motion.name}: {words}."
+    return f"The run's motion is {motion_facts(motion)['name']}: {words}."
 
 
 def _charts(charts: Iterable[tuple[str, Markup]]) -> Markup:

@@ -7,6 +7,7 @@ import time
 import warnings
 import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Runtime:
 
     ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
     the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
-    ``pixel_items`` selects the launch shape: a work-item a pixel and small groups (GPUs, needs ``lanes`` 1), or a
+    ``pixel_items`` selects the launch shape: one work-item per pixel and small groups (GPUs, needs ``lanes`` 1), or a
     work-item a band of lines (CPUs). ``memory`` (bytes, or text as 2GiB) limits what its buffers hold together.
     ``ranks``: the processes that work on the same scan, each with a Runtime of its own on the device that is its turn.
     """
@@ -54,7 +55,7 @@ class Runtime:
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         try:
             self.context = cl.Context([self.device.handle])
-            self.queue = cl.CommandQueue(self.context, properties=properties)
+            self.queue = cl.CommandQueue(self.context, properties=properties)  # type: ignore[arg-type]
         except cl.Error as error:
             raise translated(error, self.ledger, "opening it") from error
         self.lanes = lanes or default_lanes(self.device)
@@ -185,7 +186,7 @@ class Runtime:
     # --- launches -----------------------------------------------------------------------------------
 
     @naming_failures()
-    def launch(self, kernel: Kernel, items: int | tuple[int, ...], *args: object, group: int = 1) -> None:
+    def launch(self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int = 1) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
@@ -222,7 +223,7 @@ class Runtime:
         return {name: use.seconds for name, use in self.kernel_uses().items()}
 
     def best_rates(self) -> Rates:
-        """What the device copies and computes at best, measured now (a second); needs ``profile=True``."""
+        """What the device copies and computes at best, measured now (per second); needs ``profile=True``."""
         kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 

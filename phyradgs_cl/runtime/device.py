@@ -68,9 +68,9 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
     devices = list_devices()
     if not devices and pocl.unwritable_cache() is not None:
-        found = f"no device, and PoCL's cache {pocl.unwritable_cache()} cannot be written"
+        without = f"no device, and PoCL's cache {pocl.unwritable_cache()} cannot be written"
         raise DeviceError(
-            "OpenCL", found, "at least one", f"set {pocl.CACHE_VARIABLE} to a folder that can be written"
+            "OpenCL", without, "at least one", f"set {pocl.CACHE_VARIABLE} to a folder that can be written"
         )
     if not devices:
         raise DeviceError(

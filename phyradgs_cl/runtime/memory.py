@@ -105,7 +105,7 @@ def reported_bytes(device: DeviceInfo) -> int:
     """Free memory where the device tells (AMD's extension), else all of it."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
-            return int(device.handle.global_free_memory_amd[0]) * 1024
+            return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
     return device.memory_bytes
 
 

@@ -19,7 +19,7 @@ import platform
 import stat
 import struct
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from phyradgs_cl import checks
@@ -41,7 +41,7 @@ THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
 _unwritable: Path | None = None
-_kept_alive: list[ctypes.Array] = []
+_kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
@@ -177,7 +177,7 @@ def _text(memory: bytes) -> bytes | None:
 
 
 @contextlib.contextmanager
-def _own_memory() -> Iterator[object]:
+def _own_memory() -> Iterator[Callable[[int, int], bytes]]:
     """A reader of this process's memory that answers b'' for an unmapped address instead of crashing."""
     handle = os.open("/proc/self/mem", os.O_RDONLY)
 

@@ -59,7 +59,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Rates:
-    """What the device reached in this program: bytes moved (read and written) and floating-point operations a second."""
+    """What the device reached in this program: bytes moved (read and written) and floating-point operations per second."""
 
     copy_bytes_per_s: float
     flops_per_s: float

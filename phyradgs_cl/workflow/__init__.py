@@ -2,17 +2,4 @@
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__,
-    submod_attrs={
-        "evaluate": ["run_evaluation"],
-        "files": ["load_reference", "load_scan", "summary"],
-        "reconstruct": ["ReconstructionJob", "profile_report", "run_reconstruction"],
-        "simulate": [
-            "SimulationJob",
-            "refuse_jitter",
-            "refuse_noise_options",
-            "run_simulation",
-        ],
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

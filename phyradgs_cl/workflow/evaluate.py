@@ -49,7 +49,7 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
     title = f"{provenance.get('method', 'volume')}: {volume_path.name}"
     with finish_despite_interrupt():
         _write_picture(picture, volume, reference, title)
-    known = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
+    known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
     return {**metrics, **known, **interruption(provenance), **told, **files}
 

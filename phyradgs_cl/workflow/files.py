@@ -106,7 +106,7 @@ def summary(path: Path) -> dict[str, object]:
             return {"kind": "scan", **scan_summary(path)}
     if kind == "volume":
         facts = volume_summary(path)
-        provenance = dict(facts.pop("provenance", {}) or {})
+        provenance = dict(facts.pop("provenance", None) or {})
         provenance.pop("record", None)
         options = provenance.pop("options", None)
         return {"kind": "volume", **facts, **_asked_for(options), **provenance}
@@ -128,8 +128,8 @@ def _asked_for(options: object) -> dict[str, object]:
     if isinstance(motion, Mapping):
         strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
         counts = {"micro-views": f" {strips} × {sub_intervals}"}
-        if sub_intervals is not None:  # FDK has one time a line
-            counts["per-row"] = f", {sub_intervals} times a line"
+        if sub_intervals is not None:  # FDK has one time per line
+            counts["per-row"] = f", {sub_intervals} times per line"
         told["motion"] = f"{motion.get('name')}{counts.get(str(motion.get('name')), '')}"
     if "iterations" in options:
         told["iterations_asked"] = options["iterations"]

@@ -75,8 +75,8 @@ class ReconstructionJob:
 class _Keeper:
     """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end.
 
-    There is one checkpoint a run: it is replaced in one step, so that a kill at any moment leaves the last whole one. Where
-    it cannot be written the run goes on, since that is what the work is worth.
+    There is one checkpoint per run: it is replaced in one step, so that a kill at any moment leaves the last whole one.
+    Where it cannot be written the run goes on, since that is what the work is worth.
     """
 
     def __init__(self, path: Path, fingerprint: str, every_s: float, report: ProgressReport) -> None:
@@ -151,7 +151,7 @@ def _reconstructed(
     extra: dict[str, Any] = {"before": job.before}
     leads = rt.ranks.rank == 0
     if job.resume:
-        extra["resume"] = rt.ranks.tell(_resumed(job, fingerprint) if leads else None)
+        extra["resume"] = rt.ranks.bcast(_resumed(job, fingerprint) if leads else None)
     elif leads:
         _set_aside(job.output)
     keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
@@ -169,7 +169,7 @@ def _reconstructed(
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
-    return result, metrics  # type: ignore[return-value]
+    return result, metrics
 
 
 def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
@@ -191,7 +191,7 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
         found = "%s averages intensity over an exposure; --method %s averages line integrals"
         log.warning(found, job.scan, job.method)
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
-        found = "%d strips are more than the %d lines of %s: a strip a line is the most there is"
+        found = "%d strips are more than the %d lines of %s: one strip per line is the most there is"
         log.warning(found, motion.strips, scan.lines, job.scan)
     grid = scan.with_grid(job.before).grid
     if grid != scan.grid and hasattr(options, "iterations") and cuts(grid, scan.grid, scan.geometry):
@@ -217,8 +217,8 @@ def _averages(scan: Scan, options: Any) -> bool:
 def profile_report(rt: Runtime, result: Reconstruction) -> str:
     """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
     uses = rt.kernel_uses()
-    pairs = {str(name): int(n) for name, n in dict(result.facts.get("evaluated_pairs", {})).items()}  # type: ignore[call-overload]
-    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)  # type: ignore[arg-type]
+    pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
+    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)
 
 
 def _write_result(

@@ -22,7 +22,7 @@ from phyradgs_cl.workflow.files import expecting, refuse_overwriting
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """What to simulate: a phantom by name or a volume file, on which scanner, with how many voxels and rays a pixel."""
+    """What to simulate: a phantom by name or a volume file, on which scanner, with how many voxels and rays per pixel."""
 
     output: Path
     phantom: str | None = None

@@ -159,7 +159,7 @@ def tipped(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def in_a_tilted_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Rows in the plane of the orbit at first, columns far from upright."""
+    """Rows in the plane of the orbit at first, columns far from the axis of rotation."""
     tilted = pose.copy()
     tilted[:, 9:12] = 0.6 * np.array([np.sin(0.8), 0.0, np.cos(0.8)])
     return in_plane(tilted, angle)

@@ -106,7 +106,7 @@ def test_times_grow_with_the_exposure(exposure_s) -> None:
     np.testing.assert_allclose(turning.frame_start_s(), 3 * exposure_s * np.arange(4), rtol=1e-12)
 
 
-def test_the_gantry_wanders_in_straight_lines_between_a_knot_a_frame() -> None:
+def test_the_gantry_wanders_in_straight_lines_between_one_knot_per_frame() -> None:
     protocol = Protocol(5, 20.0, exposure_s=2.0, start_deg=7.0)
     encoder = protocol.orbit(GEOMETRY, 0.3, np.random.default_rng(6)).kinematics
     knots = np.random.default_rng(6).normal(0, np.deg2rad(0.3), 6)
@@ -211,10 +211,10 @@ def test_timing_names_the_first_frame_that_a_table_misses() -> None:
                 moving.check_timing()
 
 
-def test_timing_of_a_standing_gantry_is_checked_where_it_is_asked() -> None:
+def test_timing_of_a_stopped_gantry_is_checked_where_it_is_asked() -> None:
     """Its cell stands mid-window, so a table that ends before that is refused early."""
     poses = PoseTable([0.0, 20.5], GEOMETRY.pose(np.array([0.0, 1.0])))
-    standing = scan(trajectory=poses, frame_start_s=np.array([0.0, 10.0, 20.0]), is_fly=False)
+    stopped = scan(trajectory=poses, frame_start_s=np.array([0.0, 10.0, 20.0]), is_fly=False)
     with pytest.raises(InputError, match="frame 2 needs"):
-        standing.check_timing()
-    dataclasses.replace(standing, shutter=Shutter(0.5, 0.5)).check_timing()
+        stopped.check_timing()
+    dataclasses.replace(stopped, shutter=Shutter(0.5, 0.5)).check_timing()

@@ -112,7 +112,7 @@ def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_i
 
 
 def test_many_micro_views_meet_the_per_line_times() -> None:
-    """With a strip a line, mean times differ from the exact ones by at most half a strip's readout."""
+    """With one strip per line, mean times differ from the exact ones by at most half a strip's readout."""
     shutter, lines = Shutter(0.8, 0.3), 200
     micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
     exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
@@ -143,7 +143,7 @@ def scan(is_fly: bool) -> Scan:
 
 
 @pytest.mark.parametrize(
-    "motion, fly_count, standing_count",
+    "motion, fly_count, still_count",
     [
         (Static(), 1, 1),
         (StaticStart(), 1, 1),
@@ -152,10 +152,10 @@ def scan(is_fly: bool) -> Scan:
         (Exact(segments=5), 5, 1),
     ],
 )
-def test_motion_models_of_moving_and_standing_scans(motion, fly_count, standing_count) -> None:
+def test_motion_models_of_fly_and_stop_and_shoot_scans(motion, fly_count, still_count) -> None:
     assert motion.cells(scan(True), 1).count == fly_count
-    standing = motion.cells(scan(False), 1)
-    assert standing.count == standing_count
+    still = motion.cells(scan(False), 1)
+    assert still.count == still_count
     moving = motion.cells(scan(True), 1)
     assert moving.lines == 10 and moving.axis == "columns"
     first_s, last_s = moving.time_s.min(), moving.time_s.max()

@@ -141,7 +141,7 @@ def test_rows_are_the_papers_and_more() -> None:
 def test_tables_share_the_run_of_the_default_strips() -> None:
     full = next(row for row in rows_of("table1") if row.label == "PhyRadGS")
     assert full.run == next(row for row in rows_of("table2") if row.label == "M=8 N=5").run
-    assert full.standing().run == next(r for r in rows_of("table1") if r.label == "PhyRadGS w/o ST").run
+    assert full.static().run == next(r for r in rows_of("table1") if r.label == "PhyRadGS w/o ST").run
 
 
 def test_a_row_of_an_unknown_name_or_method_is_named(tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_a_method_of_ones_own_has_rows_under_its_name(
     monkeypatch.setitem(METHODS, "landweber", METHODS["sirt"])
     job = BenchJob("table1", tmp_path, rows=["landweber per-row", "landweber"])
     assert [row.run for row in job.chosen_rows] == ["landweber static", "landweber per-row"]
-    assert job.chosen_rows[1].standing().run == "landweber static"
+    assert job.chosen_rows[1].static().run == "landweber static"
     assert "landweber" not in [row.label for row in rows_of("table1")]
 
 
@@ -183,7 +183,7 @@ def test_a_plan_runs_over_seeds_volumes_and_protocols(tmp_path: Path) -> None:
     job = BenchJob("table1", tmp_path, rows=["FDK"], seeds=(0, 1))
     cases = [run.case for run in plan_runs(job)]
     assert len(set(cases)) == 2 * 2 * 2
-    assert len(cases) == 2 * len(set(cases))  # on a moving and on a standing gantry
+    assert len(cases) == 2 * len(set(cases))  # on a moving and on a gantry at rest
     assert json.loads(json.dumps([run.facts for run in plan_runs(job)]))
 
 

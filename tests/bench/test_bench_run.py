@@ -25,8 +25,8 @@ from tables import (
 from tables import rows as bench_rows
 from tables import run as bench_run
 from tables.__main__ import run
-from tables.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, standing
-from tables.phantom_case import BALLS, HOLDER, PhantomCase, balls_of, c_arm, phantom_in
+from tables.case import FLY, STILL, HeldOutViews, SyntheticCase, held_out, stop_and_shoot
+from tables.phantom_case import BEADS, HOLDER, PhantomCase, beads_of, c_arm, phantom_in
 from tables.raw_counts import Panel, measured_attenuation
 from tables.results import read_lines
 
@@ -41,7 +41,7 @@ from phyradgs_cl.simulation import phantom_scene
 
 TINY = BenchSize("T", 12, 16, 8)
 ROWS = ["FDK", "PhyRadGS w/o ST", "PhyRadGS"]
-RUNS_A_CASE = 5  # three on the fly-scan, two on the stop-and-shoot scan
+RUNS_PER_CASE = 5  # three on the fly-scan, two on the stop-and-shoot scan
 
 
 def no_runtime() -> Runtime:
@@ -69,16 +69,16 @@ def test_a_run_is_not_made_twice_and_a_damaged_line_again(job: BenchJob, rt: Run
     written = run_bench(job, lambda: rt, seen.append)
     results = job.output / RESULTS
     whole = results.read_bytes()
-    assert whole.count(b"\n") == 2 * RUNS_A_CASE
-    assert [p.number for p in seen if p.line is not None] == list(range(1, 2 * RUNS_A_CASE + 1))
+    assert whole.count(b"\n") == 2 * RUNS_PER_CASE
+    assert [p.number for p in seen if p.line is not None] == list(range(1, 2 * RUNS_PER_CASE + 1))
     assert all(path.stat().st_size for path in written)
     run_bench(job, no_runtime)
     assert results.read_bytes() == whole
     results.write_bytes(whole[:-40])  # killed while the last line was written
     made: list[BenchProgress] = []
     run_bench(job, lambda: rt, made.append)
-    assert [p.number for p in made if p.line is not None] == [2 * RUNS_A_CASE]
-    assert len(read_lines(results)) == 2 * RUNS_A_CASE
+    assert [p.number for p in made if p.line is not None] == [2 * RUNS_PER_CASE]
+    assert len(read_lines(results)) == 2 * RUNS_PER_CASE
     run_bench(job, no_runtime)
 
 
@@ -275,7 +275,7 @@ def test_an_interruption_loses_the_present_run_only(
         run_bench(job, lambda: rt, stop_after_two)
     assert len(read_lines(job.output / RESULTS)) == 2
     run_bench(job, lambda: rt)
-    assert len(read_lines(job.output / RESULTS)) == 2 * RUNS_A_CASE
+    assert len(read_lines(job.output / RESULTS)) == 2 * RUNS_PER_CASE
 
 
 def test_a_run_that_overflows_is_noted_and_tried_again(
@@ -299,7 +299,7 @@ def test_a_run_that_overflows_is_noted_and_tried_again(
 def test_stop_and_shoot_stands_at_the_mid_window_poses(name: str) -> None:
     protocol, geometry = PROTOCOLS[name], ConeGeometry(5.0, 7.0, (8, 8), (0.5, 0.5))
     shutter, start_s = protocol.shutter(), protocol.frame_start_s()
-    moving, still = protocol.orbit(geometry), standing(protocol).orbit(geometry)
+    moving, still = protocol.orbit(geometry), stop_and_shoot(protocol).orbit(geometry)
     between = held_out(protocol).orbit(geometry)
     for frame in range(protocol.views):
         middle_s = np.array([start_s[frame] + shutter.span_s / 2])
@@ -378,20 +378,20 @@ def test_the_phantoms_scan_is_the_papers_kind(rt: Runtime) -> None:
     assert shape["bias_balls"] == pytest.approx(0, abs=1e-6)
     assert shape["bias_holder"] == pytest.approx(0, abs=1e-6)
     assert shape["round_sections"] == 3 * shape["edge_balls"] > 0
-    assert {HOLDER, BALLS} <= set(np.unique(case._labels()))
+    assert {HOLDER, BEADS} <= set(np.unique(case._labels()))
 
 
 def test_every_ball_of_the_phantom_has_surroundings_of_its_own() -> None:
-    """The shape metrics look out to 1.75 radii: no other ball, and no end of the holder, may be there."""
+    """The shape metrics look out to 1.75 radii: no other bead, and no end of the holder, may be there."""
     _, grid = c_arm(BenchSize("T", 40, 24, 8))
     phantom = phantom_in(grid)
     holder = phantom.ellipsoids[0].attenuation_per_mm
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 500))
     directions /= np.linalg.norm(directions, axis=0)
-    for ball in balls_of(phantom):
+    for bead in beads_of(phantom):
         for share in (1.01, 1.4, 1.75):
-            points = np.array(ball.centre_mm)[:, None] + share * ball.radius_mm * directions
+            points = np.array(bead.centre_mm)[:, None] + share * bead.radius_mm * directions
             np.testing.assert_allclose(phantom.density(*points), holder)
 
 

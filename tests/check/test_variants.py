@@ -9,7 +9,7 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
 from phyradgs_cl.check.coarse import FINE, QUICK, binned, coarse, fewer_frames
-from phyradgs_cl.check.statistics import gain, standing, vertex
+from phyradgs_cl.check.statistics import residual_ratio, t_statistic, vertex
 from phyradgs_cl.check.variants import exposed, reversed_readout, reversed_rotation, shifted
 
 CLOSE = {"rtol": 0, "atol": 1e-12}
@@ -127,6 +127,6 @@ def test_the_standing_of_hypotheses_is_antisymmetric() -> None:
     rng = np.random.default_rng(0)
     one = 1 + 0.01 * rng.random(30)
     other = one * (1.05 + 0.01 * rng.random(30))
-    assert standing(one, other) > 10 and standing(one, other) == pytest.approx(-standing(other, one))
-    assert gain(one, other) == pytest.approx(1 / gain(other, one))
-    assert standing(one, one) == 0 and standing(one[:2], other[:2]) == 0
+    assert t_statistic(one, other) > 10 and t_statistic(one, other) == pytest.approx(-t_statistic(other, one))
+    assert residual_ratio(one, other) == pytest.approx(1 / residual_ratio(other, one))
+    assert t_statistic(one, one) == 0 and t_statistic(one[:2], other[:2]) == 0

@@ -25,7 +25,7 @@ def scan(simulated) -> Path:
 
 
 class Clock:
-    """A clock that only reconstructions move: ``start`` seconds each, ``each`` an iteration, ``control`` a round of density
+    """A clock that only reconstructions move: ``start`` seconds each, ``each`` per iteration, ``control`` a round of density
     control; runs of over 100 iterations end with ``growth`` times the Gaussians."""
 
     def __init__(self, start: float, each: float, control: float = 0.0, growth: float = 1.0) -> None:
@@ -64,7 +64,7 @@ def test_time_is_that_of_a_run_whose_iterations_are_alike(rt, scan, clock, metho
     options = method_options(method, None, {"iterations": iterations})
     found = estimate(load_scan(scan), method, options, rt)
     assert found.seconds == pytest.approx(2.0 + 0.25 * iterations)
-    assert found.iterations == iterations and found.seconds_an_iteration > 0
+    assert found.iterations == iterations and found.seconds_per_iteration > 0
     assert sum(clock.iterations) <= 500
 
 

@@ -20,7 +20,7 @@ def scan(simulated) -> Path:
 
 
 def test_simulation_in_bricks(cli, scan, tmp_path) -> None:
-    """The phantom has twice as many voxels a side: 50·50·64 padded floats, 625 KiB."""
+    """The phantom has twice as many voxels per side: 50·50·64 padded floats, 625 KiB."""
     found = tmp_path / "bricks.h5"
     assert cli.run(["simulate", *VOLUME, "--memory", "350KiB", "-o", str(found)]) == 0
     expected = load_scan(scan).projections

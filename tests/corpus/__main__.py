@@ -1,4 +1,4 @@
-"""The corpus as files: python -m tests.corpus FOLDER [--seed N]; a line a file says what must become of it."""
+"""The corpus as files: python -m tests.corpus FOLDER [--seed N]; one line per file says what must become of it."""
 
 from __future__ import annotations
 

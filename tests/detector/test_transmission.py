@@ -1,4 +1,4 @@
-"""Weights of pixels by their light: mean 1 over what counts, one over the variance of a line integral."""
+"""Transmission weights of pixels (PWLS): mean 1 over what counts, one over the variance of a line integral."""
 
 from __future__ import annotations
 

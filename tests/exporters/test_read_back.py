@@ -52,7 +52,7 @@ def test_a_bigtiff_has_the_same_grid(exported, stored, monkeypatch) -> None:
 
 @pytest.mark.parametrize("order", ["RAS", "LPI", "PIR", "SAL", "ARS"])
 @pytest.mark.parametrize("name", ["t.mha", "t.mhd", "t.nii", "t.nii.gz", "t.nrrd"])
-def test_itk_s_other_orders_and_directions_are_turned_upright(exported, stored, tmp_path, name, order) -> None:
+def test_itk_s_other_orders_and_directions_are_turned_to_the_world_s(exported, stored, tmp_path, name, order) -> None:
     image = sitk.DICOMOrient(sitk.ReadImage(str(exported("v.mha"))), order)
     sitk.WriteImage(image, str(tmp_path / name), useCompression=name != "t.nii")
     assert_same(tmp_path / name, stored)

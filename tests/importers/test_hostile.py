@@ -112,7 +112,7 @@ def test_a_deflated_image_larger_than_this_machine_s_share_is_refused(tmp_path, 
 
 @pytest.mark.parametrize(("dtype", "compression"), [(np.float32, None), (np.float32, "zlib"), (np.uint16, None)])
 def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth, dtype, compression) -> None:
-    """The frames as stored and their line integrals, a byte a pixel for the mask, and blocks."""
+    """The frames as stored and their line integrals, one byte per pixel for the mask, and blocks."""
     path = w.write_tiff(tmp_path / "tiff", make_truth(), angles="step_deg = 10")
     frames = np.random.default_rng(0).integers(1000, 50000, (32, 400, 400)).astype(dtype)
     for name, stack in (("proj", frames), ("flat", frames[:2]), ("dark", frames[:1] * 0)):

@@ -1,4 +1,4 @@
-"""One run an output: locks that end with their process."""
+"""One run per output: locks that end with their process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roundness and edge sharpness against balls whose blur, place and ellipticity are known."""
+"""Roundness and edge sharpness against beads whose blur, place and ellipticity are known."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from scipy.special import erfc
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics import Ball, edge_sharpness, roundness
-from phyradgs_cl.metrics.balls import resolved
-from phyradgs_cl.metrics.edge import RISE_PER_SIGMA, ball_edge, blurred_ball
-from phyradgs_cl.metrics.roundness import ball_sections
+from phyradgs_cl.metrics import Bead, edge_sharpness, roundness
+from phyradgs_cl.metrics.beads import resolved
+from phyradgs_cl.metrics.edge import RISE_PER_SIGMA, bead_edge, blurred_ball
+from phyradgs_cl.metrics.roundness import bead_sections
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
-GRID = Grid.cube(64, 32.0)  # half a millimetre a voxel
+GRID = Grid.cube(64, 32.0)  # half a millimetre per voxel
 CENTRE = (0.3, -0.2, 0.4)
 NOISE = 0.1
 
@@ -24,7 +24,7 @@ def drawn(
     axes_mm: tuple[float, float, float], sigma_mm: float = 0.0, centre: tuple[float, ...] = CENTRE
 ) -> np.ndarray:
     """An ellipsoid of density 1 on a background of 0.2, blurred."""
-    phantom = EllipsoidPhantom((Ellipsoid(centre, axes_mm, 1.0),), "ball")  # type: ignore[arg-type]
+    phantom = EllipsoidPhantom((Ellipsoid(centre, axes_mm, 1.0),), "bead")  # type: ignore[arg-type]
     volume = phantom.voxelise(GRID, 4) + 0.2
     return gaussian_filter(volume, sigma_mm / 0.5) if sigma_mm else volume
 
@@ -40,13 +40,13 @@ def expected_rise_mm(sigma_mm: float) -> float:
 @pytest.mark.parametrize("radius_mm", [3.0, 6.0])
 @pytest.mark.parametrize("sigma_mm", [0.0, 0.5, 1.5])
 def test_the_rise_of_a_known_blur_is_found(radius_mm: float, sigma_mm: float) -> None:
-    volume, ball = drawn((radius_mm,) * 3, sigma_mm), Ball(CENTRE, radius_mm)
-    edge = ball_edge(volume, GRID, ball)
+    volume, bead = drawn((radius_mm,) * 3, sigma_mm), Bead(CENTRE, radius_mm)
+    edge = bead_edge(volume, GRID, bead)
     # 5 %: a voxel's box is not a Gaussian; noise of a tenth of the contrast adds 2 to 7 %
     assert edge.rise_mm == pytest.approx(expected_rise_mm(sigma_mm), rel=0.05)
     assert edge.radius_mm == pytest.approx(radius_mm, abs=0.02)
     assert (edge.inside, edge.outside) == pytest.approx((1.2, 0.2), abs=0.02)
-    assert ball_edge(noisy(volume), GRID, ball).rise_mm == pytest.approx(expected_rise_mm(sigma_mm), rel=0.1)
+    assert bead_edge(noisy(volume), GRID, bead).rise_mm == pytest.approx(expected_rise_mm(sigma_mm), rel=0.1)
 
 
 def test_a_large_blurred_ball_has_the_profile_of_a_straight_edge() -> None:
@@ -55,26 +55,26 @@ def test_a_large_blurred_ball_has_the_profile_of_a_straight_edge() -> None:
     np.testing.assert_allclose(blurred_ball(distance, 100.0, 1.0), straight, atol=5e-3)
 
 
-def test_the_profile_at_the_centre_is_the_mass_within_the_ball() -> None:
+def test_the_profile_at_the_centre_is_the_mass_within_the_bead() -> None:
     # chi distribution of three degrees: the share of a 3D Gaussian within R = 2 σ
     assert blurred_ball(np.zeros(1), 2.0, 1.0)[0] == pytest.approx(0.7385358700508889, rel=1e-6)
 
 
-def test_round_balls_are_round_wherever_they_are() -> None:
+def test_round_beads_are_round_wherever_they_are() -> None:
     volume = drawn((6.0,) * 3, 0.7)
-    found = roundness(volume, GRID, [Ball(CENTRE, 6.0)])
+    found = roundness(volume, GRID, [Bead(CENTRE, 6.0)])
     assert found["roundness"] < 0.01
     assert found["roundness_rms"] < 0.003
     assert found["centre_shift_mm"] < 0.02
     assert found["round_sections"] == 3
     # seen from a centre that is 0.6 mm off along x: sagittal sections do not see that shift
-    moved = roundness(volume, GRID, [Ball((CENTRE[0] + 0.6, *CENTRE[1:]), 6.0)])
+    moved = roundness(volume, GRID, [Bead((CENTRE[0] + 0.6, *CENTRE[1:]), 6.0)])
     assert moved["centre_shift_mm"] == pytest.approx(0.6 * 2 / 3, abs=0.03)
     assert moved["roundness"] < 0.02
 
 
 def test_an_ellipsoid_is_out_of_round_by_its_axes() -> None:
-    sections = ball_sections(drawn((6.6, 6.0, 6.0)), GRID, Ball(CENTRE, 6.0))
+    sections = bead_sections(drawn((6.6, 6.0, 6.0)), GRID, Bead(CENTRE, 6.0))
     for name in ("axial", "coronal"):
         assert sections[name].span == pytest.approx(0.6 / 6.3, abs=0.02)
         # radii of an ellipse run between the axes as a cosine: RMS is the amplitude over √2
@@ -84,23 +84,23 @@ def test_an_ellipsoid_is_out_of_round_by_its_axes() -> None:
 
 
 def test_noise_adds_little_to_the_rms() -> None:
-    found = roundness(noisy(drawn((6.0,) * 3, 0.7)), GRID, [Ball(CENTRE, 6.0)])
+    found = roundness(noisy(drawn((6.0,) * 3, 0.7)), GRID, [Bead(CENTRE, 6.0)])
     assert found["roundness_rms"] < 0.03
     assert found["round_sections"] == 3
 
 
-def test_unresolved_and_missing_balls_give_no_number() -> None:
-    small, outside = Ball(CENTRE, 1.0), Ball((12.0, 0.0, 0.0), 6.0)
-    assert resolved([small, outside, Ball(CENTRE, 3.0)], GRID) == [Ball(CENTRE, 3.0)]
+def test_unresolved_and_missing_beads_give_no_number() -> None:
+    small, outside = Bead(CENTRE, 1.0), Bead((12.0, 0.0, 0.0), 6.0)
+    assert resolved([small, outside, Bead(CENTRE, 3.0)], GRID) == [Bead(CENTRE, 3.0)]
     empty = np.zeros(GRID.shape)
-    assert np.isnan(roundness(empty, GRID, [Ball(CENTRE, 6.0)])["roundness"])
-    assert np.isnan(edge_sharpness(empty, GRID, [Ball(CENTRE, 6.0)])["edge_rise_mm"])
+    assert np.isnan(roundness(empty, GRID, [Bead(CENTRE, 6.0)])["roundness"])
+    assert np.isnan(edge_sharpness(empty, GRID, [Bead(CENTRE, 6.0)])["edge_rise_mm"])
     assert edge_sharpness(drawn((6.0,) * 3), GRID, [small])["edge_balls"] == 0
 
 
 def test_wrong_arguments_are_refused() -> None:
-    with pytest.raises(InputError, match="ball radius"):
-        Ball(CENTRE, 0.0)
+    with pytest.raises(InputError, match="bead radius"):
+        Bead(CENTRE, 0.0)
     with pytest.raises(InputError, match="volume: found shape"):
         roundness(np.zeros((3, 3, 3)), GRID, [])
     with pytest.raises(InputError, match="NaN"):

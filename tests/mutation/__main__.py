@@ -1,6 +1,6 @@
 """Mutation testing of a room: python -m tests.mutation ROOM [--count N] [--seed N] [--timeout S] [--again FILE].
 
-Changes a copy of the sources in one place after the other and runs the room's tests, which are to fail. One line a mutant
+Changes a copy of the sources in one place after the other and runs the room's tests, which are to fail. One line per mutant
 on standard output; those that live stand in docs/mutants.md with a verdict each. POSIX only: a test run is a fork of a
 process that has imported everything else already.
 """

@@ -15,7 +15,7 @@ from phyradgs_cl.neural import NeuralOptions
 from phyradgs_cl.neural.rays.exposure import ExposureRays
 from phyradgs_cl.neural.rays.integral import box_span, line_integrals, sample_shifts
 
-VOXELS = 64  # of the longest side; 96 samples a ray by default
+VOXELS = 64  # of the longest side; 96 samples per ray by default
 CENTRE, AXES = np.array([0.1, -0.2, 0.05]), np.array([0.45, 0.3, 0.5])
 
 
@@ -78,7 +78,7 @@ def test_a_gaussian(rays, jitter) -> None:
     assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
 
 
-def test_a_gaussian_with_a_shift_a_sample_is_noisier_and_right_on_average(rays) -> None:
+def test_a_gaussian_with_one_shift_per_sample_is_noisier_and_right_on_average(rays) -> None:
     few = thinned(rays)
     a, b, c = quadratic(few)
     expected = np.sqrt(2 * np.pi / (9 * a)) * np.exp(-9 * (c - b * b / a) / 2)
@@ -98,7 +98,7 @@ def test_an_ellipsoid_that_fades_towards_its_edge(rays) -> None:
 
 
 def test_the_mean_over_an_exposure(rays) -> None:
-    """Fewer samples a ray, and five rays of a pixel: a Gaussian, and an ellipsoid that fades."""
+    """Fewer samples per ray, and five rays of a pixel: a Gaussian, and an ellipsoid that fades."""
     a, b, c = quadratic(rays)
     gaussian = np.sqrt(2 * np.pi / (9 * a)) * np.exp(-9 * (c - b * b / a) / 2)
     fading = 4 / 3 * a * (np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)) ** 3

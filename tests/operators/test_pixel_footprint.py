@@ -31,7 +31,7 @@ MOTIONS = pytest.mark.parametrize("motion", ["static", "exact"])
 SMALL = (0.01, 0.3)  # from a thirtieth of a pixel
 
 
-def standing(table: TimeCells) -> TimeCells:
+def at_rest(table: TimeCells) -> TimeCells:
     """A static table as segments in which nothing moves, which is what the twin reads."""
     times = np.zeros((table.count, 3, table.lines))
     times[:, 2] = 1
@@ -52,7 +52,7 @@ def make_table(make_geometry) -> Callable[[str], TimeCells]:
 
 @remembered
 def twin(rows: np.ndarray, table: TimeCells, affine: bool = False) -> np.ndarray:
-    moving = table if table.end_poses is not None else standing(table)
+    moving = table if table.end_poses is not None else at_rest(table)
     return moving_frame(rows, moving, SHAPE, affine=affine, pixel_variance=PIXEL_VARIANCE)
 
 
@@ -96,7 +96,7 @@ def round_splat(scale: float, x: float) -> np.ndarray:
 
 @pytest.mark.parametrize("pixels", [0.05, 0.3, 0.5, 1.0, 3.0])
 def test_pixels_with_an_area_see_the_mean_over_it(rt, pixels) -> None:
-    """A round splat of ``pixels`` pixels (σ), against the mean of 15 × 15 rays a pixel."""
+    """A round splat of ``pixels`` pixels (σ), against the mean of 15 × 15 rays per pixel."""
     shape, fine = (31, 33), 15
     coarse = ConeGeometry(5.0, 7.5, shape, (0.1, 0.1))
     rays = ConeGeometry(5.0, 7.5, (shape[0] * fine, shape[1] * fine), (0.1 / fine, 0.1 / fine))

@@ -14,7 +14,7 @@ from tolerances import RAYS
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
-from phyradgs_cl.operators.rays.launches import RayLayout
+from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.upright import columns_floats, upright_block
 from phyradgs_cl.operators.twins.rays import ray_frame
@@ -147,7 +147,7 @@ def steep(shape: tuple[int, int]) -> list[TimeCells]:
         (tilted(TALL_PANEL), False),
         (steep(TALL_PANEL), False),
     ],
-    ids=["static", "strips", "a pose a line", "few lines", "columns", "tilted", "steep"],
+    ids=["static", "strips", "a pose per line", "few lines", "columns", "tilted", "steep"],
 )
 def test_where_it_applies(cells, applies) -> None:
     width = 85 if cells[0].lines == 15 else 7

@@ -1,4 +1,4 @@
-"""Multi-pose batch rendering: one launch an operator for all micro-views of a frame, equal to Eq. 3 written out."""
+"""Multi-pose batch rendering: one launch per operator for all micro-views of a frame, equal to Eq. 3 written out."""
 
 from __future__ import annotations
 

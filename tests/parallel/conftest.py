@@ -1,4 +1,4 @@
-"""Ranks without MPI: threads of this process that exchange arrays. What needs MPI itself is collected where it is there."""
+"""Ranks without MPI: threads of this process. What needs MPI itself is collected where it is there."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Threads:
         self.rank, self.size = rank, len(slots)
         self.local_rank, self.local_size = rank, len(slots)
         self._slots, self._barrier = slots, barrier
-        self.exchanged_bytes = 0
+        self.sent_bytes = 0
 
     def _all(self, value: Any, nbytes: int = 0) -> list[Any]:
-        self.exchanged_bytes += nbytes  # counted as under MPI
+        self.sent_bytes += nbytes  # counted as under MPI
         self._slots[self.rank] = value
         _WORK.release()
         try:
@@ -43,22 +43,22 @@ class Threads:
             _WORK.acquire()
         return everyone
 
-    def add(self, values: np.ndarray) -> None:
+    def allreduce_sum(self, values: np.ndarray) -> None:
         everyone = self._all(values.copy(), values.nbytes)
         values[...] = 0
         for other in everyone[self.rank :] + everyone[: self.rank]:  # another order on every rank
             values += other
 
-    def largest(self, values: np.ndarray) -> None:
+    def allreduce_max(self, values: np.ndarray) -> None:
         values[...] = np.maximum.reduce(self._all(values.copy(), values.nbytes))
 
     def any(self, flag: bool) -> bool:
         return any(self._all(flag, 4))
 
-    def tell(self, value: Any) -> Any:
+    def bcast(self, value: Any) -> Any:
         return deepcopy(self._all(value)[0])  # as what comes by MPI
 
-    def join(self, values: np.ndarray) -> np.ndarray:
+    def allgather(self, values: np.ndarray) -> np.ndarray:
         return np.concatenate(self._all(values, values.nbytes))
 
     def all_fail(self) -> bool:

@@ -23,7 +23,7 @@ def test_covered_voxels_hold_the_volume_of_a_capsule() -> None:
     lattice = Lattice(48)
     distance = capsule_distance(Capsule((-0.3, 0, 0.1), (0.4, 0, 0.1), 0.25, 0.25), *lattice.points(_all(48)))
     exact = np.pi * 0.25**2 * 0.7 + 4 / 3 * np.pi * 0.25**3
-    # Edges count as if straight and upright: a rounded body gains somewhat less than a per cent.
+    # Edges count as if straight and axis-aligned: a rounded body gains somewhat less than a per cent.
     assert lattice.coverage(distance).sum() * lattice.step**3 == pytest.approx(exact, rel=1e-2)
 
 

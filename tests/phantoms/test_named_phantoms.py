@@ -57,10 +57,10 @@ def test_attenuation_of_grey_level_one_may_be_given() -> None:
 
 
 def test_spheres_stay_apart_inside_the_holder_in_two_layers() -> None:
-    holder, *balls = sphere_phantom(50.0).ellipsoids
-    centres = np.array([b.centre_mm for b in balls])
-    radii = np.array([b.semi_axes_mm[0] for b in balls])
-    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + np.eye(len(balls)) * 1e3
+    holder, *beads = sphere_phantom(50.0).ellipsoids
+    centres = np.array([b.centre_mm for b in beads])
+    radii = np.array([b.semi_axes_mm[0] for b in beads])
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + np.eye(len(beads)) * 1e3
     assert (distance > radii[:, None] + radii[None]).all()
     assert len(np.unique(centres[:, 2])) == 2 and len(np.unique(radii)) >= 3
     rng = np.random.default_rng(0)

@@ -32,7 +32,7 @@ def test_ramp_filter_is_a_convolution(width, dtype) -> None:
 
 
 def test_the_ramp_is_half_the_frequency_but_for_its_foot() -> None:
-    """In cycles a sample |f|; at zero the sampled kernel keeps the small constant that a limited row needs."""
+    """In cycles per sample |f|; at zero the sampled kernel keeps the small constant that a limited row needs."""
     spectrum = ramp_spectrum(256)
     np.testing.assert_allclose(spectrum, np.arange(129) / 256, atol=0.01)
     assert 0 < spectrum[0] < 0.002

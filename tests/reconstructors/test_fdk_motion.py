@@ -57,7 +57,7 @@ def error_at_rest(rt) -> float:
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 @pytest.mark.parametrize("direction", [1, -1])
 def test_per_row_undoes_the_readout(rt, error_at_rest, axis, direction) -> None:
-    """As good as a gantry at rest, in either direction, where one pose a frame is clearly worse."""
+    """As good as a gantry at rest, in either direction, where one pose per frame is clearly worse."""
     scan = rolling_scan(axis, direction)
     per_row = error(fdk(scan, FdkOptions(motion=LineMiddles()), rt).volume)
     static = error(fdk(scan, FdkOptions(), rt).volume)
@@ -92,7 +92,7 @@ def test_no_motion_is_static(rt, axis) -> None:
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
-def test_displaced_detectors_with_a_pose_a_line(rt, axis) -> None:
+def test_displaced_detectors_with_one_pose_per_line(rt, axis) -> None:
     """Columns are added at the detector's end, and with them lines."""
     pose = GEOMETRY.pose(2 * np.pi * np.arange(VIEWS) / VIEWS)
     frames = line_frames(np.repeat(pose[:, None], PIXELS, 1), "rows")[..., 12:]

@@ -1,4 +1,4 @@
-"""Methods as a GPU runs them, a work-item a pixel in groups the size of a sub-group, give what vectors of lanes give."""
+"""Methods as a GPU runs them, one work-item per pixel in groups the size of a sub-group, give what vectors of lanes give."""
 
 from __future__ import annotations
 

@@ -110,16 +110,16 @@ def test_sirt_is_its_definition() -> None:
 
 def test_sart_and_sirt_weigh_rays_by_their_light() -> None:
     system, matrix, _ = dense_system(noise=0.1)
-    system = system.trusting_light()
-    light = np.exp(-system.measured)
-    light /= light.mean()
-    np.testing.assert_allclose(system.light, light, rtol=FLOAT32)
+    system = system.transmission_weighted()
+    transmission = np.exp(-system.measured)
+    transmission /= transmission.mean()
+    np.testing.assert_allclose(system.transmission, transmission, rtol=FLOAT32)
     one, all_at_once = (
         Sart(system, replace(OS_SART, frames_per_subset=6), 0),
         Sirt(system, SirtOptions()),
     )
-    rows = weights_of(matrix)[0] * light.ravel()
-    columns = 1 / (matrix.T @ light.ravel())
+    rows = weights_of(matrix)[0] * transmission.ravel()
+    columns = 1 / (matrix.T @ transmission.ravel())
     x = np.zeros(matrix.shape[1])
     for k in range(4):
         one.step()
@@ -135,11 +135,11 @@ def test_sart_and_sirt_weigh_rays_by_their_light() -> None:
 
 def test_fista_minimises_squares_weighed_by_light(rt) -> None:
     system, matrix, _ = dense_system(noise=1.0)
-    system = system.trusting_light()
+    system = system.transmission_weighted()
     algorithm = FistaTv(system, FistaTvOptions(tv_weight=0.0), TvProx(rt, VOLUME))
     for _ in range(2000):
         algorithm.step()
-    root = np.sqrt(system.light.ravel())
+    root = np.sqrt(system.transmission.ravel())
     expected, _ = nnls(root[:, None] * matrix, root * system.measured.ravel())
     plain, _ = nnls(matrix, system.measured.ravel())
     assert norm(algorithm.volume.ravel() - expected) < 0.1 * norm(plain - expected)
@@ -153,8 +153,8 @@ def test_light_brings_the_solution_nearer_the_truth_under_photon_noise() -> None
         p = exact.measured * (6 / exact.measured.max())
         noisy = beer_lambert_noise(p, 3e3, 0.0, np.random.default_rng(seed)) * (exact.measured.max() / 6)
         plain = replace(exact, measured=noisy)
-        light = np.exp(-p) / np.exp(-p).mean()
-        for name, system in (("plain", plain), ("weighed", replace(plain, light=light))):
+        transmission = np.exp(-p) / np.exp(-p).mean()
+        for name, system in (("plain", plain), ("weighed", replace(plain, transmission=transmission))):
             algorithm = Sirt(system, SirtOptions(relaxation=1.9))
             for _ in range(2000):
                 algorithm.step()

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.loop import Loop
 
 
 class Halving:
-    """Three iterations a step; the loss halves with each, and 1/256 is enough."""
+    """Three iterations per step; the loss halves with each, and 1/256 is enough."""
 
     quantity, remedy, iterations = "loss", "lower the rate", 10
 

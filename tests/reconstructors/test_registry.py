@@ -198,7 +198,7 @@ def test_counts_belong_to_the_motions_that_have_them() -> None:
     pairs = [(method, name) for method in METHODS for name in motions_of(method)]
     for (method, name), (key, having) in product(pairs, models.items()):
         changes = {"motion": name, key: 3}
-        if name in having and method != "fdk":  # one pose a line
+        if name in having and method != "fdk":  # one pose per line
             assert getattr(method_options(method, None, changes).motion, key) == 3, (method, changes)
             continue
         with pytest.raises(InputError, match=f"--{key.replace('_', '-')}: ") as refused:

@@ -82,8 +82,8 @@ def test_gradient_of_everything(rt, make_cloud, finite_differences, axis) -> Non
     table = internal(OPTIONS.motion.cells(scan, frame))
     measured = scan.projections[frame].astype(float) / UNIT.line_integral
     mask = (scan.pixel_mask == 0).astype(float)
-    light = transmission_weights(scan.projections, scan.pixel_mask == 0)[frame].astype(float)
-    data = {"l1_weight": OPTIONS.l1_weight, "poisson_weight": OPTIONS.poisson_weight, "transmission": light}
+    transmission = transmission_weights(scan.projections, scan.pixel_mask == 0)[frame].astype(float)
+    data = {"l1_weight": OPTIONS.l1_weight, "poisson_weight": OPTIONS.poisson_weight, "transmission": transmission}
 
     def image_term(at: np.ndarray) -> float:
         rendered = splat_frame(activation.apply(at), table, SHAPE)

@@ -36,7 +36,7 @@ def test_a_file_that_is_written_waits_until_it_stands_still(arrivals, now, tmp_p
     assert names(arrivals) == []
     now[0] = 21.0
     assert names(arrivals) == ["scan.h5"]
-    time.sleep(0.02)  # the clock of files ticks some hundred times a second
+    time.sleep(0.02)  # the clock of files ticks some hundred times per second
     path.write_bytes(b"y" * 5)  # of the same size
     assert names(arrivals) == []
 

@@ -1,1 +1,1 @@
-"""One question a file: from a scan, or from fits to it, to a finding."""
+"""One question per file: from a scan, or from fits to it, to a finding."""

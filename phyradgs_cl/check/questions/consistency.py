@@ -15,8 +15,8 @@ from phyradgs_cl.check.frames import alike, odd_ones
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
 from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
 from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
-from phyradgs_cl.check.statistics import standing
-from phyradgs_cl.check.variants import Path, reversed_rotation, shifted, stretched, turned, with_path
+from phyradgs_cl.check.statistics import t_statistic
+from phyradgs_cl.check.variants import Path, path_of, reversed_rotation, shifted, stretched, turned, with_path
 from phyradgs_cl.runtime import Runtime
 
 _LARGEST = 0.35  # residual over that of the frames in a random order: right scans of every kind leave 0.02 to 0.23
@@ -62,7 +62,7 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
     """
     everything = np.arange(scan.frames)
     if scan.frames < _FEWEST_FRAMES or _pixels(scan) < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
-        text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels a frame"
+        text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
         return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
     kept, notes = _without_odd(scan)
     unshifted, part = _best_turning(rt, some_frames(scan, kept))
@@ -179,7 +179,7 @@ def _cause(rt: Runtime, scan: Scan, stated: Fit, most: float, looks_closely: boo
     best, least = None, most
     for cause in _causes(scan, looks_closely):
         squares = fitted(rt, cause.scan())
-        if squares.sum() < least and standing(stated.squares, squares) <= -_ERRORS:
+        if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
             best, least = cause, float(squares.sum())
     return best
 
@@ -193,7 +193,7 @@ def _causes(scan: Scan, looks_closely: bool) -> Iterator[Cause]:
 
 
 def _orders(scan: Scan) -> Iterator[Cause]:
-    path = with_path(scan).trajectory
+    path = path_of(scan)
     numbers = np.arange(scan.frames) if path.frames is None else path.frames
     count = int(numbers[-1]) + 1
     starts = np.interp(np.arange(count), numbers, scan.frame_start_s)
@@ -212,9 +212,9 @@ def _orders(scan: Scan) -> Iterator[Cause]:
 
 def _azimuths(scan: Scan) -> np.ndarray:
     """Angle of each frame's start from the first one's (F,), as the trajectory counts it where it does."""
-    base = with_path(scan).trajectory.base
+    base = path_of(scan).base
     if hasattr(base, "angle_rad"):
-        path = with_path(scan).trajectory
+        path = path_of(scan)
         numbers = np.arange(scan.frames) if path.frames is None else path.frames
         at = [float(base.angle_rad(int(n), np.array([scan.frame_start_s[f]]))[0]) for f, n in enumerate(numbers)]
         return np.array(at) - at[0]
@@ -224,7 +224,7 @@ def _azimuths(scan: Scan) -> np.ndarray:
 
 def _arcs(scan: Scan) -> Iterator[Cause]:
     from_first = _azimuths(scan)
-    path = with_path(scan).trajectory
+    path = path_of(scan)
     sense = -1.0 if path.is_reversed else 1.0
     total_deg = float(np.rad2deg(abs(from_first[-1])))
     radian = float(np.degrees(1.0))
@@ -260,7 +260,7 @@ def _sizes(scan: Scan) -> Iterator[Cause]:
 def _missing(scan: Scan) -> Iterator[Cause]:
     """Frames that are missing, or there twice, with later ones moved up or back by a step."""
     steps = wrapped(np.diff(_azimuths(scan)))
-    step = float(np.median(steps)) * (-1.0 if with_path(scan).trajectory.is_reversed else 1.0)
+    step = float(np.median(steps)) * (-1.0 if path_of(scan).is_reversed else 1.0)
     for at in np.unique(np.linspace(1, scan.frames - 1, 15).round().astype(int)):
         later = (np.arange(scan.frames) >= at) * step
         number = _number(scan, int(at))

@@ -64,7 +64,7 @@ def best_offset(rt: Runtime, scan: Scan, rough: Offset) -> Offset:
 
 
 def block_of(scan: Scan) -> int:
-    """How many pixels a side make one of the coarse ``scan``."""
+    """How many pixels per side make one of the coarse ``scan``."""
     return scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
 
 

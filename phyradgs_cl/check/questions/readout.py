@@ -10,19 +10,19 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.residual import fitted
-from phyradgs_cl.check.statistics import gain, standing
+from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 from phyradgs_cl.check.variants import at_rest, read, reversed_readout
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
 _ERRORS = 4.0
-_LEAST_GAIN = 1.04  # of the other order, which leaves a model as free as it was
-_CLEAR_GAIN = 1.5  # of another axis or time
-_REST_GAIN = 2.0  # of a gantry at rest: a model that does not blur fits better by itself, the more so the fewer the views
+_LEAST_RATIO = 1.04  # of the other order, which leaves a model as free as it was
+_CLEAR_RATIO = 1.5  # of another axis or time
+_REST_RATIO = 2.0  # of a gantry at rest: a model that does not blur fits better by itself, the more so the fewer the views
 _AS_GOOD = 1.15
 _SHARE = 0.86  # of the time between frames: a readout to try where none is stated
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
-_NEEDED = {_OTHER_WAY: _LEAST_GAIN, _AT_REST: _REST_GAIN}
+_NEEDED = {_OTHER_WAY: _LEAST_RATIO, _AT_REST: _REST_RATIO}
 READOUT = "sign of readout"
 
 
@@ -34,16 +34,16 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
     """
     stated = fitted(rt, scan)
     others: dict[str, np.ndarray] = {}
-    for name, other in _others(scan).items():
+    for name, variant in _others(scan).items():
         with suppress(InputError):  # a table of poses or angles that ends before the last line would
-            others[name] = fitted(rt, other)
+            others[name] = fitted(rt, variant)
     if not others:
         text = "the tables of poses or angles end with the stated times: no other readout can be tried"
         return Finding(READOUT, CANNOT_TELL, 0.0, -_ERRORS, "standard errors", text)
-    needed = {name: _NEEDED.get(name, _CLEAR_GAIN) for name in others}
+    needed = {name: _NEEDED.get(name, _CLEAR_RATIO) for name in others}
     name = min(others, key=lambda name: float(others[name].sum()) * needed[name])
     best, least = others[name], needed[name]
-    ratio, errors = gain(stated, best), standing(stated, best)
+    ratio, errors = residual_ratio(stated, best), t_statistic(stated, best)
     text = f"read {name}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)"
     if errors <= -_ERRORS and ratio <= 1 / least:
         alike = [n for n, squares in others.items() if squares.sum() <= _AS_GOOD * best.sum() and n != name]
@@ -51,9 +51,9 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
         return Finding(READOUT, SUSPICIOUS, errors, -_ERRORS, "standard errors", text, _advice(scan, name))
     if _OTHER_WAY in others:
         other = others[_OTHER_WAY]
-        errors, ratio = standing(stated, other), gain(stated, other)
+        errors, ratio = t_statistic(stated, other), residual_ratio(stated, other)
         text = f"read the other way, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)"
-        if errors >= _ERRORS and ratio >= _LEAST_GAIN:
+        if errors >= _ERRORS and ratio >= _LEAST_RATIO:
             return Finding(READOUT, OK, errors, -_ERRORS, "standard errors", text)
     advice = "ask which line the panel reads first: in a narrow cone the wrong order only twists the object"
     return Finding(READOUT, CANNOT_TELL, errors, -_ERRORS, "standard errors", text, advice)

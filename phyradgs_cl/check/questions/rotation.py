@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.questions.offset import Offset
-from phyradgs_cl.check.statistics import gain, standing
+from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 
 _ERRORS = 4.0
-_LEAST_GAIN, _CLEAR_GAIN = 1.2, 3.0
+_LEAST_RATIO, _CLEAR_RATIO = 1.2, 3.0
 SIGN = "sign of rotation"
 
 
 def is_clear(stated: Offset, other: Offset) -> bool:
     """Whether one of two rough offsets explains the frames so much better that the other needs no second look."""
-    ratio = gain(stated.residuals, other.residuals)
-    return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_GAIN
+    ratio = residual_ratio(stated.residuals, other.residuals)
+    return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO
 
 
 def check_rotation(stated: Offset, other: Offset) -> Finding:
@@ -22,12 +22,12 @@ def check_rotation(stated: Offset, other: Offset) -> Finding:
 
     Four standard errors decide, and 20 % of the squared residual: a mirror image in a narrow fan fits as well.
     """
-    errors, ratio = standing(stated.residuals, other.residuals), gain(stated.residuals, other.residuals)
+    errors, ratio = t_statistic(stated.residuals, other.residuals), residual_ratio(stated.residuals, other.residuals)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
-    if errors >= _ERRORS and ratio >= _LEAST_GAIN:
+    if errors >= _ERRORS and ratio >= _LEAST_RATIO:
         return Finding(SIGN, OK, *values)
-    if errors <= -_ERRORS and ratio <= 1 / _LEAST_GAIN:
+    if errors <= -_ERRORS and ratio <= 1 / _LEAST_RATIO:
         advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
         return Finding(SIGN, SUSPICIOUS, *values, advice)
     advice = "look for a feature whose side is known: a mirror image would fit as well"

@@ -1,1 +1,1 @@
-"""A format a file: from another program's scan to ours."""
+"""One format per file: from another program's scan to ours."""

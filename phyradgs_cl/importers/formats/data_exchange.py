@@ -13,7 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions, option_name
-from phyradgs_cl.importers.reading.frames import line_integrals, upright
+from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
 from phyradgs_cl.importers.scan_parts import checked, needed, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
@@ -43,10 +43,10 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
         exposure_s = optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
         title = _title(source, path)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
-    turned = {name: None if s is None else upright(s, options, "top") for name, s in stacks.items()}
+    turned = {name: None if s is None else oriented(s, options, "top") for name, s in stacks.items()}
     integrals = line_integrals(
         f"{path}:{_EXCHANGE}/data",
-        upright(frames, options, "top"),
+        oriented(frames, options, "top"),
         options,
         flats=turned["data_white"],
         darks=turned["data_dark"],

@@ -1,4 +1,4 @@
-"""Poses that no circle describes: tables of them over time, upright, with a plain geometry to go by."""
+"""Poses that no circle describes: tables of them over time, row 0 the lowest, with a plain geometry to go by."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """What stands a stored image upright, from one of its poses (12,)."""
+    """How a stored image is flipped to row 0 below and column 0 left, from one of its poses (12,)."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))

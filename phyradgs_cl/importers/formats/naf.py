@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import tigre_frame
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.frames import line_integrals, upright
+from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.reading.pickle import read_pickle
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
@@ -39,7 +39,7 @@ def import_naf(path: Path, options: ImportOptions) -> Scan:
     if data.has("image"):
         volume = _array(data, "image", 3)
         reference = tigre_frame.turned_volume(data.name("image"), volume, grid, _PER_MM)
-    frames = upright(frames, options, tigre_frame.ROW_0)
+    frames = oriented(frames, options, tigre_frame.ROW_0)
     integrals = line_integrals(str(path), frames, options, custom="attenuation")
     trajectory = turning(geometry, angle_rad, timing)
     return put_together(

@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Sc
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned
 from phyradgs_cl.importers.options import ImportOptions, option_name
-from phyradgs_cl.importers.reading.frames import line_integrals, united, upright
+from phyradgs_cl.importers.reading.frames import line_integrals, oriented, united
 from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign, opened, optional_length, read_frames
 from phyradgs_cl.importers.scan_parts import checked, needed, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
@@ -64,7 +64,7 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
         _log.warning(text, path, option_name("row_0"))
-    frames = upright(turn.frames(frames), options, "bottom")
+    frames = oriented(turn.frames(frames), options, "bottom")
     integrals = line_integrals(
         f"{path}:{detector}/data",
         frames[used],
@@ -74,7 +74,7 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         custom=quantity,
     )
     if mask is not None:
-        mask = upright(turn.frames(mask), options, "bottom")
+        mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
@@ -141,7 +141,7 @@ def _geometry(
         behind = optional_length(source, f"{detector}/distance")
         to_detector = None if behind is None else to_axis + behind
     to_detector = needed(to_detector, "source_to_detector_mm", source.name(f"{detector}/distance"))
-    pitch = options.pixel_size_mm or tuple(_pitch(source, detector, axis) for axis in "yx")
+    pitch = options.pixel_size_mm or (_pitch(source, detector, "y"), _pitch(source, detector, "x"))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
 

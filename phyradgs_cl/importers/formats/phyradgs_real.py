@@ -119,10 +119,10 @@ def _frames_and_views(
     if not paths or len(paths) != len(views):
         remedy = f"say {option_name('first_view')} if the JSON holds several scans"
         found = f"{len(paths)} TIFF files for {len(views)} views"
-        raise InputError(str(folder.root), found, "one frame a view", remedy)
+        raise InputError(str(folder.root), found, "one frame per view", remedy)
     frames = tiff.read_tiffs(paths)
     if len(frames) != len(views):
-        raise InputError(str(folder.root), f"{len(frames)} pages for {len(views)} views", "one page a file")
+        raise InputError(str(folder.root), f"{len(frames)} pages for {len(views)} views", "one page per file")
     return frames, views
 
 
@@ -195,14 +195,9 @@ def _view_poses(
 def _matrix(view: Fields) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and centre (3,) of a view's detector matrix."""
     rows = view.get("detector")
-    good = isinstance(rows, list) and len(rows) == 4
-    matrix = (
-        np.array([Fields(view.name("detector"), {"row": row}).numbers("row", 4) for row in rows])
-        if good
-        else None
-    )
-    if matrix is None:
+    if not isinstance(rows, list) or len(rows) != 4:
         raise InputError(view.name("detector"), "no 4×4 matrix", "four rows of four numbers")
+    matrix = np.array([Fields(view.name("detector"), {"row": row}).numbers("row", 4) for row in rows])
     rotation = matrix[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
         raise InputError(view.name("detector"), "columns that are not orthonormal", "a rotation and a centre")

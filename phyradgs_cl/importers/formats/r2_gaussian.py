@@ -16,7 +16,7 @@ from phyradgs_cl.importers.formats import tigre_frame
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.bounded import read_json, read_npy
 from phyradgs_cl.importers.reading.folder import SafeFolder
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, upright
+from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import make_timing, turning
 from phyradgs_cl.io.tables import Fields
@@ -57,7 +57,7 @@ class R2Folder:
         return image
 
     def projections(self, entries: list[Fields], options: ImportOptions) -> LineIntegrals:
-        """Line integrals of the listed frames, upright."""
+        """Line integrals of the listed frames, row 0 the lowest."""
         names = [entry.word("file_path") for entry in entries]
         if len(set(names)) < len(names):  # a short list must not ask for more memory than its files hold
             at = next(i for i, name in enumerate(names) if name in names[:i])
@@ -66,8 +66,8 @@ class R2Folder:
         frames = np.empty((len(entries), *first.shape), first.dtype)
         for index, entry in enumerate(entries):
             frames[index] = self.frame(entry)
-        upright_frames = upright(frames, options, tigre_frame.ROW_0)
-        return line_integrals(str(self.folder.root), upright_frames, options, custom="attenuation")
+        oriented_frames = oriented(frames, options, tigre_frame.ROW_0)
+        return line_integrals(str(self.folder.root), oriented_frames, options, custom="attenuation")
 
     def reference(self) -> tuple[Grid, np.ndarray | None]:
         """The grid, and the true volume in 1/mm where the folder has it."""

@@ -32,7 +32,7 @@ def import_rtk(path: Path, options: ImportOptions) -> Scan:
     rtk, stack = read_rtk_xml(description), read_meta_stack(stack_path)
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
-        raise InputError(str(stack_path), found, "one frame a projection")
+        raise InputError(str(stack_path), found, "one frame per projection")
     timing = make_timing(str(description), rtk.frames, options)
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
     custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None

@@ -1,4 +1,4 @@
-"""RTK's geometry files (RTKThreeDCircularGeometry, version 3): nine numbers a projection, and the poses they mean.
+"""RTK's geometry files (RTKThreeDCircularGeometry, version 3): nine numbers per projection, and the poses they mean.
 
 Read with expat alone: no entity is declared, no external file is looked at. RTK's own files carry an empty
 DOCTYPE, which is harmless and the only one that passes.

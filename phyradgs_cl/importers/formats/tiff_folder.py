@@ -17,7 +17,7 @@ from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, QUANTITIES, ROTATE
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_numbers
 from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, united, upright
+from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented, united
 from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign
 from phyradgs_cl.importers.scan_parts import put_together, with_options
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
@@ -113,7 +113,7 @@ def _line_integrals(
     stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, culprit: str
 ) -> LineIntegrals:
     """Line integrals of the projections, with the pixels not to be used."""
-    turned = {name: upright(stack, said, "top") for name, stack in stacks.items()}
+    turned = {name: oriented(stack, said, "top") for name, stack in stacks.items()}
     stack = turned["projections"]
     found = line_integrals(culprit, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
     if "mask" not in turned:
@@ -167,7 +167,7 @@ def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTi
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
-    """(F,) as stored: a list, a file of one angle a line, or the first with the last or a step."""
+    """(F,) as stored: a list, a file of one angle per line, or the first with the last or a step."""
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:
         raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
@@ -190,5 +190,5 @@ def _mask(stack: np.ndarray, shape: tuple[int, ...], culprit: str) -> np.ndarray
     if stack.shape == (1, *shape[1:]):
         return stack[0] != 0
     if stack.shape != shape:
-        raise InputError(culprit, f"shape {stack.shape}", f"one image of {shape[1:]}, or one a frame")
+        raise InputError(culprit, f"shape {stack.shape}", f"one image of {shape[1:]}, or one per frame")
     return stack != 0

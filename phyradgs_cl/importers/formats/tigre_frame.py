@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.io.tables import Fields
 
 ROW_0 = "top"
@@ -44,7 +44,7 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
     counts = scanner.counts("nVoxel", 3)
     size = pitches(scanner, "Voxel", counts) * unit_mm
     origin = offset(scanner, "offOrigin", 3) * unit_mm
-    return Grid(tuple(counts[::-1]), tuple(size[::-1].tolist()), tuple(origin[::-1].tolist()))
+    return Grid(triple(counts[::-1]), triple(size[::-1].tolist()), triple(origin[::-1].tolist()))
 
 
 def pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:

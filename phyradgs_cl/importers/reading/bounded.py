@@ -50,7 +50,7 @@ def read_json(path: Path) -> dict[str, object]:
 
 
 def read_numbers(path: Path, count: int, what: str) -> np.ndarray:
-    """(count,) finite numbers of a text file, one a line; empty lines and what follows a # are passed over."""
+    """(count,) finite numbers of a text file, one per line; empty lines and what follows a # are passed over."""
     values = []
     for number, line in enumerate(read_bytes(path).decode("utf-8-sig", "replace").splitlines(), start=1):
         text = line.partition("#")[0].strip()

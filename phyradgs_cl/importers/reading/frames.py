@@ -1,4 +1,4 @@
-"""Raw frames of any origin to line integrals on an upright panel, with bad pixels masked."""
+"""Raw frames of any origin to line integrals with row 0 the lowest, with bad pixels masked."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def line_integrals(
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, culprit, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
-    if saturation is not None and saturation.share > 0:
+    if flat is not None and saturation is not None and saturation.share > 0:
         _mask_clipped(culprit, frames, flat, saturation, unusable)
     return LineIntegrals(integrals, compact(unusable), saturation)
 
@@ -108,7 +108,7 @@ def united(first: Mask, second: Mask) -> Mask:
     return first | second
 
 
-def upright(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
+def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
     """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source.
 
     ``row_0`` and ``column_0`` are the format's custom; the options win.

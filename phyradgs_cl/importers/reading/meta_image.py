@@ -39,6 +39,7 @@ class MetaStack:
 def read_meta_stack(path: Path) -> MetaStack:
     """A stack of projections, third axis the frames, which must lie on top of each other."""
     image = read_meta_image(path)
+    assert image.steps_mm is not None and image.origin_mm is not None  # every MetaImage has them
     step = image.steps_mm
     if np.abs(step[:2, 2]).max() + np.abs(step[2, :2]).max() > 1e-9 * np.abs(step).max():
         found = str(step.tolist())[:80]

@@ -49,9 +49,9 @@ def read_nifti(path: Path) -> Voxels:
 
 def _header(culprit: str, text: bytes) -> np.void:
     """The header in the byte order in which it says how long it is."""
-    for order in "<>":
+    for stored in (HEADER.newbyteorder("<"), HEADER.newbyteorder(">")):
         if len(text) == HEADER.itemsize:
-            head = np.frombuffer(text, HEADER.newbyteorder(order))[0]
+            head = np.frombuffer(text, stored)[0]
             if head["sizeof_hdr"] == HEADER.itemsize and head["magic"] == b"n+1":
                 return head
     raise InputError(culprit, "no header of NIfTI-1", "a single-file NIfTI-1 image (.nii, .nii.gz)")
@@ -71,7 +71,7 @@ def _layout(culprit: str, head: np.void) -> tuple[int, tuple[int, ...], np.dtype
 
 
 def _frame(head: np.void) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (3, 3), a row an axis, and the place (3,) of voxel (0, 0, 0), in RAS."""
+    """Steps (3, 3), one row per axis, and the place (3,) of voxel (0, 0, 0), in RAS."""
     if head["sform_code"] > 0:
         matrix = head["srow"].astype(np.float64)
         return matrix[:, :3].T, matrix[:, 3]

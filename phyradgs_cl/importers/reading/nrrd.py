@@ -55,7 +55,7 @@ def read_nrrd(path: Path) -> Voxels:
 
 
 def _frame(culprit: str, header: dict[str, str]) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Steps (3, 3), a row an axis, and the place (3,) of voxel (0, 0, 0) in LPS mm, where the header has them."""
+    """Steps (3, 3), one row per axis, and the place (3,) of voxel (0, 0, 0) in LPS mm, where the header has them."""
     space = header.get("space", "").lower()
     if space not in _SPACES:
         raise InputError(f"{culprit} space", space[:40], ", ".join(name for name in _SPACES if "-" in name))

@@ -13,7 +13,7 @@ import pickle
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class PlainUnpickler(pickle._Unpickler):
             ("numpy.core.numeric", "_frombuffer"): _Allowed(self._array),
             ("_codecs", "encode"): _Allowed(self._encoded),
         }
-        self.dispatch = _Opcodes(pickle._Unpickler.dispatch)
+        self.dispatch = _Opcodes(pickle._Unpickler.dispatch)  # type: ignore[misc]
         self.dispatch[pickle.EMPTY_DICT[0]] = lambda machine: machine.append(_Table())
         self.dispatch[pickle.DICT[0]] = _load_table
         for name in _REFUSED:
@@ -120,7 +120,7 @@ class _Table(dict[object, object]):
         super().__setitem__(key, value)
 
 
-def _load_table(machine: PlainUnpickler) -> None:
+def _load_table(machine: Any) -> None:
     items, table = machine.pop_mark(), _Table()
     for key, value in zip(items[::2], items[1::2], strict=True):
         table[key] = value
@@ -162,6 +162,8 @@ class _Dtype:
 class _Array(np.ndarray):
     """An array that is filled by its state, with exactly as many bytes as its shape needs."""
 
+    _spend: Callable[[int], None]
+
     def __new__(cls, spend: Callable[[int], None]) -> _Array:
         made = super().__new__(cls, (0,), np.uint8)
         made._spend = spend
@@ -180,4 +182,4 @@ class _Array(np.ndarray):
         if math.prod(shape) * dtype.dtype.itemsize != len(raw):
             raise ValueError(f"an array of shape {shape} in {len(raw)} bytes")
         self._spend(len(raw))
-        super().__setstate__((1, shape, dtype.dtype, fortran is True or fortran == 1, bytes(raw)))
+        super().__setstate__((1, shape, dtype.dtype, fortran is True or fortran == 1, bytes(raw)))  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Grey TIFF images, plain or deflated, one a file or many in one, of a size that the file can hold."""
+"""Grey TIFF images, plain or deflated, one per file or many in one, of a size that the file can hold."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None
     tifffile = _library()
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
-            facts = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
+            facts: dict[str, Any] = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
             per_mm = [np.divide(*tiff.pages[0].tags[f"{axis}Resolution"].value) for axis in "XY"]
         sizes = np.array([1 / per_mm[0], 1 / per_mm[1], float(facts["spacing"])])
         if facts.get("unit") != "mm" or not np.all(np.isfinite(sizes) & (sizes > 0)):

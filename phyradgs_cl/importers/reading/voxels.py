@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.io import LoadedVolume
 from phyradgs_cl.io.hdf5.units import LENGTH
 
@@ -30,7 +30,7 @@ class Voxels:
     note: str = ""
 
 
-def upright(culprit: str, stored: Voxels) -> LoadedVolume:
+def along_world_axes(culprit: str, stored: Voxels) -> LoadedVolume:
     """The volume (z, y, x) float32 along rising world axes, and its grid; bare integers as shares of their type's maximum.
 
     Raises:
@@ -53,16 +53,15 @@ def upright(culprit: str, stored: Voxels) -> LoadedVolume:
     index = [world.index(axis) for axis in (2, 1, 0)]  # of z, y, x among i, j, k
     turned = values.transpose([2 - n for n in index])
     falling = [n for n, axis in zip(index, (2, 1, 0), strict=True) if steps[n, axis] < 0]
-    turned = np.flip(turned, [index.index(n) for n in falling])
-    size_mm = tuple(float(sizes[n]) for n in index)
+    turned = np.flip(turned, tuple(index.index(n) for n in falling))
+    size_mm = triple(float(sizes[n]) for n in index)
     if stored.origin_mm is None:
         return LoadedVolume(_float32(culprit, turned), Grid(turned.shape, size_mm))
     counts = np.array(values.shape[::-1])
     centre_mm = stored.origin_mm + ((counts - 1) / 2) @ steps
     if not np.all(np.abs(centre_mm) <= LENGTH.largest):
         raise InputError(f"{culprit}: origin", str(stored.origin_mm.tolist())[:80], "three lengths in mm")
-    z, y, x = (float(c) for c in centre_mm[::-1])
-    return LoadedVolume(_float32(culprit, turned), Grid(turned.shape, size_mm, (z, y, x)))
+    return LoadedVolume(_float32(culprit, turned), Grid(turned.shape, size_mm, triple(centre_mm[::-1])))
 
 
 def _float32(culprit: str, values: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ def _verdict(path: Path, mtime_ns: int, size: int) -> str:
     return "a file so damaged that the HDF5 library crashes on it" if status < 0 else ""
 
 
-def _in_a_copy(path: str, limits: tuple[float, ...]) -> int:
+def _in_a_copy(path: str, limits: tuple[int, int, int, int, float]) -> int:
     """How a copy of this process that looks at the file ends: its status, or less the signal."""
     with phil, warnings.catch_warnings():  # no other thread is inside HDF5; none goes on in the copy
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -68,7 +68,7 @@ def _in_a_copy(path: str, limits: tuple[float, ...]) -> int:
         status = 1
         try:
             _be_silent()
-            status = look(path, *limits)  # type: ignore[arg-type]
+            status = look(path, *limits)
         finally:
             os._exit(status)
     try:

@@ -94,10 +94,11 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
     if scan.is_fly and scan.shutter.exposure_s > 0:
         last_deg = np.rad2deg(last_rad)[frame_of]
         write_number(sample, "rotation_angle_end", last_deg, "degree", rotates="gantry")
-    if isinstance(scan.trajectory, PoseTable):
-        _write_poses(entry, scan.trajectory, 0.0 if scan.is_fly else scan.shutter.middle_s)
-    elif scan.is_fly and isinstance(scan.trajectory.kinematics, (EncoderTable, SpeedRamp)):
-        _write_kinematics(entry, *_angle_table(scan))
+    path = scan.trajectory
+    if isinstance(path, PoseTable):
+        _write_poses(entry, path, 0.0 if scan.is_fly else scan.shutter.middle_s)
+    elif scan.is_fly and isinstance(path, CircularOrbit) and isinstance(path.kinematics, EncoderTable | SpeedRamp):
+        _write_kinematics(entry, *_angle_table(scan, path.kinematics))
 
 
 def _write_poses(entry: h5py.Group, table: PoseTable, earlier_s: float) -> None:
@@ -124,15 +125,14 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
-    if isinstance(scan.trajectory, PoseTable):  # the source's azimuth: only other programs read it
-        pose = scan.trajectory.pose(frame, time_s)
-        return np.unwrap(np.arctan2(pose[:, 1], pose[:, 0]))
-    return scan.trajectory.angle_rad(frame, time_s)
+    if isinstance(scan.trajectory, CircularOrbit):
+        return scan.trajectory.angle_rad(frame, time_s)
+    pose = scan.trajectory.pose(frame, time_s)  # the source's azimuth: only other programs read it
+    return np.unwrap(np.arctan2(pose[:, 1], pose[:, 0]))
 
 
-def _angle_table(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.ndarray, np.ndarray]:
     """The encoder's table, or a speed ramp sampled until straight pieces follow it to a nanoradian."""
-    kinematics = scan.trajectory.kinematics  # type: ignore[union-attr]
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
     first_s, last_s = (

@@ -131,9 +131,9 @@ def _panel_facts(scan: Scan) -> dict[str, object]:
 def _trajectory_word(scan: Scan) -> str:
     if isinstance(scan.trajectory, PoseTable):
         return "pose table"
-    if isinstance(scan.trajectory.kinematics, EncoderTable):
+    if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, EncoderTable):
         return "encoder table"
-    return "constant speed in each frame" if scan.is_fly else "one angle a frame"
+    return "constant speed in each frame" if scan.is_fly else "one angle per frame"
 
 
 def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.arrays import to_array, to_tensor
 from phyradgs_cl.neural.field.attenuation_network import AttenuationNetwork
 from phyradgs_cl.neural.field.hash_encoding import HashEncoding
@@ -39,8 +39,8 @@ def voxel_values(
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:
-        shape, size = (tuple(of[axis] for axis in order) for of in (grid.shape, grid.voxel_size_mm))
-        part = _in_rows(field, Grid(shape, size), order, device, points_at_once, points)
+        turned = Grid(triple(grid.shape[a] for a in order), triple(grid.voxel_size_mm[a] for a in order))
+        part = _in_rows(field, turned, order, device, points_at_once, points)
         values += part.transpose(np.argsort(order))
     return values / np.float32(len(orders))
 
@@ -63,7 +63,7 @@ def _in_rows(
     filled = -(-fast.size // field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows = np.empty((slows, middles, points, points, 2))  # rows of points, row of voxels by row of voxels
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, row of voxels by row of voxels
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)
@@ -74,7 +74,7 @@ def _in_rows(
         places = (part[:, :1], part[:, 1:], fast)
         for axis, place in zip(order, places, strict=True):
             positions[..., 2 - axis] = place
-        brick = to_array(field(to_tensor(positions.reshape(-1, 3), device))).reshape(len(part), filled)
+        brick: np.ndarray = to_array(field(to_tensor(positions.reshape(-1, 3), device))).reshape(len(part), filled)
         brick = brick[:, : fasts * points].reshape(-1, points**2, fasts, points)
         values[start : start + at_once] = brick.mean((1, 3))
     return values.reshape(grid.shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +46,7 @@ class ExposureRays:
 
     @property
     def times(self) -> int:
-        """K, how many times a line has."""
+        """K, how many times per line has."""
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +60,7 @@ class ExposureRays:
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         return pose[..., :3], direction
 
-    def shadow(self, half_sides: Sequence[float], detector_shape: tuple[int, int]) -> tuple[slice, slice]:
+    def shadow(self, half_sides: np.ndarray, detector_shape: tuple[int, int]) -> tuple[slice, slice]:
         """Rows and columns within which every pixel lies whose rays meet a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
         steps, origin = self.pose[:, None, 6:12], self.pose[:, None, 3:6] - self.pose[:, None, :3]

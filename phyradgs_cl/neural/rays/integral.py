@@ -26,7 +26,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Where in its interval each sample lies, 0 to 1; (R, 1) for one shift a ray or none, (R, samples) for one each."""
+    """Where in its interval each sample lies, 0 to 1; (R, 1) for one shift per ray or none, (R, samples) for one each."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)

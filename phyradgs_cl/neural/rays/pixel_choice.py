@@ -1,4 +1,4 @@
-"""Which pixels a step looks at: scattered over the frame, or in windows too.
+"""Which pixels per step looks at: scattered over the frame, or in windows too.
 
 Windows beside scattered pixels: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024).
 """

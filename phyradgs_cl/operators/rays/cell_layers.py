@@ -1,4 +1,4 @@
-"""The cells of frames in layers of one cell a line, and what a detector that adds photons makes of them, on the host."""
+"""The cells of frames in layers of one cell per line, and what a detector that adds photons makes of them, on the host."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.detector import intensity_average
 
 
 def layers(table: TimeCells) -> list[TimeCells]:
@@ -37,21 +38,12 @@ def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], ave
     ``intensity``: −ln Σ w exp(−p); ``gap``: what Σ w p is more than that. Lines without cells are 0. The twin of what
     cl/rays.cl does where a line's cells are at hand together; weights of a line sum to 1.
     """
-    least = brightest(integrals, weights).astype(np.float64)
-    more, light = np.zeros_like(least), np.zeros_like(least)
-    for p, w in zip(integrals, weights, strict=True):
-        beyond = np.where(w > 0, p - least, 0)
-        more += w * beyond
-        light += w * np.expm1(-beyond)
-    dimmer = np.log1p(np.maximum(light, -0.9999999))
-    return (more + dimmer if average == "gap" else least - dimmer).astype(np.float32)
-
-
-def brightest(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
-    """The least of each pixel's line integrals, taken out of exponentials so that they do not overflow; 0 without cells."""
-    pairs = zip(integrals, weights, strict=True)
-    least = np.minimum.reduce([np.where(w > 0, p, np.float32(np.inf)) for p, w in pairs])
-    return np.where(np.isfinite(least), least, 0)
+    sums = np.sum(weights, axis=0, dtype=np.float64)  # 1 but for float32's rounding, which a small gap would show
+    exact = [np.divide(w, sums, out=np.zeros_like(sums), where=sums > 0) for w in weights]
+    frames, _ = intensity_average(integrals, exact)
+    if average == "gap":
+        frames = np.add.reduce([w * (p - frames) for p, w in zip(integrals, exact, strict=True)])
+    return frames.astype(np.float32)
 
 
 def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:

@@ -1,129 +1,21 @@
-"""Ray-driven projector (Joseph) and its matched adjoint: cells of many frames, one launch an operator.
-
-Memory, tables and launches shared by ``RayProjector`` (one frame) and ``RayOperator`` (a whole scan).
-"""
+"""Launches of the ray-driven projector (Joseph) and its matched adjoint: cells of many frames, one launch per operator."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.acquisition.readout import Readout
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.bricks import Brick, whole
-from phyradgs_cl.operators.splats.layout import projection_matrices
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.runtime import DeviceArray, Runtime
-from phyradgs_cl.runtime.layout import GUARD, pitch_of
+from phyradgs_cl.runtime.layout import GUARD
 
-_RAY_CELL_FLOATS = 16
-BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
-_WIDEST = 16  # cells are read as vectors, which may run past the last one
 # voxels (x, y, z) of one owner where work-items are bricks; kept in local memory, with a border of 1 around
 _BRICK = (32, 32, 8)
 _SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL promises
-_BLOCK = 4  # voxels a side of what a work-group takes where work-items are voxels; as in cl/rays.cl
+_BLOCK = 4  # voxels per side of what a work-group takes where work-items are voxels; as in cl/rays.cl
 _LONG_FROM = 2**31  # floats: where 32-bit indices end
 AVERAGES = ("log", "intensity", "gap")  # gap: log less intensity; in the order of cl/rays.cl
-
-
-@dataclass(frozen=True)
-class RayLayout:
-    """How volumes (z, y, x) and stacks of frames of ``lines`` × ``width`` pixels lie in device memory.
-
-    ``brick``: which voxels of the grid the volume has. A border of zeros around it makes it a volume of its own, so
-    that the frames of all bricks add up to those of the whole.
-    """
-
-    grid: Grid
-    lines: int
-    width: int
-    brick: Brick
-
-    @classmethod
-    def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> RayLayout:
-        """The whole grid, with the readout's lines as rows of the frames."""
-        return cls(grid, *Readout(axis).shape(detector_shape), whole(grid.shape))
-
-    def of(self, brick: Brick) -> RayLayout:
-        """The same frames with another part of the grid."""
-        return replace(self, brick=brick)
-
-    @property
-    def volume_floats(self) -> int:
-        nz, ny, nx = self.brick.shape
-        return 2 * GUARD + (nz + 2 * BORDER) * (ny + 2 * BORDER) * pitch_of(nx)
-
-    def frames_floats(self, count: int) -> int:
-        return 2 * GUARD + count * self.lines * pitch_of(self.width)
-
-    def frames_shape(self, count: int) -> tuple[int, int, int]:
-        return count, self.lines, self.width
-
-    def inside(self, flat: np.ndarray) -> np.ndarray:
-        """The volume (z, y, x) as a view of its padded floats."""
-        nz, ny, nx = self.brick.shape
-        padded = flat[GUARD:-GUARD].reshape(nz + 2 * BORDER, ny + 2 * BORDER, pitch_of(nx))
-        return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
-
-    def pad_volume(self, volume: np.ndarray) -> np.ndarray:
-        flat = np.zeros(self.volume_floats, np.float32)
-        self.inside(flat)[...] = volume
-        return flat
-
-    def unpad_volume(self, flat: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(self.inside(flat))
-
-    def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """The kernels' arguments about shapes: voxels, the first of them, pitch, voxel size, lines, width, pitch."""
-        nz, ny, nx = self.brick.shape
-        dz, dy, dx = self.grid.voxel_size_mm
-        return (
-            np.array([nx, ny, nz, 0], np.int32),
-            np.array([*self.brick.start[::-1], 0], np.int32),
-            np.int32(pitch_of(nx)),
-            np.array([dx, dy, dz, 0], np.float32),
-            np.int32(self.lines),
-            np.int32(self.width),
-            np.int32(pitch_of(self.width)),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class RayCells:
-    """The time cells of many frames on the device, frame after frame, as cl/rays.cl describes them."""
-
-    cells: DeviceArray
-    cell_lines: DeviceArray
-    line_cells: DeviceArray
-    matrices: DeviceArray
-    matrix_stride: int
-    frame_cells: DeviceArray
-
-    @classmethod
-    def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> RayCells:
-        counts = np.array([table.count for table in tables])
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
-        weight = np.concatenate([table.weight for table in tables])
-        ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
-        served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
-        stride = int(starts[-1]) + _WIDEST
-        matrices = np.zeros((12, stride))
-        matrices[:, : starts[-1]] = voxel_matrices(pose, grid).T
-        cell_lines = np.zeros((stride, 2), np.int32)
-        cell_lines[: starts[-1]] = np.concatenate(ranges)
-        return cls(
-            cells=rt.upload(ray_constants(pose, weight, grid)),
-            cell_lines=rt.upload(cell_lines),
-            line_cells=rt.upload(np.stack(served), np.int32),
-            matrices=rt.upload(matrices, np.float32),
-            matrix_stride=stride,
-            frame_cells=rt.upload(starts, np.int32),
-        )
 
 
 def launch_forward(
@@ -213,25 +105,3 @@ def _defines(rt: Runtime, layout: RayLayout) -> dict[str, int]:
         "RAY_VOXEL_ITEMS": int(rt.pixel_items),
         "RAY_LONG": int(layout.volume_floats >= _LONG_FROM),
     }
-
-
-def ray_constants(pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:
-    """Poses (C, 12) in voxel indices: the (C, 16) float32 table that cl/common/ray.h describes."""
-    first = np.array(grid.first_centre_mm[::-1])
-    pitch = np.array(grid.voxel_size_mm[::-1])
-    constants = np.zeros((len(pose), _RAY_CELL_FLOATS))
-    constants[:, 0:3] = (pose[:, 0:3] - first) / pitch
-    constants[:, 3:6] = (pose[:, 3:6] - pose[:, 0:3]) / pitch
-    constants[:, 6:9] = pose[:, 6:9] / pitch
-    constants[:, 9:12] = pose[:, 9:12] / pitch
-    constants[:, 12] = weight
-    return constants.astype(np.float32)
-
-
-def voxel_matrices(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """Rows (C, 12) that turn a voxel index (x, y, z) into (u·z, v·z, z)."""
-    matrix = projection_matrices(pose).reshape(-1, 3, 4)
-    first = np.array(grid.first_centre_mm[::-1])
-    pitch = np.array(grid.voxel_size_mm[::-1])
-    shift = np.einsum("cij,j->ci", matrix[:, :, :3], first) + matrix[:, :, 3]
-    return np.concatenate([matrix[:, :, :3] * pitch, shift[:, :, None]], -1).reshape(-1, 12)

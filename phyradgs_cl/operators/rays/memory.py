@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from phyradgs_cl.fields import triple
 from phyradgs_cl.operators.bricks import Brick, cut, whole
-from phyradgs_cl.operators.rays.launches import RayLayout, owner_steps
+from phyradgs_cl.operators.rays.launches import owner_steps
+from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
@@ -55,7 +57,7 @@ class RayMemory:
             return [everything], batch(room.free_bytes - volume_bytes - self._columns_bytes)
         self._columns_bytes = 0
         steps = owner_steps(self.rt)
-        smallest = tuple(
+        smallest = triple(
             min(n, step) for n, step in zip(layout.grid.shape, (*steps, layout.grid.shape[2]), strict=True)
         )
         beside = room.free_bytes - 4 * layout.of(whole(smallest)).volume_floats

@@ -12,7 +12,8 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import averaged, layered
-from phyradgs_cl.operators.rays.launches import RayCells, RayLayout, launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.upright import launch_upright, upright_block
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
@@ -22,8 +23,11 @@ from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 class LinearOperator(Interface):
     """What the iterative methods need to know of a scanner: A, Aᵀ, and A restricted to some frames."""
 
-    volume_shape: tuple[int, int, int]
-    frames_shape: tuple[int, int, int]
+    @property
+    def volume_shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]: ...
 
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""

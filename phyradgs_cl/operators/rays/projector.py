@@ -9,7 +9,8 @@ import numpy as np
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.launches import RayCells, RayLayout, launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 class RayProjector:
     """Line integrals of a voxel grid, weighted over a frame's cells: the merged frame, in one launch.
 
-    Joseph's method: one bilinear sample a plane of each ray's own main axis; voxels outside are zero.
+    Joseph's method: one bilinear sample per plane of each ray's own main axis; voxels outside are zero.
     """
 
     def __init__(self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str = "rows") -> None:
@@ -60,7 +61,7 @@ class RayProjector:
         self._check(table)
         if isinstance(volume, np.ndarray):
             operator = RayOperator(self.rt, self.grid, self._detector_shape, [table], memory=self._memory)
-            return operator.project(volume, detector_model)[0]
+            return operator.project(volume, detector_model).squeeze(0)
         cells = RayCells.upload(self.rt, self.grid, [table])
         launch_forward(self.rt, self._layout, cells, self._only, volume, self._image, average=detector_model)
         image = unpad_rows(self.rt.download(self._image), self._layout.frames_shape(1))[0]

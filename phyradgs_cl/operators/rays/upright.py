@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.launches import BORDER, RayCells, RayLayout, ray_constants
+from phyradgs_cl.operators.rays.layout import BORDER, RayCells, RayLayout, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
@@ -45,7 +45,8 @@ def upright_block(grid: Grid, tables: Sequence[TimeCells], width: int, lanes: in
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
     """(C,) the least length of d00 + u eu for u in [0, width − 1]; all (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
-    return np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1)
+    length: np.ndarray = np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1)
+    return length
 
 
 def columns_floats(grid: Grid) -> int:

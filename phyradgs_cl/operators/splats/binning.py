@@ -1,4 +1,4 @@
-"""Lists of splats a tile, by a stable counting sort on the device."""
+"""Lists of splats per tile, by a stable counting sort on the device."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class TileLists:
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
-            raise MemoryShortage("lists of splats a tile", found, expected, remedy)
+            raise MemoryShortage("lists of splats per tile", found, expected, remedy)
         if needed > self.entries.size:
             self.entries = rt.empty(1, np.int32)
             self.entries = rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)

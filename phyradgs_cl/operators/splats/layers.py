@@ -1,4 +1,4 @@
-"""The cells of a frame in layers, one cell a line and layer, and the intensity model that merges them.
+"""The cells of a frame in layers, one cell per line and layer, and the intensity model that merges them.
 
 A detector adds photons: the merged frame is −ln Σ w_k exp(−p_k) over the cells k of a line. Projectors draw w_k p_k into
 the k-th layer; merging also keeps the derivative by every layer, which is what the adjoint needs.

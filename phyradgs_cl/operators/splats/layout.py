@@ -55,7 +55,7 @@ class DeviceCells:
     """The time cells of one frame on the device; lines are always the slow axis of the image.
 
     A frame read out along columns is handled as its transpose: only the poses' pixel steps change places.
-    With motion, ``matrices`` has three poses a cell, middle and both ends, and ``line_times`` (C, 3, time_pitch) when
+    With motion, ``matrices`` has three poses per cell, middle and both ends, and ``line_times`` (C, 3, time_pitch) when
     every line integrates (TimeCells.line_times); without, it is a dummy. For the intensity model cells are spread over
     ``layers`` images in which no line has two; ``layer_weights`` (layers, lines) are their shares of a line's window.
     """

@@ -22,7 +22,7 @@ def backprojection(frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, gri
 def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
 ) -> np.ndarray:
-    """The same with one pose a line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
+    """The same with one pose per line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
     power = 2 if axis == "columns" else 1
     if axis == "columns":
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
@@ -63,7 +63,7 @@ def _seen(frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray
         float(np.interp(u[r], np.arange(frame.shape[1]), frame[r], 0, 0)) for r in (line, line + 1)
     )
     middle = (1 - t) * depth[line] + t * depth[line + 1]
-    return ((1 - t) * here + t * there) / (middle**2 * speed**power)
+    return float(((1 - t) * here + t * there) / (middle**2 * speed**power))
 
 
 def _on(position: np.ndarray, count: int) -> np.ndarray:
@@ -71,4 +71,5 @@ def _on(position: np.ndarray, count: int) -> np.ndarray:
 
 
 def _bilinear(frame: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return map_coordinates(frame, [v, u], order=1, mode="nearest")
+    values: np.ndarray = map_coordinates(frame, [v, u], order=1, mode="nearest")
+    return values

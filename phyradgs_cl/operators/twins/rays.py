@@ -98,9 +98,9 @@ def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
 
 
 def _rays(
-    grid: Grid, pose: np.ndarray, detector_shape: tuple[int, ...], wanted: np.ndarray
+    grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], wanted: np.ndarray
 ) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
-    """(pixel, sample points (n, 3) as voxel indices x y z, length of ray a sample in mm) of the wanted pixels."""
+    """(pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) of the wanted pixels."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     source = (pose[:3] - first) / pitch
     to_pixel = (pixel_centres(pose, detector_shape) - pose[:3]) / pitch

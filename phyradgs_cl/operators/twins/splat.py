@@ -17,7 +17,8 @@ from phyradgs_cl.acquisition.geometry import pixel_centres
 def precision_matrices(rows: np.ndarray) -> np.ndarray:
     """Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
     turn = Rotation.from_quat(rows[[7, 8, 9, 6]].T).as_matrix()
-    return np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn)
+    matrices: np.ndarray = np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn)
+    return matrices
 
 
 def splat_image(
@@ -51,7 +52,7 @@ def _exact(
     b = np.einsum("vui,ij,j->vu", to_pixel, precision, centre)
     q = kappa - b**2 / a
     length = np.linalg.norm(to_pixel, axis=-1)
-    value = row[10] * np.sqrt(2 * np.pi / a) * length * np.exp(-q / 2)
+    value: np.ndarray = row[10] * np.sqrt(2 * np.pi / a) * length * np.exp(-q / 2)
     if cutoff_sigma > 0:
         depth = centre @ normal
         reach = cutoff_sigma * np.sqrt(normal @ np.linalg.inv(precision) @ normal)

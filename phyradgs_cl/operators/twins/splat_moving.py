@@ -43,6 +43,7 @@ def moving_frame(
 
     ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept.
     """
+    assert table.end_poses is not None and table.line_times is not None
     by_column = table.axis == "columns"
     shape = detector_shape[::-1] if by_column else detector_shape
     turn = transpose_pose if by_column else np.asarray
@@ -115,7 +116,8 @@ def _segment_image(
 def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray) -> np.ndarray:
     """q (lines, width) when the centre has moved for times ``at`` (lines, 1 or width)."""
     moved = delta - at[..., None] * s.path
-    return np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q
+    q: np.ndarray = np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q
+    return q
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ _BLOCK_BYTES = 1 << 26  # rows that are filtered at one time
 class FdkOptions:
     """``window`` is the ramp filter's (see ``WINDOWS``).
 
-    ``motion``: static (one pose a frame, mid-window), static-start (the frame's first pose) or per-row (every line
+    ``motion``: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line
     at the middle of its own exposure). Of a model with more poses it takes a line's middle one.
     """
 

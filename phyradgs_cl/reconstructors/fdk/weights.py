@@ -35,7 +35,7 @@ def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Vectors (..., v, u, 3) mm from source to pixels of the given rows (v,) and columns (u,).
 
-    pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one a row (v, 1, 12), one a column (1, u, 12).
+    pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one per row (v, 1, 12), one per column (1, u, 12).
     """
     corner = pose[..., 3:6] - pose[..., 0:3]
     return corner + columns[:, None] * pose[..., 6:9] + rows[:, None, None] * pose[..., 9:12]

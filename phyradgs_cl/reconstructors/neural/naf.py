@@ -11,7 +11,7 @@ from phyradgs_cl.reconstructors.neural.run import reconstruct_neural
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.runtime import Runtime
 
-# Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels a side
+# Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels per side
 NAF_PUBLISHED = NeuralOptions(
     iterations=1500,
     rays=1024,

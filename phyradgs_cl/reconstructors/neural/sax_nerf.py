@@ -14,7 +14,7 @@ from phyradgs_cl.runtime import Runtime
 
 # The released configuration Lineformer/chest_50: that of NAF, with 256 samples for 128 voxels
 SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
-# Windows do not change the expected gradient of a squared error, and of few pixels a step they leave it to noise
+# Windows do not change the expected gradient of a squared error, and of few pixels per step they leave it to noise
 SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
 
 

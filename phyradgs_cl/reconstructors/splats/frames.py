@@ -79,7 +79,7 @@ def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], b
 
 
 def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Masks that are 1 where a pixel counts: one for all frames, or one a frame."""
+    """Masks that are 1 where a pixel counts: one for all frames, or one per frame."""
     if scan.pixel_mask is None:
         masks = [np.ones(scan.geometry.detector_shape, np.float32)]
     else:

@@ -121,7 +121,7 @@ _PAPER = SplatOptions(
     control=PUBLISHED_CONTROL,
 )
 _RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
-# a sixth of the iterations with everything at the same share of them, and two or three segments a frame
+# a sixth of the iterations with everything at the same share of them, and two or three segments per frame
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02),
     iterations=500,

@@ -18,5 +18,5 @@ def phyradgs(
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
 ) -> Reconstruction:
-    """Reconstructs a scan with M×N micro-views a frame; ``options.motion`` static is the paper's "w/o ST"."""
+    """Reconstructs a scan with M×N micro-views per frame; ``options.motion`` static is the paper's "w/o ST"."""
     return reconstruct_splats(scan, options, rt, seed, report, "phyradgs", resume)

@@ -62,7 +62,7 @@ class SharedFrames:
 
     def loss(self, step: FrameStep) -> float:
         losses = self._losses.copy()
-        self.ranks.add(losses)
+        self.ranks.allreduce_sum(losses)
         return float(losses.mean())
 
 

@@ -1,1 +1,1 @@
-"""Methods that fit voxels, a file each, around one system of operators."""
+"""Methods that fit voxels, one file each, around one system of operators."""

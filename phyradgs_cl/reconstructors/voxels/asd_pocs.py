@@ -28,7 +28,7 @@ from phyradgs_cl.runtime import Runtime
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """tv_steps: TV steps an iteration. tv_share: α, length of a TV step over the first SART pass's change.
+    """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the first SART pass's change.
 
     tv_reduction: factor of that length when TV moves more than ``tv_ratio`` (r_max) of what the data moved while the
     residual is above ε. residual_share: ε over the residual of FDK's volume.

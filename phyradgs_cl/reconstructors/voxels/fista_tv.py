@@ -30,8 +30,8 @@ from phyradgs_cl.runtime import Runtime
 class FistaTvOptions(IterativeOptions):
     """tv_weight: λ as a share of the largest value of Aᵀp, so that units and doses do not matter.
 
-    tv_iterations: dual iterations a proximal map; it goes on from the last one's dual. transmission_weights: pixels
-    count by their light, ½ Σ t (p − A x)², and λ is a share of the largest value of Aᵀ t p.
+    tv_iterations: dual iterations per proximal map; it goes on from the last one's dual. transmission_weights: least
+    squares weighted by transmission (PWLS), ½ Σ t (p − A x)², and λ is a share of the largest value of Aᵀ t p.
     """
 
     iterations: int = 100

@@ -1,19 +1,22 @@
-"""The frames of a scan's operator shared out over ranks: each projects its own; frames are joined, volumes summed.
+"""The frames of a scan's operator shared out over ranks: each projects its own; frames are gathered, volumes summed.
 
 Volumes and frames are whole on every rank, so that the methods around an operator need not know of the others: they do the
-same everywhere. Sums of volumes do not depend on their order, but on how many frames a rank adds up by itself.
+same everywhere. Sums of volumes do not depend on their order, but on how many frames per rank adds up by itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Protocol as Interface
+from typing import TypeVar
 
 import numpy as np
 
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator
 from phyradgs_cl.parallel import Communicator, exact_sum, span
+
+S = TypeVar("S", bound="SharedOperator")
 
 
 class SharedOperator:
@@ -28,7 +31,7 @@ class SharedOperator:
 
     def forward(self, volume: np.ndarray) -> np.ndarray:
         """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
-        return self._joined(None if self._part is None else self._part.forward(volume))
+        return self._gathered(None if self._part is None else self._part.forward(volume))
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
         """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
@@ -36,13 +39,13 @@ class SharedOperator:
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
 
-    def subset(self, frames: Sequence[int]) -> SharedOperator:
+    def subset(self: S, frames: Sequence[int]) -> S:
         """The same of some of the frames, in this order, shared out anew."""
         return type(self)(self.ranks, self.whole.subset(frames))
 
-    def _joined(self, part: np.ndarray | None) -> np.ndarray:
+    def _gathered(self, part: np.ndarray | None) -> np.ndarray:
         none = np.zeros((0, *self.frames_shape[1:]), np.float32)
-        return self.ranks.join(none if part is None else part)
+        return self.ranks.allgather(none if part is None else part)
 
 
 class Intensity(Interface):
@@ -67,4 +70,4 @@ class SharedIntensity(SharedOperator):
 
     def expected(self, volume: np.ndarray) -> np.ndarray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
-        return self._joined(None if self._part is None else self._part.expected(volume))
+        return self._gathered(None if self._part is None else self._part.expected(volume))

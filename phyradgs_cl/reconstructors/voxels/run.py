@@ -90,7 +90,7 @@ def run_iterations(
     started = time.perf_counter()
     system = System.of_scan(rt, scan, options.motion, options.detector_model)
     if options.transmission_weights:
-        system = system.trusting_light()
+        system = system.transmission_weighted()
     run = _Iterations(make(system), options, scan.grid, norm(system.measured) or 1.0)
     loop = Loop(run, rt.ranks, report, started)
     loop.run(resume)

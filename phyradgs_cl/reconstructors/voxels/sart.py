@@ -28,11 +28,11 @@ _WEIGHT_CACHE_BYTES = 1 << 29
 
 @dataclass(frozen=True)
 class SartOptions(IterativeOptions):
-    """relaxation: λ, the share of each correction that is taken; relaxation_reduction: its factor an iteration.
+    """relaxation: λ, the share of each correction that is taken; relaxation_reduction: its factor per iteration.
 
     frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
     (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
-    transmission_weights: rays count by the light that came through, W = t/(A 1) and V = 1/(Aᵀ t).
+    transmission_weights: transmission-weighted (PWLS), W = t/(A 1) and V = 1/(Aᵀ t).
     """
 
     relaxation: float = 1.0
@@ -74,7 +74,7 @@ def os_sart(
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
 ) -> Reconstruction:
-    """The same with several frames a correction."""
+    """The same with several frames per correction."""
     return run_iterations("os-sart", lambda s: Sart(s, options, seed), scan, options, rt, report, resume)
 
 

@@ -22,7 +22,7 @@ from phyradgs_cl.runtime import Runtime
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """relaxation: λ between 0 and 2. transmission_weights: rays count by their light, R = t/(A 1), C = 1/(Aᵀ t)."""
+    """relaxation: λ between 0 and 2. transmission_weights: transmission-weighted (PWLS), R = t/(A 1), C = 1/(Aᵀ t)."""
 
     iterations: int = 100
     relaxation: float = 1.0

@@ -24,14 +24,14 @@ class System:
     Pixels that are not valid are 0 in ``measured`` and in every residual, as if their rows were not in A.
     ``intensity`` is there where the detector adds photons: the measurement is then compared with I(x) instead of A x,
     and what comes back goes through Jᵀ, the derivative of I at the volume of the last comparison, instead of Aᵀ.
-    ``light`` (F, rows, columns) weighs pixels by their transmission, mean 1; None: all alike.
+    ``transmission`` (F, rows, columns) weighs pixels by their transmission, mean 1; None: all alike.
     """
 
     operator: LinearOperator
     measured: np.ndarray
     valid: np.ndarray | None = None
     intensity: Intensity | None = None
-    light: np.ndarray | None = None
+    transmission: np.ndarray | None = None
 
     @classmethod
     def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> System:
@@ -42,10 +42,10 @@ class System:
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: Intensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # of one value both are the mean
-            intensity = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+            every = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+            intensity = SharedIntensity(rt.ranks, every) if rt.ranks.size > 1 else every
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
-            intensity = None if intensity is None else SharedIntensity(rt.ranks, intensity)
         if scan.pixel_mask is None:
             return cls(operator, measured, None, intensity)
         valid = np.broadcast_to(scan.pixel_mask == 0, measured.shape)
@@ -93,24 +93,24 @@ class System:
         return self.forward(np.ones(self.operator.volume_shape, np.float32))
 
     def column_sums(self) -> np.ndarray:
-        """Aᵀ 1 in mm over the pixels that count, or Aᵀ t with their light."""
+        """Aᵀ 1 in mm over the pixels that count, or Aᵀ t with transmission weights."""
         return self.operator.adjoint(self.masked(self.weighed(np.ones(self.measured.shape, np.float32))))
 
     def weighed(self, frames: np.ndarray) -> np.ndarray:
-        """Frames times the light of their pixels."""
-        return frames if self.light is None else frames * self.light
+        """Frames times their transmission weights, where there are any."""
+        return frames if self.transmission is None else frames * self.transmission
 
-    def trusting_light(self) -> System:
-        """The same system with pixels that count by their transmission."""
-        return replace(self, light=transmission_weights(self.measured, self.valid))
+    def transmission_weighted(self) -> System:
+        """The same system, its pixels weighted by their transmission (PWLS)."""
+        return replace(self, transmission=transmission_weights(self.measured, self.valid))
 
     def subset(self, frames: Sequence[int]) -> System:
         """The system of some frames."""
         chosen = list(frames)
         valid = None if self.valid is None else self.valid[chosen]
         intensity = None if self.intensity is None else self.intensity.subset(chosen)
-        light = None if self.light is None else self.light[chosen]
-        return System(self.operator.subset(chosen), self.measured[chosen], valid, intensity, light)
+        transmission = None if self.transmission is None else self.transmission[chosen]
+        return System(self.operator.subset(chosen), self.measured[chosen], valid, intensity, transmission)
 
 
 def norm(values: np.ndarray) -> float:
@@ -133,7 +133,7 @@ def reciprocal(sums: np.ndarray, share: float = 1e-6) -> np.ndarray:
 
 
 def row_weights(system: System) -> np.ndarray:
-    """1/(A 1) of every ray, 1/mm, no more than that of a ray through a tenth of the longest path; times its light.
+    """1/(A 1) of every ray, 1/mm, at most that of a ray through a tenth of the longest path; times its transmission weight.
 
     A ray that only grazes an edge of the volume would else put its whole noise on a voxel or two, and bright corners
     are what one sees of it. TIGRE measures the paths in a box that is a tenth larger, to the same end.

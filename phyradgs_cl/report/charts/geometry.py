@@ -113,7 +113,7 @@ def side_drawing(scan: Scan) -> Markup:
 
     source, low, high = seen(pose[:3]), seen(corners[[0, 2]].mean(0)), seen(corners[[1, 3]].mean(0))
     box = seen(_box_corners(scan))
-    left, bottom, right, top = *box.min(0), *box.max(0)
+    (left, bottom), (right, top) = box.min(0), box.max(0)
     outline = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     plan = Plan.around(source[None], low[None], high[None], outline)
     axis = np.array([[0, bottom - 0.1 * (top - bottom)], [0, top + 0.1 * (top - bottom)]])

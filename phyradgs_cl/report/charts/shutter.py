@@ -82,7 +82,7 @@ def _windows(axes: Axes, scan: Scan, start_s: float) -> list[Markup]:
 
 
 def _sampling(axes: Axes, scan: Scan, motion: Motion) -> list[Markup]:
-    """When the run took its poses: a line for one a frame, edges of segments, or dots on lines."""
+    """When the run took its poses: a line for one per frame, edges of segments, or dots on lines."""
     bottom, top = axes.y
     if isinstance(motion, MicroViews | PerRow | LineMiddles) and scan.is_fly:
         return [axes.dot(time_s, line, "sample") for time_s, line in _sample_times(scan, motion)]

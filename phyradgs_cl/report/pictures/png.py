@@ -46,7 +46,7 @@ def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np
     return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
 
-def upright(image: NDArray[np.generic]) -> NDArray[np.generic]:
+def top_row_first(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """An image (rows, columns) whose row 0 is the lowest, as a picture, whose row 0 is the top."""
     return np.ascontiguousarray(image[::-1])
 

@@ -16,7 +16,7 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import check_writable, partial_path, written_beside
 from phyradgs_cl.reconstructors import Progress, ProgressReport
-from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, upright
+from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, top_row_first
 
 _GAP = 4  # pixels between slices
 _SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
@@ -94,7 +94,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
     for axis in range(3):
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
-        slices.append(upright(_resampled(image, [max(1, round(side * per_mm)) for side in size_mm])))
+        slices.append(top_row_first(_resampled(image, [max(1, round(side * per_mm)) for side in size_mm])))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] for s in slices) + 2 * _GAP
     picture = np.zeros((height, width), np.uint8)
     left = 0

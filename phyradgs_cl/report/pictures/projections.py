@@ -13,7 +13,7 @@ from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
 
-TIMES_A_LINE = 16  # a line's exposure is sampled so often; what that leaves is far below noise
+TIMES_PER_LINE = 16  # a line's exposure is sampled so often; what that leaves is far below noise
 Image = NDArray[np.float32]
 
 
@@ -56,7 +56,7 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
     if run.scan is None or count < 1:
         return []
     scan, chosen = prepared(run.scan, run.before), chosen_frames(run.scan.frames, count)
-    motion = PerRow(sub_intervals=TIMES_A_LINE)
+    motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in chosen]
     operator = RayOperator(rt, run.stored.grid, scan.geometry.detector_shape, tables)
     computed = operator.forward(run.stored.volume)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, upright
+from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, top_row_first
 from phyradgs_cl.report.pictures.preview import grey_range
 
 LONGEST_EDGE = 192  # pixels of a slice in the page
@@ -45,7 +45,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one an index.
+    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one per index.
 
     first_mm, step_mm: centre of slice 0 and the way to the next. size_mm: (width, height) of a slice. still: the result's
     middle slice as it is seen without a script, a PNG.
@@ -69,7 +69,7 @@ class Plane:
 
 
 def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
-    """A window a layer; the truth's range serves both where there is one, so that a wrong gain shows."""
+    """A window per layer; the truth's range serves both where there is one, so that a wrong gain shows."""
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
@@ -110,7 +110,7 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
 
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
     """A slice as a grey PNG, black ``low`` and white ``high``."""
-    return png_bytes(upright(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
+    return png_bytes(top_row_first(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
 
 
 def _base64(png: bytes) -> str:

@@ -186,8 +186,8 @@ def _product(table: Table, where: str) -> Iterator[dict[str, Any]]:
             raise InputError(f"{where}: {name}", "an empty list", "the values to try")
     if (count := math.prod(map(len, axes.values()))) > MOST_RUNS:
         raise InputError(where, f"{count} combinations", f"at most {MOST_RUNS}")
-    for values in itertools.product(*axes.values()):
-        yield dict(zip(axes, values, strict=True))
+    for chosen in itertools.product(*axes.values()):
+        yield dict(zip(axes, chosen, strict=True))
 
 
 def _setting(values: dict[str, Any], where: str) -> Setting:

@@ -1,4 +1,4 @@
-"""A sweep's results as tables: a line a setting in Markdown, a line a run in CSV."""
+"""A sweep's results as tables: one line per setting in Markdown, one line per run in CSV."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _failures(failed: Sequence[Line]) -> Iterator[str]:
 
 
 def comma_separated(lines: Sequence[Line]) -> str:
-    """A record a run; a column for every option that any run states."""
+    """A record per run; a column for every option that any run states."""
     stated = [dict(flat({**line["input"], **line["changes"]})) for line in lines]
     names = list(dict.fromkeys(name for options in stated for name in options))
     stream = io.StringIO()

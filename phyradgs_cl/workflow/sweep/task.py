@@ -73,7 +73,7 @@ def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) ->
         line = {
             **run.facts,
             "metrics": {name: _number(value) for name, value in metrics.items()},
-            "seconds": round(float(result.facts["seconds"]), 3),  # type: ignore[arg-type]
+            "seconds": round(float(result.facts["seconds"]), 3),
             "total_s": round(time.perf_counter() - started, 3),
             "gaussians": result.facts.get("gaussians"),
             **environment(rt),

@@ -106,5 +106,5 @@ def limit(what: str, to: int) -> None:
 
 
 if __name__ == "__main__":
-    file, *numbers, last = sys.argv[1:]
-    sys.exit(look(file, *map(int, numbers), float(last)))
+    file, small, most, memory, cpu, last = sys.argv[1:]
+    sys.exit(look(file, int(small), int(most), int(memory), int(cpu), float(last)))

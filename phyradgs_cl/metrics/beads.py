@@ -1,4 +1,4 @@
-"""Balls of known place and size in a volume: what the shape metrics are measured on."""
+"""Beads of known place and size in a volume: what the shape metrics are measured on."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from phyradgs_cl.fields import Grid
 
 Array = NDArray[np.float64]
 
-# Balls are looked at out to this multiple of their radius: enough surroundings to know the level outside.
+# Beads are looked at out to this multiple of their radius: enough surroundings to know the level outside.
 REACH = 1.75
-# Below this radius a ball is a handful of voxels: its shape is the voxels' own.
+# Below this radius a bead is a handful of voxels: its shape is the voxels' own.
 SMALLEST_RADIUS_VOXELS = 2.5
 
 
 @dataclass(frozen=True)
-class Ball:
-    """A homogeneous ball in homogeneous surroundings (out to ``REACH`` radii).
+class Bead:
+    """A homogeneous bead in homogeneous surroundings (out to ``REACH`` radii).
 
     Args:
         centre_mm: (x, y, z).
@@ -35,22 +35,22 @@ class Ball:
     radius_mm: float
 
     def __post_init__(self) -> None:
-        shape("ball centre", self.centre_mm, (3,))
-        finite("ball centre", self.centre_mm)
-        positive("ball radius", self.radius_mm)
+        shape("bead centre", self.centre_mm, (3,))
+        finite("bead centre", self.centre_mm)
+        positive("bead radius", self.radius_mm)
 
 
-def resolved(balls: Sequence[Ball], grid: Grid) -> list[Ball]:
-    """The balls that are large enough on ``grid`` to have a shape, and lie in it with their surroundings."""
+def resolved(beads: Sequence[Bead], grid: Grid) -> list[Bead]:
+    """The beads that are large enough on ``grid`` to have a shape, and lie in it with their surroundings."""
     least_mm = SMALLEST_RADIUS_VOXELS * max(grid.voxel_size_mm)
-    return [ball for ball in balls if ball.radius_mm >= least_mm and _is_inside(ball, grid)]
+    return [bead for bead in beads if bead.radius_mm >= least_mm and _is_inside(bead, grid)]
 
 
-def surroundings(volume: NDArray[np.floating], grid: Grid, ball: Ball) -> tuple[Array, Array]:
-    """Distances (n,) in mm from the ball's centre and values (n,) of all voxels within ``REACH`` radii."""
-    reach_mm = REACH * ball.radius_mm
+def surroundings(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> tuple[Array, Array]:
+    """Distances (n,) in mm from the bead's centre and values (n,) of all voxels within ``REACH`` radii."""
+    reach_mm = REACH * bead.radius_mm
     picks, offsets = [], []
-    for axis_mm, centre_mm in zip(grid.axes_mm(), ball.centre_mm[::-1], strict=True):
+    for axis_mm, centre_mm in zip(grid.axes_mm(), bead.centre_mm[::-1], strict=True):
         pick = np.flatnonzero(np.abs(axis_mm - centre_mm) <= reach_mm)
         picks.append(pick)
         offsets.append(axis_mm[pick] - centre_mm)
@@ -70,7 +70,7 @@ def levels(distance_mm: Array, values: Array, radius_mm: float) -> tuple[float, 
     return float(np.median(inside)), float(np.median(outside))
 
 
-def _is_inside(ball: Ball, grid: Grid) -> bool:
-    reach_mm = REACH * ball.radius_mm
-    sides = zip(grid.offset_mm, grid.size_mm, ball.centre_mm[::-1], strict=True)
+def _is_inside(bead: Bead, grid: Grid) -> bool:
+    reach_mm = REACH * bead.radius_mm
+    sides = zip(grid.offset_mm, grid.size_mm, bead.centre_mm[::-1], strict=True)
     return all(abs(centre - offset) + reach_mm <= side / 2 for offset, side, centre in sides)

@@ -1,7 +1,7 @@
-"""Why the balls of the sphere phantom come out too dense from fly-scans: one thing changed at a time.
+"""Why the beads of the sphere phantom come out too dense from fly-scans: one thing changed at a time.
 
 The scans are those of `phyradgs bench phantom`, and for comparison free of noise and jitter, and with line integrals
-averaged over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the balls
+averaged over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the beads
 over the true one, less 1; that of the total is of the whole volume.
 """
 
@@ -40,7 +40,7 @@ TRIALS = (
     Trial("intensity not modelled", changes={"detector_model": "log"}),
     Trial(CLEAN, CLEAN),
     Trial(LINEAR, LINEAR),
-    Trial("the same, 15 times a line", LINEAR, changes={"sub_intervals": 15}),
+    Trial("the same, 15 times per line", LINEAR, changes={"sub_intervals": 15}),
     Trial("the same, 500 iterations", LINEAR, changes={"iterations": 500}),
     Trial("the same, a tenth of the TV weight", LINEAR, changes={"tv_weight": 1e-4}),
     Trial("the same, ten times the TV weight", LINEAR, changes={"tv_weight": 1e-2}),
@@ -71,7 +71,7 @@ def run(rt: Runtime, case: PhantomCase, scan: Scan, trial: Trial) -> dict[str, f
 
 
 def table(lines: list[dict]) -> str:
-    text = ["| data and changes | method | PSNR (dB) | bias of balls (%) | of the total (%) | rise (mm) |"]
+    text = ["| data and changes | method | PSNR (dB) | bias of beads (%) | of the total (%) | rise (mm) |"]
     text.append("| --- " * 6 + "|")
     for line in lines:
         biases = f"{100 * line['bias_balls']:+.1f} | {100 * line['bias_total']:+.2f}"
