@@ -1,5 +1,6 @@
 # make demo    simulate a fly-scan, reconstruct it three ways, print a table (minutes on two cores)
-# make test    style, tests on a CPU device; a skipped kernel test is a failure
+# make test    style, types, every kernel, a bit of everything else: minutes; a skipped kernel test is a failure
+# make test-all   the same and then all other tests: a quarter of an hour
 # make docs     the documentation as a site, in site/
 # make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
 # make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
@@ -23,7 +24,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test docs stress coverage mutants test-browser test-cluster test-intel test-mpi test-neural test-oclgrind clean
+.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-intel test-mpi test-neural test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -58,10 +59,22 @@ demo: $(VENV)/.installed-cpu
 		"phyradgs, static=$(OUT)/static.h5" "phyradgs=$(OUT)/phyradgs.h5"
 	@echo "pictures: $(OUT)/slices.png and one beside each volume"
 
+# $(call tested,FOLDER,WORDS): pytest with these words in the environment of that folder; a skipped kernel test is a failure.
+define tested
+	$(1)/bin/python -m pytest $(2) --junit-xml=$(1)/junit.xml
+	@$(1)/bin/python .ci/no_skips.py $(1)/junit.xml
+endef
+
+# A process per core; the tests of a file stay in one process and so share what they have made.
+PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
+
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
-	$(BIN)/python -m pytest --junit-xml=$(VENV)/junit.xml
-	@$(BIN)/python .ci/no_skips.py $(VENV)/junit.xml
+	$(BIN)/mypy phyradgs_cl cli.py
+	$(call tested,$(VENV),-m quick $(PARALLEL))
+
+test-all: test
+	$(call tested,$(VENV),-m "not quick" $(PARALLEL))
 
 docs: $(VENV)/.installed-test
 	$(BIN)/python docs/make_reference.py
@@ -92,12 +105,6 @@ $(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
 	$(VENV)-$*/bin/python -m pip install --quiet --editable ".[$(EXTRAS_$*)]" $(PACKAGES_$*)
 	@touch $@
 
-# $(call tested,ENVIRONMENT,TESTS): runs them there; a skipped kernel test is a failure.
-define tested
-	$(VENV)-$(1)/bin/python -m pytest $(2) --junit-xml=$(VENV)-$(1)/junit.xml
-	@$(VENV)-$(1)/bin/python .ci/no_skips.py $(VENV)-$(1)/junit.xml
-endef
-
 # The tests of all rooms run, those in processes of their own and under mpiexec too.
 coverage: $(VENV)-coverage/.installed
 	$(VENV)-coverage/bin/python -m coverage erase
@@ -117,20 +124,20 @@ test-intel: export OCL_ICD_VENDORS = $(abspath $(VENV)-intel/vendors)
 test-intel: export LD_LIBRARY_PATH = $(abspath $(VENV)-intel/lib)
 test-intel: export PHYRADGS_DEVICE = Intel(R) OpenCL
 test-intel: $(VENV)-intel/vendors/intel.icd
-	$(call tested,intel)
+	$(call tested,$(VENV)-intel)
 
 test-neural: $(VENV)-neural/.installed
-	$(call tested,neural,tests/neural)
+	$(call tested,$(VENV)-neural,tests/neural)
 
 test-browser: export PHYRADGS_PICTURES = $(abspath $(VENV)-browser/pictures)
 test-browser: $(VENV)-browser/.installed
-	$(call tested,browser,tests/report/browser_page.py)
+	$(call tested,$(VENV)-browser,tests/report/browser_page.py)
 
 test-cluster: $(VENV)-cluster/.installed
-	$(call tested,cluster,tests/cluster)
+	$(call tested,$(VENV)-cluster,tests/cluster)
 
 test-mpi: $(VENV)-mpi/.installed
-	$(call tested,mpi,tests/parallel)
+	$(call tested,$(VENV)-mpi,tests/parallel)
 
 test-oclgrind: $(VENV)-oclgrind/.installed
 	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py

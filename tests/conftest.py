@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,11 +16,31 @@ import pytest
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent / "benchmarks")]
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thread of PoCL's, as what it starts has
+    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
+
+from quick import is_quick  # noqa: E402
+
+from phyradgs_cl.__main__ import load_cli  # noqa: E402
 from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
 from phyradgs_cl.acquisition.cells import TimeCells  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 Cloud = Callable[..., np.ndarray]
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if is_quick(item.nodeid.partition("tests/")[2]):
+            item.add_marker("quick")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    """Workers send what a test has printed as UTF-8, which not every name of a file is."""
+    report = yield
+    report.sections = [(title, said.encode(errors="backslashreplace").decode()) for title, said in report.sections]
+    return report
 
 
 @pytest.fixture(autouse=True)
@@ -44,6 +67,25 @@ def any_rt(request: pytest.FixtureRequest) -> Runtime:
     if request.param == "work-items as lanes":  # a GPU's kernels and group sizes, whatever the device
         return Runtime(lanes=1, pixel_items=True)
     return Runtime()
+
+
+@pytest.fixture(scope="session")
+def cli() -> ModuleType:
+    """The command line in this process: cli.run([...]) gives the exit status."""
+    return load_cli()
+
+
+@pytest.fixture(scope="session")
+def simulated(cli, tmp_path_factory) -> Callable[..., Path]:
+    """(words of ``phyradgs simulate``...) → the scan, made once and not to be written to."""
+
+    @cache
+    def make(*words: str) -> Path:
+        path = tmp_path_factory.mktemp("scan") / "scan.h5"
+        assert cli.run(["simulate", *words, "-o", str(path)]) == 0
+        return path
+
+    return make
 
 
 @pytest.fixture(scope="session")

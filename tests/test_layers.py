@@ -1,4 +1,4 @@
-"""The floors of the house: a room imports lower floors only, and pyopencl lives in one room.
+"""The floors of the house: a room imports lower floors only, no imports go in a circle, and pyopencl lives in one room.
 
 Rooms on one floor do not see each other. Which room is on which floor says the table of docs/architecture.md; a new module
 has to have a room there before the tests pass.
@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-
-import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "phyradgs_cl"
 NAME = PACKAGE.name
-
 ARCHITECTURE = PACKAGE.parent / "docs" / "architecture.md"
+MOST_FILES = 13  # of a folder: a dozen and __init__.py; commands/ has a file per command
 
 
 def floors_of_the_page() -> dict[str, int]:
@@ -39,9 +40,11 @@ GROUND_FLOOR = {
 }
 
 
-def module_files() -> list[Path]:
-    """Every module of the package, and cli.py beside it."""
-    return [*sorted(PACKAGE.rglob("*.py")), PACKAGE.parent / "cli.py"]
+@cache
+def modules() -> dict[Path, ast.Module]:
+    """Every module of the package, and cli.py beside it, as a tree."""
+    paths = [*sorted(PACKAGE.rglob("*.py")), PACKAGE.parent / "cli.py"]
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in paths}
 
 
 def room_of(path: Path) -> str:
@@ -51,27 +54,28 @@ def room_of(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
-def imported_modules(path: Path) -> Iterator[tuple[int, str]]:
-    """(line, dotted name) of every import, those inside functions and type-checking blocks included."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def dotted(path: Path) -> str:
+    """The name by which a module is imported."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
+    """The nodes that run, or that a type checker follows, when the module is imported."""
+    for node in ast.iter_child_nodes(tree):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield node
+            yield from outside_functions(node)
+
+
+def imported_names(nodes: Iterator[ast.AST]) -> Iterator[tuple[int, str]]:
+    """(line, dotted name) of every import among the nodes; ``from a import b`` is a.b."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}:{node.lineno}: write the import with its full name"
-            if node.module == NAME:
-                yield from ((node.lineno, f"{NAME}.{alias.name}") for alias in node.names)
-            elif node.module:
-                yield node.lineno, node.module
-
-
-def imported_rooms(path: Path) -> Iterator[tuple[int, str]]:
-    """(line, room) of every import from this package; ``from phyradgs_cl import __version__`` is __init__."""
-    for line, module in imported_modules(path):
-        parts = module.split(".")
-        if parts[0] != NAME:
-            continue
-        room = parts[1] if len(parts) > 1 else "__init__"
-        yield line, "__init__" if room.startswith("__version") else room
+            module = "" if node.level else node.module  # a relative import is no name at all
+            yield from ((node.lineno, f"{module}.{alias.name}") for alias in node.names)
 
 
 def forbidden(room: str, other: str) -> bool:
@@ -83,54 +87,108 @@ def forbidden(room: str, other: str) -> bool:
     return FLOOR_OF[other] >= FLOOR_OF[room]
 
 
-@pytest.mark.parametrize("path", module_files(), ids=lambda p: str(p.relative_to(PACKAGE.parent)))
-def test_a_module_imports_only_lower_floors(path: Path) -> None:
-    room = room_of(path)
-    assert room in FLOOR_OF, f"{path} belongs to no room of docs/architecture.md"
-    for line, other in imported_rooms(path):
-        assert other in FLOOR_OF, f"{path}:{line}: imports {other}, which is no room of docs/architecture.md"
-        assert not forbidden(room, other), (
-            f"{path}:{line}: {room} (floor {FLOOR_OF[room]}) imports {other} (floor {FLOOR_OF[other]})"
-        )
+def complaint(room: str, name: str) -> str:
+    """What is wrong with an import of ``name`` in ``room``; nothing where it may be."""
+    first, _, rest = name.partition(".")
+    other = rest.partition(".")[0]
+    if not first:
+        return "write the import with its full name"
+    if first != NAME:
+        return ""
+    other = "__init__" if not other or other.startswith("__version") else other
+    if other not in FLOOR_OF:
+        return f"imports {other}, which is no room of docs/architecture.md"
+    if forbidden(room, other):
+        return f"{room} (floor {FLOOR_OF[room]}) imports {other} (floor {FLOOR_OF[other]})"
+    return ""
 
 
-def test_the_table_names_only_rooms_that_exist() -> None:
-    found = {room_of(path) for path in module_files()}
-    assert set(FLOOR_OF) <= found, f"no such room: {set(FLOOR_OF) - found}"
+def circle(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other, in a row that ends where it begins; none where there is an order."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def may_import(path: Path, name: str) -> bool:
+    """Whether ``path`` may import pyopencl or PyTorch, ``name``."""
+    if name == "pyopencl":
+        return room_of(path) == "runtime"
+    return room_of(path) == "neural" or path == PACKAGE / "api" / "bridges.py"  # operators for PyTorch's users
+
+
+def test_a_module_imports_only_lower_floors() -> None:
+    wrong = []
+    for path, tree in modules().items():
+        assert room_of(path) in FLOOR_OF, f"{path} belongs to no room of docs/architecture.md"
+        found = ((line, complaint(room_of(path), name)) for line, name in imported_names(ast.walk(tree)))
+        wrong += [f"{path}:{line}: {said}" for line, said in found if said]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    """Within rooms too, those for types included; an import inside a function is made when it is called."""
+    known = {dotted(path) for path in modules()}
+    graph: dict[str, set[str]] = {}
+    for path, tree in modules().items():
+        names = {name for _, name in imported_names(outside_functions(tree))}
+        graph[dotted(path)] = {n if n in known else n.rpartition(".")[0] for n in names if n.startswith(NAME)}
+    found = circle(graph)
+    assert not found, "a circle of imports: " + " ← ".join(found)
+
+
+def test_pyopencl_and_pytorch_live_in_one_room_each() -> None:
+    wrong = [
+        f"{path}:{line}: {name} is another room's to import"
+        for path, tree in modules().items()
+        for line, name in imported_names(ast.walk(tree))
+        if (top := name.partition(".")[0]) in ("pyopencl", "torch") and not may_import(path, top)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_library_does_not_print() -> None:
+    wrong = [
+        f"{path}:{node.lineno}: the library returns or raises; the command line prints"
+        for path, tree in modules().items()
+        if PACKAGE in path.parents
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_a_listing_says_what_is_in_a_folder() -> None:
+    """Few files, and none whose name says again what its folder's name has said."""
+    inside = [path for path in modules() if PACKAGE in path.parents]
+    files = Counter(path.parent for path in inside if path.parent != PACKAGE / "commands")
+    wrong = [f"{folder}: {count} files" for folder, count in files.items() if count > MOST_FILES]
+    for path in inside:
+        folder = path.parent.name.removesuffix("s")
+        if path.stem.removesuffix("s") == folder or path.stem.startswith((f"{folder}_", f"{folder}s_")):
+            wrong.append(f"{path}: its name repeats its folder's")
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_page_is_read_as_it_is_meant() -> None:
-    assert (
-        FLOOR_OF["fields"] == FLOOR_OF["parallel"] == 1 and FLOOR_OF["cli"] == 8 and FLOOR_OF["__main__"] == 9
-    )
+    assert [FLOOR_OF[room] for room in ("fields", "parallel", "cli", "__main__")] == [1, 1, 8, 9]
     assert sorted(set(FLOOR_OF.values())) == list(range(10))
+    found = {room_of(path) for path in modules()}
+    assert set(FLOOR_OF) <= found, f"no such room: {set(FLOOR_OF) - found}"
 
 
-def test_the_rule_sees_upward_and_sideways_imports() -> None:
+def test_the_rules_see_what_they_forbid() -> None:
     assert forbidden("fields", "acquisition")
     assert forbidden("phantoms", "io")
     assert forbidden("errors", "checks")
     assert not forbidden("checks", "errors")
     assert not forbidden("reconstructors", "errors")
-
-
-@pytest.mark.parametrize("path", module_files(), ids=lambda p: str(p.relative_to(PACKAGE.parent)))
-def test_pyopencl_lives_in_the_runtime(path: Path) -> None:
-    if room_of(path) != "runtime":
-        found = [line for line, module in imported_modules(path) if module.split(".")[0] == "pyopencl"]
-        assert not found, f"{path}:{found[0]}: only phyradgs_cl/runtime imports pyopencl"
-
-
-@pytest.mark.parametrize("path", module_files(), ids=lambda p: str(p.relative_to(PACKAGE.parent)))
-def test_pytorch_lives_in_the_neural_room(path: Path) -> None:
-    if room_of(path) == "neural" or path == PACKAGE / "api" / "bridges.py":  # operators for PyTorch's users
-        return
-    found = [line for line, module in imported_modules(path) if module.split(".")[0] == "torch"]
-    assert not found, f"{path}:{found[0]}: only phyradgs_cl/neural imports torch"
-
-
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_the_library_does_not_print(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        is_print = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
-        assert not is_print, f"{path}:{node.lineno}: the library returns or raises; the command line prints"
+    tree = ast.parse("from a.b import c\nif TYPE_CHECKING:\n    import torch\ndef f():\n    import h5py\nfrom . import d")
+    assert {name for _, name in imported_names(ast.walk(tree))} == {"a.b.c", "torch", "h5py", ".d"}
+    assert {name for _, name in imported_names(outside_functions(tree))} == {"a.b.c", "torch", ".d"}
+    assert [complaint("fields", name)[:7] for name in ("numpy", ".a", f"{NAME}.x.y", f"{NAME}.io")] == [
+        "", "write t", "imports", "fields "
+    ]  # fmt: skip
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) and not circle({"a": {"b", "c"}, "b": {"c"}, "c": set()})

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
 from phyradgs_cl.check.questions.exposure import check_exposure
@@ -18,11 +17,6 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 from phyradgs_cl.workflow import load_scan
-
-
-@pytest.fixture(scope="module")
-def cli():
-    return load_cli()
 
 
 def verdicts(found):

@@ -4,11 +4,10 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,31 +15,18 @@ import pytest
 
 from phyradgs_cl.__main__ import load_cli
 
-SIMULATE = [
-    "simulate",
-    "--phantom",
-    "jaw",
-    "--size",
-    "16",
-    "--detector",
-    "24",
-    "--views",
-    "6",
-    "--time-samples",
-    "4",
-]
+SIMULATE = ["simulate", "--phantom", "jaw", "--size", "16", "--detector", "24", "--views", "6", "--time-samples", "4"]
+
+
+def facts_of(volume: Path) -> dict[str, Any]:
+    """The provenance of a volume, as it is stored."""
+    with h5py.File(volume) as file:
+        return json.loads(file["entry/provenance/json"][()])
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory):
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert cli.run([*SIMULATE, "--noise", "tigre", "-o", str(path)]) == 0
-    return path
+def scan(simulated):
+    return simulated(*SIMULATE[1:], "--noise", "tigre")
 
 
 def test_help_shows_every_command_with_an_example(cli, capsys):
@@ -87,33 +73,9 @@ def test_a_method_that_ends_by_itself_says_when_and_why(cli, scan, tmp_path, cap
 
 def test_columns_and_intensity_and_jitter_are_simulated(cli, tmp_path):
     path = tmp_path / "scan.h5"
-    options = [
-        "--readout",
-        "columns",
-        "--readout-direction",
-        "-1",
-        "--detector-model",
-        "intensity",
-        "--jitter-deg",
-        "0.2",
-    ]
-    assert (
-        cli.run(
-            [
-                *SIMULATE,
-                *options,
-                "--noise",
-                "beer",
-                "--peak",
-                "3",
-                "--detector-offset",
-                "0.1,-0.2",
-                "-o",
-                str(path),
-            ]
-        )
-        == 0
-    )
+    options = ["--readout", "columns", "--readout-direction", "-1", "--detector-model", "intensity", "--jitter-deg", "0.2"]
+    options += ["--noise", "beer", "--peak", "3", "--detector-offset", "0.1,-0.2"]
+    assert cli.run([*SIMULATE, *options, "-o", str(path)]) == 0
     with h5py.File(path) as file:
         own = file["entry/phyradgs"]
         assert own["readout_axis"][()].decode() == "columns"
@@ -183,12 +145,9 @@ def test_the_command_line_wins_over_the_config_file(cli, scan, tmp_path):
     config = tmp_path / "run.toml"
     config.write_text("iterations = 7\ngaussians = 50\nmotion = 'static'\n[rates]\nposition = [1e-3, 1e-4]\n")
     output = tmp_path / "volume.h5"
-    assert (
-        cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config), "--iterations", "4"])
-        == 0
-    )
-    with h5py.File(output) as file:
-        options = json.loads(file["entry/provenance/json"][()])["options"]
+    given = ["--config", str(config), "--iterations", "4"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), *given]) == 0
+    options = facts_of(output)["options"]
     assert options["iterations"] == 4
     assert options["gaussians"] == 50
     assert options["motion"]["name"] == "static"
@@ -207,8 +166,7 @@ def test_numbers_of_a_config_may_be_written_as_whole_floats(cli, scan, tmp_path)
     config, output = tmp_path / "run.toml", tmp_path / "volume.h5"
     config.write_text("device = 0\nseed = 3.0\nstrips = 2.0\nsub_intervals = 3\niterations = 2.0\n")
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config)]) == 0
-    with h5py.File(output) as file:
-        facts = json.loads(file["entry/provenance/json"][()])
+    facts = facts_of(output)
     motion = facts["options"]["motion"]
     assert (motion["name"], motion["strips"], motion["sub_intervals"]) == ("micro-views", 2, 3)
     assert (facts["seed"], facts["options"]["iterations"]) == (3, 2)
@@ -218,8 +176,7 @@ def test_more_gaussians_than_voxels_are_said_and_kept(cli, scan, tmp_path, caplo
     output = tmp_path / "volume.h5"
     asked = ["--iterations", "1", "--gaussians", "100000"]
     assert cli.run(["reconstruct", str(scan), "-o", str(output), *asked]) == 0
-    with h5py.File(output) as file:
-        facts = json.loads(file["entry/provenance/json"][()])
+    facts = facts_of(output)
     assert facts["gaussians_asked"] == 100_000
     assert 0 < facts["gaussians_first"] < 16**3
     assert [r.getMessage() for r in caplog.records if "asked for" in r.getMessage()] == [
@@ -263,47 +220,12 @@ def test_volume_files_are_simulated_at_their_own_resolution(cli, tmp_path):
     with h5py.File(source, "w") as file:
         file["volume"] = volume
     path = tmp_path / "scan.h5"
-    options = [
-        "--volume",
-        str(source),
-        "--size",
-        "12",
-        "--detector",
-        "20",
-        "--views",
-        "4",
-        "--protocol",
-        "static",
-    ]
-    assert cli.run(["simulate", *options, "-o", str(path)]) == 0
+    options = ["--size", "12", "--detector", "20", "--views", "4", "--protocol", "static"]
+    assert cli.run(["simulate", "--volume", str(source), *options, "-o", str(path)]) == 0
     with h5py.File(path) as file:
         reference = file["entry/phyradgs/reference/volume"][()]
     block = (volume / 255).reshape(12, 2, 12, 2, 12, 2).mean((1, 3, 5))
     np.testing.assert_allclose(reference, block, atol=1e-6)
-
-
-def test_ctrl_c_keeps_the_volume_and_resume_ends_with_the_same_bits(cli, scan, tmp_path):
-    whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
-    common = ["--iterations", "600", "--gaussians", "400"]
-    assert cli.run(["reconstruct", str(scan), "-o", str(whole), *common]) == 0
-    command = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(stopped), *common]
-    started = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    time.sleep(2.5)
-    started.send_signal(signal.SIGINT)
-    _, errors = started.communicate(timeout=120)
-    if started.returncode == 130 and stopped.exists():
-        assert "--resume" in errors
-        assert Path(f"{stopped}.checkpoint.npz").exists()
-        assert cli.run(["reconstruct", str(scan), "-o", str(stopped), *common, "--resume"]) == 0
-    else:  # the signal came before the first or after the last iteration: then nothing, or everything, is there
-        assert started.returncode in (0, 130)
-        if not stopped.exists():
-            assert cli.run(["reconstruct", str(scan), "-o", str(stopped), *common]) == 0
-    assert not Path(f"{stopped}.checkpoint.npz").exists()
-    with h5py.File(whole) as a, h5py.File(stopped) as b:
-        np.testing.assert_array_equal(
-            a["entry/reconstruction/volume"][()], b["entry/reconstruction/volume"][()]
-        )
 
 
 def test_devices_names_the_choice_and_the_reason(cli, capsys):
@@ -326,8 +248,7 @@ def test_assignments_win_over_the_file_and_switches_over_both(cli, scan, tmp_pat
     config.write_text("method = 'sart'\niterations = 7\nrelaxation = 0.1\norder = 'ordered'\n")
     given = ["--set", "relaxation=0.5", "--set", "order=random", "--set", "iterations=5", "--iterations", "2"]
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--config", str(config), *given]) == 0
-    with h5py.File(output) as file:
-        options = json.loads(file["entry/provenance/json"][()])["options"]
+    options = facts_of(output)["options"]
     assert (options["relaxation"], options["order"], options["iterations"]) == (0.5, "random", 2)
 
 
@@ -336,7 +257,6 @@ def test_an_assignment_reaches_into_a_table_of_the_file(cli, scan, tmp_path):
     config.write_text("iterations = 2\n[rates]\nposition = [1e-3, 1e-4]\ndensity = [1e-2, 1e-3]\n")
     given = ["--config", str(config), "--set", "rates.position=[2e-3, 2e-4]"]
     assert cli.run(["reconstruct", str(scan), "-o", str(output), *given]) == 0
-    with h5py.File(output) as file:
-        rates = json.loads(file["entry/provenance/json"][()])["options"]["rates"]
+    rates = facts_of(output)["options"]["rates"]
     assert rates["position"] == [2e-3, 2e-4]
     assert rates["density"] == [1e-2, 1e-3]

@@ -12,7 +12,6 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Static
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.runtime import device, pocl
@@ -22,15 +21,8 @@ TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert cli.run(["simulate", *TINY, "--jitter-deg", "0.1", "-o", str(path)]) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*TINY, "--jitter-deg", "0.1")
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 from phyradgs_cl import estimate as room
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.estimate import duration, estimate, shortened
 from phyradgs_cl.reconstructors import method_options
 from phyradgs_cl.reconstructors.result import Reconstruction
@@ -21,15 +20,8 @@ SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", 
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("estimate") / "scan.h5"
-    assert cli.run([*SIMULATE, "--time-samples", "2", "-o", str(path)]) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*SIMULATE[1:], "--time-samples", "2")
 
 
 class Clock:

@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.report.run import load_run
@@ -21,15 +20,8 @@ SIRT = ["--method", "sirt", "--iterations", "2"]
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert cli.run(["simulate", *TINY, "-o", str(path)]) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*TINY)
 
 
 def test_what_is_chosen_is_in_the_result_and_told(cli, scan, tmp_path, capsys, caplog) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from phyradgs_cl import signals, simulation
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import evaluate, reconstruct, simulate
@@ -22,15 +21,8 @@ COMPLETE = "phyradgs: interrupted, the output is complete\n"
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory):
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert cli.run(["simulate", *TINY, "-o", str(path)]) == 0
-    return path
+def scan(simulated):
+    return simulated(*TINY)
 
 
 def interrupted_before(function):

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.lock import lock_path
 
@@ -28,10 +27,8 @@ KILLS = int(os.environ.get("STRESS", "1"))
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert load_cli().run(["simulate", *TINY, "--noise", "tigre", "-o", str(path)]) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*TINY, "--noise", "tigre")
 
 
 def volume(path: Path) -> np.ndarray:

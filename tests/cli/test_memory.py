@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.runtime import MEMORY_VARIABLE, context
 from phyradgs_cl.workflow import load_scan
@@ -16,15 +15,8 @@ VOLUME = ["--phantom", "jaw", "--size", "24", "--detector", "20", "--views", "4"
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("memory") / "scan.h5"
-    assert cli.run(["simulate", *VOLUME, "-o", str(path)]) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*VOLUME)
 
 
 def test_simulation_in_bricks(cli, scan, tmp_path) -> None:

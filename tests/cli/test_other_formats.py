@@ -11,18 +11,12 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import simulate
 from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan, write_volume
 
 FORMATS = {"v.mha": "mha", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
-
-
-@pytest.fixture(scope="module")
-def cli():
-    return load_cli()
 
 
 @pytest.fixture

@@ -8,26 +8,13 @@ import numpy as np
 import pytest
 from skimage.io import imread
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.report import Preview
 
-SIMULATE = [
-    "simulate",
-    "--phantom",
-    "jaw",
-    "--size",
-    "12",
-    "--detector",
-    "16",
-    "--views",
-    "4",
-    "--time-samples",
-    "2",
-]
+SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
 RUNS = {
     "phyradgs": ["--iterations", "60", "--gaussians", "60"],
     "footprint": ["--iterations", "60", "--gaussians", "60", "--set", "pixel_footprint=true"],
@@ -36,15 +23,8 @@ RUNS = {
 
 
 @pytest.fixture(scope="module")
-def cli():
-    return load_cli()
-
-
-@pytest.fixture(scope="module")
-def scan(cli, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("preview") / "scan.h5"
-    assert cli.run([*SIMULATE, "-o", str(path)]) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*SIMULATE[1:])
 
 
 @pytest.mark.parametrize("name", RUNS)

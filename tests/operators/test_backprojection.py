@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from remembered import remembered
 from tolerances import BACKPROJECTION
 
 from phyradgs_cl.acquisition import ConeGeometry
@@ -13,6 +14,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.operators.twins.backproject import backprojection, lines_backprojection
 
+backprojection, lines_backprojection = remembered(backprojection), remembered(lines_backprojection)
 GRID = Grid((5, 9, 19), (0.3, 0.2, 0.1), (0.1, -0.1, 0.2))
 ANGLES = np.array([0.0, 1.3, 2.9, 4.4])
 SHAPES = [(13, 18), (31, 5), (2, 2), (21, 26)]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
@@ -15,6 +16,7 @@ from phyradgs_cl.operators import IntensityOperator, RayOperator, RayProjector
 from phyradgs_cl.operators.rays.cell_layers import layers
 from phyradgs_cl.operators.twins.rays import intensity_change, intensity_volume, ray_frame
 
+intensity_change, intensity_volume, ray_frame = map(remembered, (intensity_change, intensity_volume, ray_frame))
 GRID = Grid((5, 7, 6), (0.35, 0.26, 0.3), (0.1, -0.05, 0.1))
 SHAPE = (6, 7)
 DIFFERENCE = 1e-4  # step of finite differences in float64: their error is of its square

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remembered import remembered
 from tolerances import (
     FINITE_DIFFERENCE_STEP,
     FOOTPRINT_AREA,
@@ -49,6 +50,7 @@ def make_table(make_geometry) -> Callable[[str], TimeCells]:
     return make
 
 
+@remembered
 def twin(rows: np.ndarray, table: TimeCells, affine: bool = False) -> np.ndarray:
     moving = table if table.end_poses is not None else at_rest(table)
     return moving_frame(rows, moving, SHAPE, affine=affine, pixel_variance=PIXEL_VARIANCE)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ray_tables import SHAPE, noise, tables
+from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 
 from phyradgs_cl.acquisition.cells import TimeCells
@@ -17,6 +18,7 @@ from phyradgs_cl.operators.rays import launches as rays
 from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
 from phyradgs_cl.runtime import Runtime
 
+ray_frame, ray_volume = remembered(ray_frame), remembered(ray_volume)
 GRID = Grid((9, 14, 11), (0.21, 0.13, 0.16), (0.1, -0.05, 0.2))
 MOTIONS = ("static", "micro-views", "per line", "per line at one time")
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from memory_limits import room_for
 from ray_tables import noise, tables
+from remembered import remembered
 from tolerances import RAYS
 
 from phyradgs_cl.acquisition.cells import TimeCells
@@ -19,6 +20,7 @@ from phyradgs_cl.operators.rays.upright import columns_floats, upright_block
 from phyradgs_cl.operators.twins.rays import ray_frame
 from phyradgs_cl.runtime import Runtime
 
+ray_frame = remembered(ray_frame)
 GRID = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.1, -0.05, 0.2))
 TALL_PANEL = (85, 7)
 PLANNED = 0.9  # share of free memory that is planned with

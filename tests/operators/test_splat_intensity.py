@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remembered import remembered
 from tolerances import FINITE_DIFFERENCE_STEP, GRADIENT, INTENSITY_FRAME, SPLAT_CLOUD
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
@@ -46,6 +47,7 @@ def make_table(make_geometry) -> MakeTable:
     return make
 
 
+@remembered
 def twin(rows: np.ndarray, table: TimeCells, unit: float = UNIT, affine: bool = False) -> np.ndarray:
     """The merged frame (rows, columns): every cell by its own float64 twin, averaged line by line."""
     weights, images = [], []

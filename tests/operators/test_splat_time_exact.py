@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from remembered import remembered
 from tolerances import (
     CUTOFF_EDGE_MOVING,
     EXACT_OVER_MICRO_VIEWS,
@@ -27,6 +28,7 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGauss
 from phyradgs_cl.operators.twins.splat_moving import moving_frame
 from phyradgs_cl.runtime import Runtime
 
+moving_frame = remembered(moving_frame)
 SHAPE = (13, 18)
 WIDE = (16, 96)
 CLOSED_ONLY = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -49,34 +50,40 @@ def nested(path: tuple[str, ...], value: object) -> dict[str, Any]:
     return value
 
 
-def number_cases() -> list[Any]:
-    cases = []
+NUMBERS = [
+    (method, path, value)
+    for method, entry in METHODS.items()
+    for path, value in numeric_options(next(iter(entry.presets.values())))
+]
+
+
+def refusal(method: str, changes: dict[str, Any]) -> str:
+    """What is said of the changes; nothing where they are taken."""
+    try:
+        method_options(method, None, changes)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def test_every_preset_is_taken_as_it_is() -> None:
     for method, entry in METHODS.items():
-        for path, value in numeric_options(next(iter(entry.presets.values()))):
-            cases.append(pytest.param(method, path, value, id=f"{method} {'.'.join(path)}"))
-    return cases
+        for name, options in entry.presets.items():
+            assert method_options(method, name) == options, (method, name)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_preset_is_taken_as_it_is(method) -> None:
-    for name, options in METHODS[method].presets.items():
-        assert method_options(method, name) == options
+def test_every_number_has_a_checked_range() -> None:
+    for method, path, current in NUMBERS:
+        for name, absurd in ABSURD.items():
+            said = refusal(method, nested(path, [absurd] * len(current) if isinstance(current, tuple) else absurd))
+            assert path[-1] in said and len(said) < 700, f"{method} {'.'.join(path)}, {name}: {said!r}"
 
 
-@pytest.mark.parametrize(("method", "path", "current"), number_cases())
-def test_every_number_has_a_checked_range(method, path, current) -> None:
-    for name, absurd in ABSURD.items():
-        value = [absurd] * len(current) if isinstance(current, tuple) else absurd
-        with pytest.raises(InputError) as refusal:
-            method_options(method, None, nested(path, value))
-        assert path[-1] in str(refusal.value), name
-        assert len(str(refusal.value)) < 700, name
-
-
-@pytest.mark.parametrize(("method", "path", "current"), number_cases())
-def test_every_number_can_be_given_as_it_stands(method, path, current) -> None:
-    value = list(current) if isinstance(current, tuple) else float(current)
-    assert method_options(method, None, nested(path, value)) == method_options(method)
+def test_every_number_can_be_given_as_it_stands() -> None:
+    assert len(NUMBERS) > 100
+    for method, path, current in NUMBERS:
+        value = list(current) if isinstance(current, tuple) else float(current)
+        assert method_options(method, None, nested(path, value)) == method_options(method), (method, path)
 
 
 def test_whole_floats_are_whole_numbers() -> None:
@@ -176,32 +183,28 @@ def test_only_splats_are_exact_in_time_and_fdk_has_no_micro_views() -> None:
     assert "micro-views" not in motions_of("fdk")
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_errors_about_motion_offer_what_the_method_has(method) -> None:
-    own = motions_of(method)
-    for name in own:
-        assert method_options(method, None, {"motion": name}).motion.name == name
-    with pytest.raises(InputError) as refusal:
-        method_options(method, None, {"motion": "wobble"})
-    assert refusal.value.expected == f"one of {', '.join(own)} for --method {method}"
+def test_errors_about_motion_offer_what_the_method_has() -> None:
+    for method in METHODS:
+        own = motions_of(method)
+        for name in own:
+            assert method_options(method, None, {"motion": name}).motion.name == name, (method, name)
+        with pytest.raises(InputError) as refused:
+            method_options(method, None, {"motion": "wobble"})
+        assert refused.value.expected == f"one of {', '.join(own)} for --method {method}"
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("key", ["strips", "sub_intervals", "segments"])
-def test_counts_belong_to_the_motions_that_have_them(method, key) -> None:
+def test_counts_belong_to_the_motions_that_have_them() -> None:
     models = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}, "segments": {"exact"}}
-    having = models[key]
-    if method == "fdk":  # one pose per line
-        having = set()
-    for name in motions_of(method):
+    pairs = [(method, name) for method in METHODS for name in motions_of(method)]
+    for (method, name), (key, having) in product(pairs, models.items()):
         changes = {"motion": name, key: 3}
-        if name in having:
-            assert getattr(method_options(method, None, changes).motion, key) == 3
+        if name in having and method != "fdk":  # one pose per line
+            assert getattr(method_options(method, None, changes).motion, key) == 3, (method, changes)
             continue
-        with pytest.raises(InputError, match=f"--{key.replace('_', '-')}: ") as refusal:
+        with pytest.raises(InputError, match=f"--{key.replace('_', '-')}: ") as refused:
             method_options(method, None, changes)
         for other in having - set(motions_of(method)):
-            assert other not in refusal.value.expected
+            assert other not in refused.value.expected, (method, changes)
 
 
 @pytest.mark.parametrize(

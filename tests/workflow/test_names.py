@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path, read_volume, write_scan
 from phyradgs_cl.io.names import beside, shortened
@@ -21,11 +20,6 @@ from phyradgs_cl.workflow.files import load_scan
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
 BAD = os.fsdecode(b"bad\xff")
 FAST = ["--method", "sirt", "--iterations", "2"]
-
-
-@pytest.fixture(scope="module")
-def cli():
-    return load_cli()
 
 
 def test_text_is_made_fit_to_be_shown() -> None:

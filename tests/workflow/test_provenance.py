@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from tables import results as bench_results
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.io.hdf5.facts import PROVENANCE, read_facts
 from phyradgs_cl.io.json_lines import read_lines
@@ -46,11 +45,6 @@ def files(tiny_scan: Path) -> tuple[Path, Path]:
     scan, volume = load_scan(tiny_scan), tiny_scan.with_name("volume.h5")
     write_volume(volume, 0.9 * scan.reference, scan.grid, {"method": "fdk"}, metrics={"ssim": 0.5})
     return tiny_scan, volume
-
-
-@pytest.fixture(scope="module")
-def cli():
-    return load_cli()
 
 
 def written(path: Path, target: Path, provenance: str, metrics: str = "{}") -> Path:

@@ -1,0 +1,66 @@
+"""Every command once, each on what the ones before it have made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import typer
+
+from phyradgs_cl.io import read_volume
+from phyradgs_cl.workflow import load_scan
+
+SCAN = "--phantom jaw --size 10 --detector 12 --views 4 --time-samples 2"
+CONE = "--source-to-axis-mm 500 --source-to-detector-mm 800 --pixel-size-mm 3,3"
+GRID = 'scans = ["scan.h5"]\n[[runs]]\nmethod = "fdk"\n'
+# (command line, what it leaves)
+COMMANDS = (
+    ("devices", ""),
+    (f"simulate {SCAN} -o scan.h5", "scan.h5"),
+    ("info scan.h5", ""),
+    ("check scan.h5", ""),
+    ("estimate scan.h5 --method sirt", ""),
+    ("reconstruct scan.h5 --iterations 2 -o volume.h5", "volume.h5"),
+    ("evaluate volume.h5 --reference scan.h5 --json", "volume.png"),
+    ("report volume.h5 --scan scan.h5 --views 2 -o page.html", "page.html"),
+    ("view volume.h5", ""),
+    ("export volume.h5 --to nrrd -o volume.nrrd", "volume.nrrd"),
+    (f"import foreign.h5 --format data-exchange {CONE} -o imported.h5", "imported.h5"),
+    ("sweep grid.toml -o swept", "swept/results.csv"),
+    ("watch incoming --once --settle-s 0 --method fdk -o out", "out/imported.h5"),
+    ("bench quick --iterations 1 -o bench", "bench/results.md"),
+)
+
+
+def write_foreign(path: Path) -> None:
+    """Counts of four frames, a flat and a dark, as a synchrotron would store them."""
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.linspace(400, 900, 4 * 8 * 9).reshape(4, 8, 9).astype(np.uint16)
+        file["exchange/data_white"] = np.full((1, 8, 9), 1000, np.uint16)
+        file["exchange/data_dark"] = np.zeros((1, 8, 9), np.uint16)
+        file["exchange/theta"] = np.arange(4) * 90.0
+
+
+def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None:
+    windows = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("phyradgs_cl.workflow.quick.VOXELS", 8)
+    monkeypatch.setattr("phyradgs_cl.workflow.quick.PIXELS", 12)
+    monkeypatch.setattr("phyradgs_cl.commands.view.view_volume", windows.append)
+    write_foreign(tmp_path / "foreign.h5")
+    (tmp_path / "grid.toml").write_text(GRID)
+    (tmp_path / "incoming").mkdir()
+    for line, output in COMMANDS:
+        if line.startswith("watch"):
+            (tmp_path / "incoming/imported.h5").write_bytes((tmp_path / "imported.h5").read_bytes())
+        assert cli.run(line.split()) == 0, f"{line}: {capsys.readouterr().err}"
+        assert (tmp_path / output).exists(), line
+    assert len(windows) == 1 and load_scan(tmp_path / "imported.h5").frames == 4
+    for name in ("volume.h5", "out/imported.h5"):
+        assert read_volume(tmp_path / name).volume.any(), name
+
+
+def test_no_command_is_left_out(cli) -> None:
+    known = set(typer.main.get_command(cli.app).commands)
+    assert {line.split()[0] for line, _ in COMMANDS} == known

@@ -1,0 +1,43 @@
+"""What `make test` runs: rooms, files and single tests, by how their names begin. `make test-all` runs the others too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+QUICK = (
+    # geometry to metrics, whole: values, closed forms, laws
+    "acquisition/", "detector/", "fields/", "metrics/", "objective/", "optim/", "phantoms/", "simulation/",
+    # every kernel against its twin
+    "runtime/", "operators/", "laws/",
+    # options of every method, the loop, the whole gradient, FDK, what a GPU would run
+    "reconstructors/test_registry.py", "reconstructors/test_loop.py", "reconstructors/test_whole_objective.py",
+    "reconstructors/test_fdk", "reconstructors/test_gpu_shape.py", "reconstructors/test_without_pytorch.py",
+    "check/test_plain_questions.py", "check/test_variants.py",
+    "io/test_atomic.py", "io/test_checkpoint_file.py", "io/test_scan_round_trip.py", "io/test_volume_file.py",
+    # every command; a kill and a resume; a full disk; hostile files of each kind
+    "cli/test_smoke.py", "cli/test_settings.py", "cli/test_startup.py",
+    "cli/test_kills.py::test_killed_runs_end_with_the_bits_of_one_that_was_not[phyradgs]",
+    "faults/test_disk.py::test_no_room_at_any",
+    "importers/test_hostile.py", "io/test_scan_damaged.py::test_damage", "io/test_hdf5_trial.py::test_a_file_that",
+    "corpus/test_fuzz_readers.py::test_what_once_went_wrong",
+    "test_layers.py", "test_errors.py",
+)  # fmt: skip
+
+
+def is_quick(node: str) -> bool:
+    """Whether a test, by its name from tests/ on, is one of them."""
+    return node.startswith(QUICK)
+
+
+def exists(entry: str) -> bool:
+    """Whether there is a file, and a test in it, whose names begin like that: they may have been renamed."""
+    file, _, test = entry.partition("::")
+    word = f"def {test.partition('[')[0]}" if test else ""
+    return any(
+        path.relative_to(HERE).as_posix().startswith(file) and word in path.read_text(encoding="utf-8")
+        for path in sorted(HERE.rglob("test_*.py"))
+    )
+
+
+assert all(map(exists, QUICK)), f"no such tests: {[entry for entry in QUICK if not exists(entry)]}"
