@@ -27,8 +27,8 @@ EXAMPLE = (
 
 
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
-AngleAt, Part, Quantity = Literal[ANGLE_AT], Literal[PARTS], Literal[QUANTITIES]  # type: ignore[valid-type]
-Rotates, Row0, Column0 = Literal[ROTATES], Literal[ROW_0], Literal[COLUMN_0]  # type: ignore[valid-type]
+AngleAt, Part, Quantity = Literal[ANGLE_AT], Literal[PARTS], Literal[QUANTITIES]
+Rotates, Row0, Column0 = Literal[ROTATES], Literal[ROW_0], Literal[COLUMN_0]
 
 
 _FIELDS = frozenset(f.name for f in fields(ImportOptions))
@@ -44,7 +44,7 @@ def import_command(
         Path, file_option("--output", "-o", help="Scan file to write; an existing one is replaced whole.")
     ],
     form: Annotated[
-        FormatName | None,
+        FormatName | None,  # type: ignore[valid-type]
         typer.Option("--format", help="Format of SRC.", show_default="recognised"),
     ] = None,
     exposure_s: Annotated[float | None, _number("Exposure of a line, s.")] = None,
@@ -59,7 +59,7 @@ def import_command(
         ),
     ] = None,
     angle_at: Annotated[
-        AngleAt | None,
+        AngleAt | None,  # type: ignore[valid-type]
         typer.Option(
             help="What a frame's angle belongs to: start or middle of its exposure.", show_default="start"
         ),
@@ -81,21 +81,21 @@ def import_command(
     ] = None,
     unit_mm: Annotated[float, typer.Option(help="Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
     rotates: Annotated[
-        Rotates | None,
+        Rotates | None,  # type: ignore[valid-type]
         typer.Option(help="What the stored angles turn.", show_default="the format's"),
     ] = None,
     row_0: Annotated[
-        Row0 | None,
+        Row0 | None,  # type: ignore[valid-type]
         typer.Option("--row-0", help="Where the first stored row is.", show_default="the format's"),
     ] = None,
     column_0: Annotated[
-        Column0 | None,
+        Column0 | None,  # type: ignore[valid-type]
         typer.Option(
             "--column-0", help="Where the first stored column is, seen from the source.", show_default="left"
         ),
     ] = None,
     quantity: Annotated[
-        Quantity | None,
+        Quantity | None,  # type: ignore[valid-type]
         typer.Option(help="What the pixels hold.", show_default="the file's"),
     ] = None,
     flat_value: Annotated[
@@ -108,7 +108,7 @@ def import_command(
         ),
     ] = None,
     part: Annotated[
-        Part,
+        Part,  # type: ignore[valid-type]
         typer.Option(help="Projections of a benchmark folder (r2, phyradgs, naf)."),
     ] = "train",
     first_view: Annotated[

@@ -99,7 +99,7 @@ RoiMm = Annotated[
 
 # what a reconstruction is asked for; commands that speak of one share these words
 Method = Annotated[
-    MethodName | None,
+    MethodName | None,  # type: ignore[valid-type]
     typer.Option(
         case_sensitive=False,
         help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "

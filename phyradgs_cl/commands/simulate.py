@@ -39,7 +39,7 @@ def simulate_command(
     ] = None,
     scanner: Annotated[str, typer.Option(help="Scanner by name (r2, carm) or a TOML file.")] = "r2",
     protocol: Annotated[
-        ProtocolName,
+        ProtocolName,  # type: ignore[valid-type]
         typer.Option(
             help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
             "rapid, or of the fly-scan that the options below describe."

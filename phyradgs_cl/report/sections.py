@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow
+from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.report.charts.curve import convergence_charts
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
@@ -160,7 +161,7 @@ def _motion_words(motion: Motion) -> str:
             words = "dashed lines bound the segments in which Gaussians move"
         case _:
             words = "the dashed line is the one pose of a frame"
-    return f"The run's motion is {motion.name}: {words}."
+    return f"The run's motion is {motion_facts(motion)['name']}: {words}."
 
 
 def _charts(charts: Iterable[tuple[str, Markup]]) -> Markup:
