@@ -64,7 +64,7 @@ def write_whole(path: Path, head: bytes, values: np.ndarray) -> None:
     """A file of a header and float32 in little endian behind it, whole or not at all."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         file.write(head)
-        file.write(memoryview(np.ascontiguousarray(values, "<f4")).cast("B"))
+        file.write(np.ascontiguousarray(values, "<f4").data.cast("B"))
 
 
 def _xyz(triple: Triple) -> Triple:

@@ -66,6 +66,8 @@ def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions
     to_axis = options.source_to_axis_mm or optional_length(source, f"{_INSTRUMENT}/source/distance")
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(f"{_INSTRUMENT}/source/distance"))
     to_detector = distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
-    names = [(f"{_DETECTOR}/pixel_size_{axis}", f"{_DETECTOR}/{axis}_pixel_size") for axis in "yx"]
-    pitch = options.pixel_size_mm or tuple(stored_pitch(source, *addresses) for addresses in names)
+    pitch = options.pixel_size_mm or (
+        stored_pitch(source, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
+        stored_pitch(source, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
+    )
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, options.detector_offset_mm or (0.0, 0.0)))

@@ -139,7 +139,10 @@ def _geometry(
         to_axis = abs(read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
     to_detector = distance_to_detector(source, f"{detector}/distance", to_axis, options)
-    pitch = options.pixel_size_mm or tuple(stored_pitch(source, f"{detector}/{axis}_pixel_size") for axis in "yx")
+    pitch = options.pixel_size_mm or (
+        stored_pitch(source, f"{detector}/y_pixel_size"),
+        stored_pitch(source, f"{detector}/x_pixel_size"),
+    )
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
 

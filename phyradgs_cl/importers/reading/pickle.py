@@ -19,7 +19,7 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import check_room
-from phyradgs_cl.importers.reading.folder import regular_file
+from phyradgs_cl.io.regular import read_regular, regular_file
 
 _MOST_OPCODES = 1_000_000  # two seconds
 _MOST_COPIES, _FREE_BYTES = 4, 1 << 20  # of the file's size: one text may be made an array again and again
@@ -32,13 +32,13 @@ _LATIN1 = ("latin1", "latin-1")
 def read_pickle(path: Path) -> object:
     """What a pickle file holds: dicts, lists, tuples, text, numbers, NumPy arrays. InputError for anything else."""
     culprit = str(path)
-    check_room(culprit, _BESIDE * regular_file(path, culprit).stat().st_size)
+    size = regular_file(path, culprit).st_size
+    check_room(culprit, _BESIDE * size)
+    data = read_regular(path, culprit, size, "a pickle")
     try:
-        return PlainUnpickler(culprit, path.read_bytes()).load()
+        return PlainUnpickler(culprit, data).load()
     except InputError:
         raise
-    except OSError as error:
-        raise InputError(culprit, error.strerror or str(error), "a readable file") from error
     except Exception as error:  # a stranger's opcodes in any order: every failure is the file's
         found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
         raise InputError(culprit, found, "a pickle of plain containers and NumPy arrays") from error
