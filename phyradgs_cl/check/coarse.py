@@ -15,6 +15,7 @@ from phyradgs_cl.fields import Grid
 _MOST_FRAMES = 60
 _LEAST_VALID = 0.5  # of a block's pixels
 _MOST_VOXELS = 64  # per side
+_MARGIN = 1  # voxels: an object that fills the box, cut off at coarse voxels' centres, fits better where it is made smaller
 _SMOOTH = 0.8  # of a block: standard deviation
 _KEPT_COLUMNS = 12  # of blocks, where the panel has as many
 
@@ -105,12 +106,16 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: ConeGeometry, voxels: float) -> Grid:
-    """The same box in cubes (nearly) that are a pixel at the axis over ``voxels`` wide; never finer than the scan's own."""
+    """The same box and a voxel around it, in cubes (nearly) that are a pixel at the axis over ``voxels`` wide.
+
+    They are never finer than the scan's own.
+    """
     pixel_mm = min(geometry.pixel_size_mm) / geometry.magnification
     wanted_mm = max(pixel_mm / voxels, max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     shape = [max(1, math.ceil(side / wanted_mm - 1e-6)) for side in grid.size_mm]
     voxel = [side / n for side, n in zip(grid.size_mm, shape, strict=True)]
-    return Grid((shape[0], shape[1], shape[2]), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
+    nz, ny, nx = (n + 2 * _MARGIN for n in shape)
+    return Grid((nz, ny, nx), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
 def _binned_panel(geometry: ConeGeometry, block: int) -> ConeGeometry:
