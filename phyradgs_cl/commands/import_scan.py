@@ -136,11 +136,15 @@ def import_command(
         with finish_despite_interrupt():
             write_scan(output, scan)
     frames, rows, columns = scan.projections.shape
-    masked = 0 if scan.pixel_mask is None else int(np.count_nonzero(scan.pixel_mask))
+    bad = np.zeros(1, bool) if scan.pixel_mask is None else np.asarray(scan.pixel_mask) != 0
+    masked, largest = int(np.count_nonzero(bad)), float(np.max(scan.projections, where=~bad, initial=-np.inf))
+    whole = [] if bad.ndim < 3 else np.flatnonzero(bad.all((1, 2))).tolist()
+    if whole:
+        remark(f"no pixel can be used in {len(whole)} frames (from 0): {', '.join(map(str, whole[:10]))}")
     kind = "fly-scan" if scan.is_fly else "at rest"
     say(
         f"{output}: {chosen}, {frames} frames of {rows}×{columns}, {kind}, "
-        f"largest line integral {scan.projections.max():.3g}, {masked} pixels masked"
+        f"largest line integral {largest:.3g}, {masked} pixels masked"
     )
 
 

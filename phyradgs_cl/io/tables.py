@@ -28,7 +28,7 @@ def read_toml(path: Path, culprit: str = "") -> dict[str, Any]:
     """The content of a TOML file. Raises InputError, about ``culprit`` or the path, where there is none or no TOML."""
     culprit = culprit or str(path)
     try:
-        return tomllib.loads(read_regular(path, culprit, _MOST_TOML_BYTES, "a TOML file").decode("utf-8"))
+        return tomllib.loads(read_regular(path, culprit, _MOST_TOML_BYTES, "a TOML file").decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
         raise InputError(culprit, f"text that is not TOML ({error})", "a TOML file") from error
 

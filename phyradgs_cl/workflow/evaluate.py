@@ -16,6 +16,7 @@ from phyradgs_cl.metrics import compare, resampled, slices_png
 from phyradgs_cl.reconstructors.interrupt import (
     finish_despite_interrupt,
 )
+from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
             raise InputError(str(volume_path), found, "volumes in one place")
         where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
         rest = "" if share == 1 else f"; {100 * share:.3g} % of those lie in the volume, the rest counts as 0"
-        log.warning("%s: resampled (linear) %s%s", volume_path, where, rest)
+        log.warning("%s: resampled (linear) %s%s", plain_text(str(volume_path)), where, rest)
         told = {"resampled": where, "share_of_reference_covered": share}
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")

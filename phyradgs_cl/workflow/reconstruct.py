@@ -48,9 +48,11 @@ from phyradgs_cl.reconstructors.interrupt import (
 )
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
+from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 
 log = logging.getLogger(__name__)
+_FOREIGN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".npy", ".npz", ".tif", ".tiff", ".dcm", ".ply", ".png")
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,7 @@ def run_reconstruction(
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)
     if leads:
+        _refuse_foreign_suffix(job.output)
         check_writable(job.output)
     for path in (job.output, partial_path(job.output)):
         refuse_overwriting("-o", path, job.scan, *([job.config] if job.config else []))
@@ -219,6 +222,14 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
     uses = rt.kernel_uses()
     pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
     return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)
+
+
+def _refuse_foreign_suffix(output: Path) -> None:
+    """What is written is HDF5: under another format's suffix other programs would take it for that."""
+    ending = next((end for end in _FOREIGN if output.name.lower().endswith(end)), None)
+    if ending is not None:
+        remedy = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
+        raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as volume.h5", remedy)
 
 
 def _write_result(

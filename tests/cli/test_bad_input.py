@@ -234,6 +234,14 @@ def test_outputs_that_cannot_be_written(cli, good_scan, tmp_path, capfd):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_volume_is_not_written_under_another_formats_suffix(cli, good_scan, tmp_path, capfd):
+    for name in ("v.nii", "v.nii.gz", "V.MHA"):
+        assert cli.run(["reconstruct", str(good_scan), "--method", "fdk", "-o", str(tmp_path / name)]) == 2
+        error = capfd.readouterr().err
+        assert error.count("\n") == 1 and "another format" in error and f"export volume.h5 -o {name}" in error
+        assert not (tmp_path / name).exists()
+
+
 def test_the_scan_is_never_overwritten_by_its_volume(cli, good_scan, tmp_path, capfd):
     scan = tmp_path / "scan.h5"
     shutil.copy(good_scan, scan)

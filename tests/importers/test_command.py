@@ -170,3 +170,18 @@ def test_a_title_with_a_nul_and_a_folder_whose_name_is_no_text(run, tmp_path, ma
         scan = read_scan(out, counts_to_attenuation)
         assert scan.title == ("a\ufffdb\ufffd" if title else "bad\ufffd")
         assert scan.provenance["imported_from"] == str(folder)
+
+
+def test_frames_without_a_pixel_are_named_and_do_not_count(run, tmp_path) -> None:
+    counts = np.random.default_rng(0).uniform(500.0, 900.0, (3, 4, 5)).astype(np.float32)
+    counts[0, 0, 0] = 500.0
+    counts[1] = 0.0
+    with h5py.File(tmp_path / "dx.h5", "w") as file:
+        file["exchange/data"], file["exchange/theta"] = counts, np.array([0.0, 120.0, 240.0])
+        file["exchange/data_white"] = np.full((2, 4, 5), 1000.0, np.float32)
+        file["exchange/data_dark"] = np.zeros((1, 4, 5), np.float32)
+    where = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--pixel-size-mm", "1,1")
+    done = run(tmp_path / "dx.h5", "-o", tmp_path / "s.h5", *where)
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert "largest line integral 0.693, 20 pixels masked" in done.output
+    assert "no pixel can be used in 1 frames (from 0): 1" in done.output

@@ -65,6 +65,11 @@ def test_all_fields(write) -> None:
     assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("columns", -1, 0.5)
 
 
+def test_a_byte_order_mark_is_no_part_of_the_text(write) -> None:
+    """Editors of Windows write one."""
+    assert load_scanner(write("\ufeff" + GOOD), DATA) == load_scanner(write(GOOD), DATA)
+
+
 def test_pulse_and_lag_of_a_scanner(write) -> None:
     plain = load_scanner(write(GOOD), DATA)
     assert plain.pulse is None and plain.lag == 0
