@@ -1,0 +1,121 @@
+/* Soft threshold of all 4³ block DCTs of a volume, averaged (translation-invariant shrinkage, Coifman and Donoho 1995).
+
+   What is shrunk away, clamp(B v, ±threshold) without the mean of the block, is gathered in ``excess``: the result is
+   v − excess / blocks that cover a voxel. Volumes are (z, y, pitch) with a guard. A work-item has one block in registers, and
+   along x a vector of blocks one voxel apart; blocks of one launch do not meet in y and z, so that nothing adds at one time.
+   Where work-items are the lanes they do not meet in x either. Twin: objective/dct_prox.py. */
+#include "common/lanes.h"
+
+#define EDGE 4
+#define BLOCK 64
+#define COS_1 0.65328148f /* cos(π/8)/√2 */
+#define COS_3 0.27059805f /* cos(3π/8)/√2 */
+
+/* Orthonormal DCT-II of four values ``step`` apart. */
+static inline void forward_4(vf *v, const int step)
+{
+    const vf outer = v[0] + v[3 * step], inner = v[step] + v[2 * step];
+    const vf slope = v[0] - v[3 * step], middle = v[step] - v[2 * step];
+    v[0] = 0.5f * (outer + inner);
+    v[step] = COS_1 * slope + COS_3 * middle;
+    v[2 * step] = 0.5f * (outer - inner);
+    v[3 * step] = COS_3 * slope - COS_1 * middle;
+}
+
+/* Its transpose. */
+static inline void inverse_4(vf *v, const int step)
+{
+    const vf outer = 0.5f * (v[0] + v[2 * step]), inner = 0.5f * (v[0] - v[2 * step]);
+    const vf slope = COS_1 * v[step] + COS_3 * v[3 * step], middle = COS_3 * v[step] - COS_1 * v[3 * step];
+    v[0] = outer + slope;
+    v[step] = inner + middle;
+    v[2 * step] = inner - middle;
+    v[3 * step] = outer - slope;
+}
+
+/* The clamped coefficients of the block(s) at ``corner``, back in space. */
+static inline void shrunk(__global const float *volume, const size_t corner, const int pitch, const size_t slice,
+                          const float threshold, vf *block)
+{
+    for (int k = 0; k < EDGE; k++)
+        for (int j = 0; j < EDGE; j++)
+            for (int i = 0; i < EDGE; i++)
+                block[(k * EDGE + j) * EDGE + i] = V_LOAD(volume + corner + k * slice + j * pitch + i);
+    for (int n = 0; n < BLOCK; n += 4)
+        forward_4(block + n, 1);
+    for (int n = 0; n < 16; n++)
+        forward_4(block + (n / 4) * 16 + n % 4, 4);
+    for (int n = 0; n < 16; n++)
+        forward_4(block + n, 16);
+    block[0] = (vf)(0.0f);
+    for (int n = 1; n < BLOCK; n++)
+        block[n] = fmin(fmax(block[n], (vf)(-threshold)), (vf)(threshold));
+    for (int n = 0; n < 16; n++)
+        inverse_4(block + n, 16);
+    for (int n = 0; n < 16; n++)
+        inverse_4(block + (n / 4) * 16 + n % 4, 4);
+    for (int n = 0; n < BLOCK; n += 4)
+        inverse_4(block + n, 1);
+}
+
+__kernel void dct_excess(
+    __global const float *volume, const int4 shape, const int pitch,
+    const int4 shift,                /* of the first block, x y z; x counts where work-items are pixels */
+    const float threshold, __global float *excess)
+{
+    const int y = EDGE * (int)get_global_id(1) + shift.y, z = EDGE * (int)get_global_id(2) + shift.z;
+    if (y + EDGE > shape.y || z + EDGE > shape.z)
+        return;
+    const size_t slice = (size_t)shape.y * pitch;
+    const size_t row = IMAGE_GUARD + z * slice + (size_t)y * pitch;
+    const int last = shape.x - EDGE;
+    vf block[BLOCK];
+#if BLOCK_PIXEL
+    const int x = EDGE * (int)get_global_id(0) + shift.x;
+    if (x > last)
+        return;
+#else
+    for (int x = 0; x <= last; x += LANES)
+#endif
+    {
+        shrunk(volume, row + x, pitch, slice, threshold, block);
+        const vf inside = V_PICK(0.0f, 1.0f, (vf)(x) + V_IOTA <= (float)last);
+        for (int k = 0; k < EDGE; k++)
+            for (int j = 0; j < EDGE; j++) {
+                __global float *line = excess + row + x + k * slice + j * pitch;
+                for (int i = 0; i < EDGE; i++)
+                    V_STORE(V_LOAD(line + i) + inside * block[(k * EDGE + j) * EDGE + i], line + i);
+            }
+    }
+}
+
+/* Blocks along one axis that cover voxel ``at``. */
+static inline int covering(const int at, const int count)
+{
+    return min(at, count - EDGE) - max(0, at - EDGE + 1) + 1;
+}
+
+/* Plain (nz, ny, nx) to the padded layout. */
+__kernel void dct_start(
+    __global const float *volume, const int4 shape, const int pitch, __global float *padded, __global float *excess)
+{
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
+    if (x >= shape.x)
+        return;
+    const size_t row = (size_t)z * shape.y + y;
+    padded[IMAGE_GUARD + row * pitch + x] = volume[row * shape.x + x];
+    excess[IMAGE_GUARD + row * pitch + x] = 0.0f;
+}
+
+__kernel void dct_end(
+    __global const float *volume, __global const float *excess, const int4 shape, const int pitch, const int nonnegative,
+    __global float *result)
+{
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
+    if (x >= shape.x)
+        return;
+    const size_t row = (size_t)z * shape.y + y;
+    const int blocks = covering(x, shape.x) * covering(y, shape.y) * covering(z, shape.z);
+    const float value = volume[row * shape.x + x] - excess[IMAGE_GUARD + row * pitch + x] / (float)max(blocks, 1);
+    result[row * shape.x + x] = nonnegative ? fmax(value, 0.0f) : value;
+}

@@ -1,0 +1,41 @@
+"""Shrinkage of block cosine transforms: kernel against twin, twin against what defines it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import FLOAT32, FLOAT64
+
+from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
+
+SHAPES = [(5, 6, 7), (4, 4, 33), (17, 4, 20), (9, 11, 16), (3, 8, 8), (1, 1, 1)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_kernel_is_its_twin(any_rt, shape) -> None:
+    volume = np.random.default_rng(1).normal(size=shape).astype(np.float32)
+    prox, on_device = DctProx(any_rt, shape), any_rt.upload(volume)
+    for nonnegative in (False, True):
+        found = any_rt.empty(shape)
+        prox(on_device, 0.4, nonnegative=nonnegative, result=found)
+        np.testing.assert_allclose(
+            any_rt.download(found), dct_prox(volume, 0.4, nonnegative=nonnegative), rtol=0, atol=FLOAT32
+        )
+    prox(on_device, 0.4, nonnegative=True, result=on_device)  # in place, the same bits
+    np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(found))
+
+
+def test_what_is_kept_and_what_goes() -> None:
+    """A constant stays; noise below the threshold leaves its block means; a strong wave loses the threshold alone."""
+    rng = np.random.default_rng(0)
+    flat = np.full((8, 8, 8), 3.0)
+    np.testing.assert_allclose(dct_prox(flat, 1.0, nonnegative=True), flat, atol=FLOAT64)
+    noise = 1e-3 * rng.normal(size=(12, 12, 12))
+    smoothed = dct_prox(flat[0, 0, 0] + noise, 1.0, nonnegative=True) - 3
+    assert smoothed[4:8, 4:8, 4:8].std() < noise.std() / 8  # the mean over 64 voxels and their 64 shifts
+    block = np.zeros((4, 4, 4))
+    block[...] = 10 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)  # one coefficient of the only block
+    norm = np.linalg.norm(block)
+    np.testing.assert_allclose(
+        dct_prox(block, 2.0, nonnegative=False), block * (norm - 2) / norm, atol=FLOAT64
+    )
