@@ -5,9 +5,11 @@ from phyradgs_cl.runtime.device import DEVICE_VARIABLE, DeviceInfo, choose_devic
 from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import (
     MEMORY_VARIABLE,
+    Array,
     DeviceArray,
     MemoryShortage,
     Room,
+    Traffic,
     bytes_of,
     with_smaller_bricks,
 )
@@ -16,6 +18,7 @@ from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
 __all__ = [
     "DEVICE_VARIABLE",
     "MEMORY_VARIABLE",
+    "Array",
     "DeviceArray",
     "DeviceInfo",
     "Kernel",
@@ -24,6 +27,7 @@ __all__ = [
     "Rates",
     "Room",
     "Runtime",
+    "Traffic",
     "bytes_of",
     "choose_device",
     "list_devices",
