@@ -1,8 +1,8 @@
 """The only room that knows OpenCL: devices, programs, buffers, launches."""
 
+from phyradgs_cl.runtime.algebra import DeviceSpace, HostSpace, Space
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.device import DEVICE_VARIABLE, DeviceInfo, choose_device, list_devices
-from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import (
     MEMORY_VARIABLE,
     Array,
@@ -14,6 +14,7 @@ from phyradgs_cl.runtime.memory import (
     with_smaller_bricks,
 )
 from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
+from phyradgs_cl.runtime.source import Kernel
 
 __all__ = [
     "DEVICE_VARIABLE",
@@ -21,12 +22,15 @@ __all__ = [
     "Array",
     "DeviceArray",
     "DeviceInfo",
+    "DeviceSpace",
+    "HostSpace",
     "Kernel",
     "KernelUse",
     "MemoryShortage",
     "Rates",
     "Room",
     "Runtime",
+    "Space",
     "Traffic",
     "bytes_of",
     "choose_device",

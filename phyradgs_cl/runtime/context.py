@@ -15,11 +15,10 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
-from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, Traffic, memory_limit
 from phyradgs_cl.runtime.opencl import cl
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
-from phyradgs_cl.runtime.source import kernel_source
+from phyradgs_cl.runtime.source import Kernel, kernel_source
 
 log = logging.getLogger(__name__)
 
@@ -183,9 +182,31 @@ class Runtime:
         return value[0]
 
     @naming_failures("a copy")
-    def copy(self, source: DeviceArray, target: DeviceArray) -> None:
-        event = cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes)
-        self._record("copy", event, 2 * source.nbytes)
+    def copy(
+        self,
+        source: DeviceArray,
+        target: DeviceArray,
+        *,
+        nbytes: int | None = None,
+        source_offset: int = 0,
+        target_offset: int = 0,
+    ) -> None:
+        """Bytes of one device array to another: all of the source's, or ``nbytes`` between the offsets given."""
+        count = source.nbytes if nbytes is None else nbytes
+        event = cl.enqueue_copy(
+            self.queue,
+            target.buffer,
+            source.buffer,
+            byte_count=count,
+            src_offset=source_offset,
+            dst_offset=target_offset,
+        )
+        self._record("copy", event, 2 * count)
+
+    @staticmethod
+    def local(nbytes: int) -> cl.LocalMemory:
+        """Local memory of a work-group, as an argument of a launch."""
+        return cl.LocalMemory(nbytes)
 
     # --- launches -----------------------------------------------------------------------------------
 
