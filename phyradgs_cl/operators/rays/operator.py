@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Any
+from typing import Any, TypeVar
 from typing import Protocol as Interface
-from typing import TypeVar
 
 import numpy as np
 
@@ -32,12 +31,12 @@ class LinearOperator(Interface):
     @property
     def frames_shape(self) -> tuple[int, int, int]: ...
 
-    def forward(self, volume: A, out: A | None = None) -> A:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32, into ``out`` if there is one."""
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
         ...
 
-    def adjoint(self, frames: A, out: A | None = None) -> A:
-        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32, into ``out`` if there is one."""
+    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         ...
 
     def subset(self, frames: Sequence[int]) -> LinearOperator:
