@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +15,8 @@ from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
 from phyradgs_cl.operators.rays.layout import voxel_matrices
-from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, with_smaller_bricks
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
-
-A = TypeVar("A", np.ndarray, DeviceArray)
 
 _VIEWS_PER_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28
@@ -29,7 +27,7 @@ _UPRIGHT = 1e-7  # of the depth: how far u or depth may move over the whole heig
 _Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
-def backproject(rt: Runtime, frames: A, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> A:
+def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> SameArray:
     """Σ_f weight_f / z² · frame_f(u, v) at every voxel centre, z the voxel's depth as a share of the ray.
 
     frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). Returns (z, y, x) float32, on the
@@ -44,8 +42,8 @@ def backproject(rt: Runtime, frames: A, pose: np.ndarray, weight: np.ndarray, gr
 
 
 def backproject_lines(
-    rt: Runtime, frames: A, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
-) -> A:
+    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
+) -> SameArray:
     """The same where every line of a frame has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
 
     A voxel takes the line r whose pose projects it onto r, by linear interpolation between neighbouring lines, and

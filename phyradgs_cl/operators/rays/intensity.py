@@ -18,8 +18,8 @@ from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import layered
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.rays.operator import A, RayOperator
-from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, Space
+from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, SameArray, Space
 
 _HOST = HostSpace()
 
@@ -55,7 +55,7 @@ class IntensityOperator:
         """The most cells of a line: so many times I hold frames."""
         return len(self._operators)
 
-    def expected(self, volume: A, out: A | None = None) -> A:
+    def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
         self._shares = []  # their memory is wanted again
         if isinstance(volume, DeviceArray):
@@ -68,7 +68,7 @@ class IntensityOperator:
             frames, self._shares = averaged.astype(np.float32), [s.astype(np.float32) for s in shares]
         return self._given(frames, out)
 
-    def forward(self, volume: A, out: A | None = None) -> A:
+    def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """J d: a change of the volume (nz, ny, nx) to that of the frames (F, rows, columns) float32."""
         space = self._space(volume)
         total: Any = None
@@ -77,7 +77,7 @@ class IntensityOperator:
             total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
         return self._given(total, out)
 
-    def adjoint(self, frames: A, out: A | None = None) -> A:
+    def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Jᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         space = self._space(frames)
         total: Any = None
