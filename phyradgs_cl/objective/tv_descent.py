@@ -5,6 +5,9 @@ Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777; backward differences and their f
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import cast
+
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Runtime, SameArray
@@ -24,21 +27,29 @@ class TvDescent:
 
     def gradient(self, volume: SameArray) -> SameArray:
         """dTV/dvolume (z, y, x) float32, on the device where the volume is."""
-        if not isinstance(volume, DeviceArray):
-            return self.rt.download(self.gradient(self.rt.upload(volume, np.float32)))
+        return self._where_it_is(self._gradient, volume)
+
+    def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
+        """``count`` steps of Euclidean length ``step`` (1/mm) downhill; of a device array on the device alone."""
+
+        def descended(x: DeviceArray) -> DeviceArray:
+            for _ in range(count):
+                x = self._space.descend(x, self._gradient(x), step)
+            return x
+
+        return self._where_it_is(descended, volume)
+
+    def _gradient(self, volume: DeviceArray) -> DeviceArray:
         nz, ny, nx = self.shape
         gradient = self._space.empty(self.shape)
         items, group = (nx, ny, nz), self.rt.group(on_cpu=16)
         self.rt.launch(self._kernel, items, volume, self._shape4, gradient, group=group)
         return gradient
 
-    def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """``count`` steps of Euclidean length ``step`` (1/mm) downhill; of a device array on the device alone."""
-        if not isinstance(volume, DeviceArray):
-            return self.rt.download(self(self.rt.upload(volume, np.float32), step, count))
-        for _ in range(count):
-            volume = self._space.descend(volume, self.gradient(volume), step)
-        return volume
+    def _where_it_is(self, function: Callable[[DeviceArray], DeviceArray], volume: SameArray) -> SameArray:
+        if isinstance(volume, DeviceArray):
+            return cast(SameArray, function(volume))
+        return cast(SameArray, self.rt.download(function(self.rt.upload(volume, np.float32))))
 
 
 def tv_gradient(volume: np.ndarray) -> np.ndarray:

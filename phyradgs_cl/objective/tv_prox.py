@@ -6,6 +6,8 @@ an axis may be weighted, for voxels that are not cubes.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
@@ -45,13 +47,11 @@ class TvProx:
 
         A device array gives a device array, ``out`` if there is one, and nothing crosses the bus.
         """
-        if isinstance(volume, DeviceArray):
-            result = self.rt.empty(self.shape) if out is None else out
-            self._map(volume, weight, iterations, nonnegative, result)
-            return result
-        observed, result = self.rt.upload(volume, np.float32), self.rt.empty(self.shape)
+        is_there = isinstance(volume, DeviceArray)
+        observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
+        result = self.rt.empty(self.shape) if out is None else out
         self._map(observed, weight, iterations, nonnegative, result)
-        return self.rt.download(result)
+        return cast(SameArray, result if is_there else self.rt.download(result))
 
     def _map(
         self, observed: DeviceArray, weight: float, iterations: int, nonnegative: bool, result: DeviceArray

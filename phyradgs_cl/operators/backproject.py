@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import numpy as np
 
@@ -37,8 +37,10 @@ def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.nda
     block = 0 if rt.pixel_items else _upright_block(matrices, grid)
     views = _Views(frames, bool(block), matrices, weight)
     if block:
-        return _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, block, *where))
-    return _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
+        volume = _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, block, *where))
+    else:
+        volume = _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
+    return cast(SameArray, volume)
 
 
 def backproject_lines(
@@ -55,7 +57,7 @@ def backproject_lines(
     matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(pose), -1)
     across = np.int32(axis == "columns")
     views = _Views(frames, axis == "columns", matrices, weight)
-    return _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where))
+    return cast(SameArray, _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,7 @@ class _Views:
 _Launch = Callable[["_Arguments", Brick, DeviceArray], None]
 
 
-def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> Any:
+def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> Array:
     """The volume (z, y, x), in bricks of a multiple of ``step`` voxels along z where it does not fit as a whole."""
 
     is_resident = isinstance(views.frames, DeviceArray)
@@ -186,7 +188,7 @@ def _images(rt: Runtime, views: _Views, part: slice) -> _Arguments:
     count, each = images.shape
     sizes = (np.int32(count), np.int32(rows), np.int32(width), np.int32(pitch_of(width)), np.int64(each))
     tables = (rt.upload(table[part], np.float32) for table in (views.matrices, views.weight))
-    return (images, *tables, *sizes)  # type: ignore[return-value]
+    return (images, *tables, *sizes)
 
 
 def _volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:

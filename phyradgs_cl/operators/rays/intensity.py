@@ -43,6 +43,7 @@ class IntensityOperator:
             self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
         self._by_row = tables[0].axis == "rows"
         self._device = DeviceSpace(rt)
+        self._shares: list[Any] = []
         self._set(weights)
 
     @property
@@ -58,6 +59,7 @@ class IntensityOperator:
     def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
         self._shares = []  # their memory is wanted again
+        frames: Array
         if isinstance(volume, DeviceArray):
             p = [self._device.apply(operator.forward, volume, self.frames_shape) for operator in self._operators]
             frames, self._shares = self._device_average(p)
@@ -65,8 +67,10 @@ class IntensityOperator:
             averaged, shares = intensity_average(
                 [operator.forward(volume) for operator in self._operators], self._weights
             )
-            frames, self._shares = averaged.astype(np.float32), [s.astype(np.float32) for s in shares]
-        return self._given(frames, out)
+            frames = averaged.astype(np.float32)
+            self._shares = [share.astype(np.float32) for share in shares]
+        same: SameArray = self._given(frames, out)
+        return same
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """J d: a change of the volume (nz, ny, nx) to that of the frames (F, rows, columns) float32."""
@@ -75,7 +79,8 @@ class IntensityOperator:
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
             part = space.apply(operator.forward, volume, self.frames_shape)
             total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
-        return self._given(total, out)
+        same: SameArray = self._given(total, out)
+        return same
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Jᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
@@ -84,7 +89,8 @@ class IntensityOperator:
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
             part = space.apply(operator.adjoint, space.multiply(frames, share), self.volume_shape)
             total = part if total is None else space.add(total, part)
-        return self._given(total, out)
+        same: SameArray = self._given(total, out)
+        return same
 
     def subset(self, frames: Sequence[int]) -> IntensityOperator:
         """The same for some of the frames, in this order, with a volume of its own for J."""
@@ -99,15 +105,16 @@ class IntensityOperator:
         """Weights (F, lines, 1) or (F, 1, lines) of each layer; shares are those of a volume of zeros."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
-        self._shares: list[Any] = []
+        self._shares = []
 
     def _space(self, like: Array) -> Space[Any]:
         return self._device if isinstance(like, DeviceArray) else _HOST
 
-    def _given(self, result: Any, out: Any) -> Any:
+    def _given(self, result: Any, out: SameArray | None) -> SameArray:
         """The result, in ``out`` if there is one."""
         if out is None:
-            return result
+            new: SameArray = result
+            return new
         if isinstance(out, DeviceArray):
             self._device.rt.copy(result, out)
         else:

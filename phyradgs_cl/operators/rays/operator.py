@@ -21,7 +21,7 @@ from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_sma
 
 
 class LinearOperator(Interface):
-    """What the iterative methods need to know of a scanner: SameArray, Aᵀ, and A restricted to some frames."""
+    """What the iterative methods need to know of a scanner: A, Aᵀ, and A restricted to some frames."""
 
     @property
     def volume_shape(self) -> tuple[int, ...]: ...
@@ -96,7 +96,7 @@ class RayOperator:
     def project(self, volume: SameArray, average: str, out: SameArray | None = None) -> SameArray:
         """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""
         _check_shape("volume", volume, self.volume_shape)
-        result = _room_for(self.rt, self.frames_shape, volume, out)
+        result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
         with_smaller_bricks(
             "ray-driven projector", lambda share: self._project(volume, average, share, result)
         )
@@ -141,7 +141,7 @@ class RayOperator:
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Aᵀ y; frames (F, rows, columns), result (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
-        result = _room_for(self.rt, self.volume_shape, frames, out)
+        result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
         with_smaller_bricks(
             "ray-driven backprojector", lambda share: self._adjoint(frames, share, result)
         )

@@ -121,7 +121,6 @@ class FistaTv:
 
     def restore(self, state: State) -> None:
         *arrays, momentum, dual = state_arrays(state, [*_ARRAYS, "momentum", "dual"])
-        arrays = map(self.system.space.array, arrays)
-        self.volume, self.previous, self.projected, self.projected_previous = arrays
+        self.volume, self.previous, self.projected, self.projected_previous = map(self.system.space.array, arrays)
         self.momentum, self.prox.dual = float(momentum), dual
         self.system.stand_at(self.volume)

@@ -1,7 +1,7 @@
 """The linear system A x = p of a scan under a motion model, as the iterative methods see it.
 
-Its arrays lie on the device from the first iteration to the last where everything fits there (``resident``), else on the host;
-a method does the same with both, through the system's ``space``.
+Its arrays lie on the device from the first iteration to the last where everything fits there (``resident``), else on the
+host; a method does the same with both, through the system's ``space``.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _FAINTEST = 1e-6  # of the largest sum over a voxel's rays
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Operator A and measurement p (F, rows, columns) float32; ``valid`` (F, rows, columns) or (rows, columns), 1 or 0, None:
-    all pixels. Volumes (nz, ny, nx) and frames are arrays of ``space``.
+    """Operator A and measurement p (F, rows, columns) float32; ``valid`` (F, rows, columns) or (rows, columns), 1 or 0;
+    None: all pixels. Volumes (nz, ny, nx) and frames are arrays of ``space``.
 
     Pixels that are not valid are 0 in ``measured`` and in every residual, as if their rows were not in A.
     ``intensity`` is there where the detector adds photons: the measurement is then compared with I(x) instead of A x,
@@ -68,22 +68,21 @@ class System:
 
         Else the system itself, on the host: in bricks, and on ranks, which sum there.
         """
-        operators = [self.operator, *([] if self.intensity is None else [self.intensity])]
-        if not all(isinstance(o, (RayOperator, IntensityOperator)) for o in operators):
+        operators = [o for o in (self.operator, self.intensity) if isinstance(o, (RayOperator, IntensityOperator))]
+        if len(operators) < 1 + (self.intensity is not None):
             return self
         layers = self.intensity.layers if isinstance(self.intensity, IntensityOperator) else 0
         volume_bytes, frames_bytes = 4 * math.prod(self.operator.volume_shape), self.measured.nbytes
         sizes_bytes = [volume_bytes] * volumes + [frames_bytes] * (frames + layers)
         try:
-            whole = all(o.memory.holds_all(self.frames) for o in operators)  # type: ignore[union-attr]
+            whole = all(o.memory.holds_all(self.frames) for o in operators)
         except MemoryShortage:
             whole = False
         if not (whole and rt.room().holds(*sizes_bytes)):
             log.info("the device has no room for all arrays of the method: they stay on the host")
             return self
         space = DeviceSpace(rt)
-        kept = (None if a is None else space.array(a) for a in (self.valid, self.transmission))
-        valid, transmission = kept
+        valid, transmission = (None if a is None else space.array(a) for a in (self.valid, self.transmission))
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
     @property
