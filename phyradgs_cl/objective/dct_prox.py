@@ -8,11 +8,12 @@ blocks (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT:
 from __future__ import annotations
 
 import itertools
+from typing import cast
 
 import numpy as np
 import scipy.fft
 
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 EDGE = 4
@@ -31,31 +32,33 @@ class DctProx:
         self._padded = padded_zeros(rt, nz * ny, nx)
         self._excess = padded_zeros(rt, nz * ny, nx)
 
-    def __call__(self, volume: DeviceArray, threshold: float, *, nonnegative: bool, result: DeviceArray) -> None:
-        """The map of ``volume`` (z, y, x) float32 into ``result``, which may be the same; ``threshold`` in its unit."""
+    def __call__(
+        self, volume: SameArray, threshold: float, *, nonnegative: bool, out: DeviceArray | None = None
+    ) -> SameArray:
+        """The map of a volume (z, y, x), float32; ``threshold`` in its unit, of coefficients of the orthonormal transform.
+
+        A device array gives a device array, ``out`` if there is one, and nothing crosses the bus.
+        """
+        is_there = isinstance(volume, DeviceArray)
+        observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
+        result = self.rt.empty(self.shape) if out is None else out
+        self._map(observed, threshold, nonnegative, result)
+        return cast(SameArray, result if is_there else self.rt.download(result))
+
+    def _map(self, volume: DeviceArray, threshold: float, nonnegative: bool, result: DeviceArray) -> None:
         rt, (nz, ny, nx) = self.rt, self.shape
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
-        rt.launch(
-            self._start, voxels, volume, self._shape4, self._pitch, self._padded, self._excess, group=by_voxel
-        )
-        blocks_y, blocks_z = -(-ny // EDGE), -(-nz // EDGE)
-        blocks_x = -(-nx // EDGE) if rt.pixel_items else 1
-        for shift in itertools.product(range(EDGE), range(EDGE), range(EDGE if rt.pixel_items else 1)):
-            rt.launch(
-                self._excess_of,
-                (blocks_x, blocks_y, blocks_z),
-                self._padded,
-                self._shape4,
-                self._pitch,
-                np.array([*shift[::-1], 0], np.int32),
-                np.float32(threshold),
-                self._excess,
-                group=rt.group(),
-            )
-        rt.launch(
-            self._end, voxels, volume, self._excess, self._shape4, self._pitch, np.int32(nonnegative), result,
-            group=by_voxel,
-        )  # fmt: skip
+        layout = self._shape4, self._pitch
+        rt.launch(self._start, voxels, volume, *layout, self._padded, self._excess, group=by_voxel)
+        # blocks of one launch are apart: in x too where they are work-items, else a vector of them is one
+        along_x = EDGE if rt.pixel_items else 1
+        blocks = -(-nx // EDGE) if rt.pixel_items else 1, -(-ny // EDGE), -(-nz // EDGE)
+        for z, y, x in itertools.product(range(EDGE), range(EDGE), range(along_x)):
+            shift = np.array([x, y, z, 0], np.int32)
+            arguments = self._padded, *layout, shift, np.float32(threshold), self._excess
+            rt.launch(self._excess_of, blocks, *arguments, group=rt.group())
+        clip = np.int32(nonnegative)
+        rt.launch(self._end, voxels, volume, self._excess, *layout, clip, result, group=by_voxel)
 
 
 def dct_prox(volume: np.ndarray, threshold: float, *, nonnegative: bool) -> np.ndarray:

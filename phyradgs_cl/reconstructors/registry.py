@@ -57,6 +57,7 @@ METHODS = _Methods({
     "sirt": "voxels.sirt",
     "cgls": "voxels.cgls",
     "asd-pocs": "voxels.asd_pocs",
+    "fista": "voxels.fista",
     "fista-tv": "voxels.fista_tv",
     "naf": "neural.naf",
     "sax-nerf": "neural.sax_nerf",

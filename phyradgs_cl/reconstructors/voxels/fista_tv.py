@@ -13,7 +13,6 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
@@ -23,6 +22,7 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
     state_arrays,
 )
+from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
@@ -67,13 +67,6 @@ def fista_tv(
 
 
 METHOD = Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True)
-
-
-def axis_weights(grid: Grid) -> tuple[float, float, float]:
-    """Weights (z, y, x) that make differences slopes, 1 along the finest axis."""
-    finest = min(grid.voxel_size_mm)
-    z, y, x = (finest / pitch for pitch in grid.voxel_size_mm)
-    return z, y, x
 
 
 class FistaTv:

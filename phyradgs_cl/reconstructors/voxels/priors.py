@@ -1,0 +1,111 @@
+"""Priors of volumes by name, as proximal maps that start from where the last one ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+from typing import Protocol as Interface
+
+import numpy as np
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.objective import DctProx, TvProx
+from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.runtime import Runtime, Space
+
+PRIORS = ("dct", "tv", "none")
+_TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where both are in one step
+
+
+class Prior(Interface):
+    """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or what stands for one."""
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        """The map of a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the next map starts from."""
+        ...
+
+    def restore(self, state: State) -> None: ...
+
+
+def prior_of(name: str, rt: Runtime, grid: Grid, tv_iterations: int) -> Prior:
+    """A prior by its name in ``PRIORS``."""
+    tv = TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations)
+    if name == "tv":
+        return tv
+    return TvAndDct(tv, DctProx(rt, grid.shape)) if name == "dct" else NoPrior()
+
+
+def axis_weights(grid: Grid) -> tuple[float, float, float]:
+    """Weights (z, y, x) that make differences slopes, 1 along the finest axis."""
+    finest = min(grid.voxel_size_mm)
+    z, y, x = (finest / pitch for pitch in grid.voxel_size_mm)
+    return z, y, x
+
+
+class TvPrior:
+    """Isotropic total variation."""
+
+    def __init__(self, prox: TvProx, iterations: int) -> None:
+        self.prox, self.iterations = prox, iterations
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        prox = partial(self.prox, weight=weight, iterations=self.iterations, nonnegative=nonnegative)
+        return space.apply(prox, volume, self.prox.shape)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {"dual": self.prox.dual}
+
+    def restore(self, state: State) -> None:
+        (self.prox.dual,) = state_arrays(state, ["dual"])
+
+
+class TvAndDct(TvPrior):
+    """Total variation, then the shrinkage of block DCTs: alone the latter falls where it is run on."""
+
+    def __init__(self, tv: TvPrior, shrink: DctProx) -> None:
+        super().__init__(tv.prox, tv.iterations)
+        self.shrink = shrink
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        smooth = super().__call__(space, volume, _TV_SHARE * weight, nonnegative=nonnegative)
+        shrink = partial(self.shrink, threshold=_DCT_SHARE * weight, nonnegative=nonnegative)
+        return space.apply(shrink, smooth, self.prox.shape)
+
+
+class NoPrior:
+    """Nothing but x ≥ 0."""
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        return space.add(volume, volume, 0.0, nonnegative=nonnegative)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def restore(self, state: State) -> None:
+        pass
+
+
+Denoiser = Callable[[np.ndarray, float], np.ndarray]
+"""(volume (nz, ny, nx) float32 in 1/mm, noise in 1/mm) → volume: a prior of one's own (plug-and-play)."""
+
+
+class OwnPrior:
+    """A user's denoiser on the host, in the place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        self.denoiser = denoiser
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        cleaned = np.asarray(self.denoiser(space.numpy(volume), weight), np.float32)
+        return space.array(np.maximum(cleaned, 0) if nonnegative else cleaned)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def restore(self, state: State) -> None:
+        pass
