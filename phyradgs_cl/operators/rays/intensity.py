@@ -52,9 +52,9 @@ class IntensityOperator:
         return self._operators[0].memory
 
     @property
-    def layers(self) -> int:
-        """The most cells of a line: so many times I hold frames."""
-        return len(self._operators)
+    def holds(self) -> tuple[int, int]:
+        """Volumes and stacks of frames that I take on a device beside ``memory``: p and share of every cell of a line."""
+        return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
