@@ -4,8 +4,6 @@ One line of text comes out of ``str()``, so that the command line can print it a
 scripts and listed in docs/trouble.md; 1 is Python's own, for a defect of this program.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

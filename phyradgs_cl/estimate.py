@@ -4,8 +4,6 @@ A cloud of Gaussians grows under density control, and its footprints with it: an
 again as the first ones. The trial therefore goes through the whole schedule in few iterations.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import sys

@@ -1,7 +1,5 @@
 """Where the files beside the package are: inside it in a wheel, beside it in a checkout."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent

@@ -1,7 +1,5 @@
 """What a run is asked to do: the configuration file, the command line that wins over it, and words into values."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

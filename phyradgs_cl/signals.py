@@ -6,8 +6,6 @@ nothing is raised here: the process removes its half-written files and ends. Wor
 this is to be in force as early as can be.
 """
 
-from __future__ import annotations
-
 import _signal as signal
 import os
 import sys
@@ -37,7 +35,7 @@ class InterruptedAfterwards(KeyboardInterrupt):
     """Ctrl-C that came during work which was finished all the same."""
 
 
-def answer(caught: int, frame: FrameType | None) -> None:
+def answer(caught: int, frame: "FrameType | None") -> None:
     """The handler: notes a signal that has to wait; else ends this process, or raises where it is not the command line's."""
     global number, asked_s
     number, now_s = caught, time.monotonic()

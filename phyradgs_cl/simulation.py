@@ -1,7 +1,5 @@
 """Simulation: a phantom or volume and an acquisition to frames, each line over its own time window."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace

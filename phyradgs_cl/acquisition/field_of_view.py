@@ -1,7 +1,5 @@
 """What a circular scan sees, and grids that see less."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0)
 column to the next (û·du) and from one row to the next (v̂·dv). Operators take poses, never angles.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,7 +60,7 @@ class ConeGeometry:
         )
         return np.concatenate([self.source_to_axis_mm * radial, first_pixel, du * u_hat, dv * v_hat], -1)
 
-    def scaled(self, factor: float) -> ConeGeometry:
+    def scaled(self, factor: float) -> "ConeGeometry":
         """The same geometry with every length multiplied by ``factor``."""
         dv, du = self.pixel_size_mm
         off_v, off_u = self.detector_offset_mm
@@ -74,7 +72,7 @@ class ConeGeometry:
             detector_offset_mm=(off_v * factor, off_u * factor),
         )
 
-    def finer(self, factor: int) -> ConeGeometry:
+    def finer(self, factor: int) -> "ConeGeometry":
         """The same panel with every pixel cut into ``factor`` by ``factor``."""
         rows, columns = self.detector_shape
         dv, du = self.pixel_size_mm

@@ -4,8 +4,6 @@ A model is a small frozen class with ``cells(scan, frame)``; a class of your own
 scan that is not a fly-scan has one pose per frame in every model here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any

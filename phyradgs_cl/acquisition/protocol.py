@@ -1,7 +1,5 @@
 """Scan protocols: how many frames, how long an arc each exposes, how the panel reads out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

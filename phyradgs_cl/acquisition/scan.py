@@ -1,7 +1,5 @@
 """A scan: what was measured, where the gantry was, and the grid that is asked for."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -88,7 +86,7 @@ class Scan:
         """Lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
 
-    def on_grid(self, grid: Grid) -> Scan:
+    def on_grid(self, grid: Grid) -> "Scan":
         """The same scan with another grid; a reference stays where the grid is a part of its own, else it is left out."""
         if grid == self.grid:
             return self
@@ -98,7 +96,7 @@ class Scan:
             reference = None if first is None else _part(reference, first, grid.shape)
         return replace(self, grid=grid, reference=reference)
 
-    def with_grid(self, choice: GridChoice) -> Scan:
+    def with_grid(self, choice: GridChoice) -> "Scan":
         """The same scan with the grid that is chosen. Raises InputError for one that no ray of an orbit meets."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):

@@ -1,7 +1,5 @@
 """The shutter: when each detector line opens and closes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kinematics: the gantry angle θ(t), or whole poses, at any time of a frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Protocol
 

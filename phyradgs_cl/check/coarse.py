@@ -1,7 +1,5 @@
 """A scan made small enough to be reconstructed many times: fewer frames, blocks of pixels, coarse voxels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

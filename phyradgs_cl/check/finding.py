@@ -1,7 +1,5 @@
 """What a check found: one answer per question, with the number it rests on."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"

@@ -1,7 +1,5 @@
 """Frames that stand out by themselves, before anything is reconstructed: black, bright, or the one before again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan

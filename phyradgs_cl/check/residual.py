@@ -1,7 +1,5 @@
 """How well a coarse reconstruction explains the frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +33,7 @@ class WithFlats:
     level: float
 
     @classmethod
-    def of(cls, operator: LinearOperator, frames_shape: tuple[int, int, int]) -> WithFlats:
+    def of(cls, operator: LinearOperator, frames_shape: tuple[int, int, int]) -> "WithFlats":
         frames, pixels = frames_shape[0], frames_shape[1] * frames_shape[2]
         length = math.prod(operator.volume_shape) + pixels + frames
         back = operator.adjoint(np.ones(frames_shape, np.float32))
@@ -51,7 +49,7 @@ class WithFlats:
         flats = self.pattern * frames.sum(0).ravel(), self.level * frames.sum((1, 2))
         return np.concatenate([x, *flats]).astype(np.float32)
 
-    def subset(self, frames: Sequence[int]) -> WithFlats:
+    def subset(self, frames: Sequence[int]) -> "WithFlats":
         shape = (len(frames), *self.frames_shape[1:])
         return WithFlats.of(self.operator.subset(frames), shape)
 

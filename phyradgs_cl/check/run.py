@@ -1,7 +1,5 @@
 """All questions in the order in which they rest on each other; what is found is taken out of the way of the next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What the residuals of a few hypotheses say, with how sure one can be of it: frames are the sample."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _DRAWS = 200

@@ -1,7 +1,5 @@
 """The same frames under another hypothesis: turned the other way, read the other way, exposed longer, panel shifted."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """dask.distributed, imported when it is needed and quiet: what users are to know is said here, not in its logs."""
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 from types import ModuleType

@@ -1,7 +1,5 @@
 """A scheduler and workers on this machine, one process per worker, each with a device of its own."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from typing import Any

@@ -3,8 +3,6 @@
 What Dask holds at a worker shares that worker's deaths: so a run that kills workers takes no other with it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time
@@ -51,7 +49,7 @@ class Pool:
         self._cluster: Any = None
         self._client: Any = None
 
-    def __enter__(self) -> Pool:
+    def __enter__(self) -> "Pool":
         distributed()
         try:
             if self.workers.is_local:

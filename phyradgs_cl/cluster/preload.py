@@ -1,7 +1,5 @@
 """What a local worker does first: Ctrl-C in a terminal reaches the whole group, and is the client's to answer."""
 
-from __future__ import annotations
-
 import signal
 import threading
 

@@ -1,7 +1,5 @@
 """The device of a worker's process: kernels are built once and stay, run after run."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

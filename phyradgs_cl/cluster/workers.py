@@ -1,7 +1,5 @@
 """Which workers make the runs: some of this machine, or those of a scheduler that is there already."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """bench: a quick comparison of methods."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """check: what is wrong or suspicious in a scan."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

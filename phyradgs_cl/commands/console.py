@@ -1,7 +1,5 @@
 """What a command says: results on stdout, one line about trouble on stderr, and the status it ends with."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """evaluate: a volume against the truth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated
@@ -23,9 +21,7 @@ def evaluate_command(
     picture: Annotated[
         Path | None,
         file_option(
-            "--picture",
-            help="PNG of slices: result, truth, difference.",
-            show_default="VOLUME with .png",
+            "--picture", help="PNG of slices: result, truth, difference.", show_default="VOLUME with .png"
         ),
     ] = None,
 ) -> None:

@@ -1,7 +1,5 @@
 """Help in plain text with the options of a panel under its name, behind all others."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from typer.core import TyperCommand

@@ -1,7 +1,5 @@
 """import: a scan of another program becomes one of ours."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path

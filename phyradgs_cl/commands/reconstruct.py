@@ -1,7 +1,5 @@
 """reconstruct: a scan file to a volume file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """report: a reconstruction as an HTML page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

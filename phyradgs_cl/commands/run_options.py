@@ -1,7 +1,5 @@
 """The options of a reconstruction, given to every command that speaks of one."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable

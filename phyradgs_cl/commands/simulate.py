@@ -1,7 +1,5 @@
 """simulate: a phantom or a volume to a scan file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

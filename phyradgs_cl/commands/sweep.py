@@ -1,7 +1,5 @@
 """sweep: scans × settings × seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -92,7 +90,7 @@ class SweepTicker:
     def __init__(self) -> None:
         self.all, self.one, self.name = Ticker("run"), Ticker("iteration"), ""
 
-    def __enter__(self) -> SweepTicker:
+    def __enter__(self) -> "SweepTicker":
         return self
 
     def __exit__(self, *_: object) -> None:

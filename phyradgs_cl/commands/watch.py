@@ -1,7 +1,5 @@
 """watch: scans reconstructed as they arrive."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """From what a detector records to line integrals, with its flat and dark frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How a detector averages what it sees while the beam or the object moves."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

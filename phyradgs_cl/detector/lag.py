@@ -4,8 +4,6 @@ One exponential, from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), y bef
 before a scan. For what lag does to reconstructions: Tilley et al., arXiv:1805.11631.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -8,8 +8,6 @@ counts = Poisson(expected) + N(0, electronic_noise), in two ways of arriving at 
 - beer-lambert: expected = dose · exp(-p), the physics.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """How noisy line integrals are, estimated from themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

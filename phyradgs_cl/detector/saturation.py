@@ -1,7 +1,5 @@
 """Pixels at the end of a detector's range: asked of raw counts, before they become line integrals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far each measured line integral can be trusted: the variance of −ln(counts) is one over the counts."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Volumes in other programs' formats, with spacing, origin and directions; `export_volume` is the door."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

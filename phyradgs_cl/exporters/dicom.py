@@ -3,8 +3,6 @@
 Attributes of the CT Image module (DICOM PS3.3, A.3 and C.8.2): position and orientation in LPS, 16 bits per voxel.
 """
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any

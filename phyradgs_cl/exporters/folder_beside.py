@@ -1,7 +1,5 @@
 """Folders that are there whole or not at all: filled beside the target, then renamed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

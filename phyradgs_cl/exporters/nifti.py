@@ -1,7 +1,5 @@
 """NIfTI-1 (.nii, .nii.gz): a header of 348 bytes, whose frame is RAS, then voxels with x running fastest."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 

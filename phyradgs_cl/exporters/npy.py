@@ -1,7 +1,5 @@
 """A bare NumPy array (.npy), and its grid as JSON beside it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

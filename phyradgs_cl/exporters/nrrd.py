@@ -3,8 +3,6 @@
 https://teem.sourceforge.net/nrrd/format.html
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from phyradgs_cl.exporters.placed import Placed, write_whole

@@ -5,8 +5,6 @@ up in every viewer, programs of the ITK family show this package's own millimetr
 in a viewer that knows directions and in one that shows bare images with row 0 at the top.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 TIFF has no place for the origin; ImageJ's own, in pixels, is written, and napari and others read the sizes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from phyradgs_cl import checks

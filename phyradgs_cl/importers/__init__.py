@@ -3,8 +3,6 @@
 `import_scan` and `load_volume` are the doors; one module per format.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

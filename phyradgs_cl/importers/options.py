@@ -1,7 +1,5 @@
 """What the user says about a foreign scan that its files do not say, or say differently."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 from phyradgs_cl import checks

@@ -1,7 +1,5 @@
 """Which format a file or folder is in, from what is in it; nothing is guessed from numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py
@@ -26,8 +24,7 @@ def recognise(path: Path) -> str:
         return found[0]
     if not found and _holds_tiffs(path):
         what, expected = (
-            "TIFF images and no TOML that describes them",
-            "geometry and angles in a TOML beside them",
+            "TIFF images and no TOML that describes them", "geometry and angles in a TOML beside them"
         )
         raise InputError(
             str(path), what, expected, "docs/import.md and docs/tutorial.md have one to start from"

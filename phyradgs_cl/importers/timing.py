@@ -1,7 +1,5 @@
 """From a list of angles, and what is known about time, to shutter, trajectory and opening times."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 

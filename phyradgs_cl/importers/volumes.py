@@ -1,7 +1,5 @@
 """Voxel volumes of any origin: HDF5 files of ours or bare, and what `phyradgs export` and other programs write."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

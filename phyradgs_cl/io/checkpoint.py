@@ -1,7 +1,5 @@
 """Checkpoints of interrupted runs: plain arrays in a NumPy archive, never a pickle."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

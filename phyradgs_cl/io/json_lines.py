@@ -3,8 +3,6 @@
 A run that is killed while it writes leaves a damaged last line, which reading skips and the next append closes off.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """One run per output: a lock file beside it that the operating system lets go of when its process ends, however it ends."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """How much memory a reading may take: what the file's header promises, and what this machine has."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Names of the files that go with another: its checkpoint, its lock, its message."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outputs that are there whole or not at all: written beside the target, then moved over it."""
 
-from __future__ import annotations
-
 import errno
 import glob
 import os

@@ -1,7 +1,5 @@
 """Files that a user or another file names, opened without waiting: a device, a pipe or a file of /proc may never end."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

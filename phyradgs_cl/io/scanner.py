@@ -1,7 +1,5 @@
 """Scanner descriptions: a small TOML file with a geometry, a volume and how the panel reads out."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,8 +19,7 @@ from phyradgs_cl.text import near_miss
 _TABLES: dict[str, tuple[str, ...]] = {
     "source": ("to_axis_mm", "to_detector_mm"),
     "detector": (
-        *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"),
-        "lag",
+        *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"), "lag"
     ),
     "beam": ("pulse_start", "pulse_length"),
     "volume": ("shape", "size_mm", "offset_mm"),

@@ -1,7 +1,5 @@
 """Typed values out of nested plain containers (JSON, TOML, pickles), each named by its path when it is wrong."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -70,7 +68,7 @@ class Fields:
             raise InputError(self.name(key), "nothing", "a value", "add it to the file")
         return self.values[key]
 
-    def table(self, key: str) -> Fields:
+    def table(self, key: str) -> "Fields":
         """A required table inside this one."""
         return Fields(self.name(key), self.get(key))
 
@@ -137,7 +135,7 @@ class Fields:
             checks.one_of(self.name(key), value, allowed)
         return value
 
-    def tables(self, key: str) -> Iterator[Fields]:
+    def tables(self, key: str) -> "Iterator[Fields]":
         """The tables of a list that is not empty."""
         found = self.get(key)
         if not isinstance(found, list) or not found:

@@ -1,7 +1,5 @@
 """Volume files: a reconstruction with its grid, its history and its Gaussians, as an NXdata in HDF5; bare volumes too."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable, Mapping

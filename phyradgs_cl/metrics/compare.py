@@ -1,7 +1,5 @@
 """A volume against the truth: the numbers of the published tables."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

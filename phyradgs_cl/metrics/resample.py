@@ -1,7 +1,5 @@
 """A volume on another grid."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -9,9 +7,7 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Grid
 
 
-def resampled(
-    volume: NDArray[np.floating], grid: Grid, onto: Grid
-) -> tuple[NDArray[np.float32], float]:
+def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
     """A volume (nz, ny, nx) at the voxel centres of another grid, trilinear; and the share of them that lie in its box.
 
     Outside of its box the volume is 0; between its outermost centres and its faces it is what it is at the centres.

@@ -1,7 +1,5 @@
 """A figure of the three middle slices beside the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,7 +61,7 @@ def _numbers(result: Image, reference: Image) -> str:
     return f"PSNR {psnr(result, reference):.2f} dB, SSIM {ssim(result, reference):.4f}"
 
 
-def _fill(figure: Figure, volume: Image, truth: Image | None) -> None:
+def _fill(figure: "Figure", volume: Image, truth: Image | None) -> None:
     if truth is not None:
         shape("reference", truth, volume.shape)
         finite("reference", truth)
@@ -85,7 +83,7 @@ def _fill(figure: Figure, volume: Image, truth: Image | None) -> None:
 
 
 def _panel(
-    figure: Figure, axes: Axes, image: Image, title: str, colours: str, low: float, high: float
+    figure: "Figure", axes: "Axes", image: Image, title: str, colours: str, low: float, high: float
 ) -> None:
     drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, origin="lower")
     axes.set_title(title, fontsize=9)

@@ -5,8 +5,6 @@ the slices of each axis whose truth is not empty and then over the three axes: h
 of radiative Gaussian splatting are made.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray

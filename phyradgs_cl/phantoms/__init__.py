@@ -6,8 +6,6 @@ phantom also has `line_integrals(source, target)` in closed form, a "voxel" phan
 the size chosen; in units of the half-size the procedural volumes are in [0, 1].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

@@ -5,8 +5,6 @@ the ray's distance to the ball's centre (A. C. Kak and M. Slaney, Principles of 
 Tomographic Imaging, IEEE Press 1988, section 3.1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar

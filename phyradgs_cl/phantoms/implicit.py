@@ -6,8 +6,6 @@ of a cosine over a voxel: a coarse phantom is close to the block mean of a fine 
 Distances are positive outside. Points run (x, y, z), arrays (z, y, x), float32.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,7 +29,7 @@ class Capsule:
     r0: float
     r1: float
 
-    def grown(self, width: float) -> Capsule:
+    def grown(self, width: float) -> "Capsule":
         """The same with `width` added to both radii."""
         return Capsule(self.p0, self.p1, self.r0 + width, self.r1 + width)
 

@@ -5,8 +5,6 @@ anybody is in it. The foot points along the rotation axis (toes to +z), the big 
 to -y. Lengths are in units of half the cube's side.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -5,8 +5,6 @@ and roots are tapered capsules, crowns are small ellipsoids with an enamel cap. 
 the teeth to +z. Lengths are in units of half the cube's side.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -8,8 +8,6 @@ Implementation, PhD thesis, DTU 1996, in the values that H. Yu, Y. Ye and G. Wan
 ellipsoids (Proc. SPIE 5535, 550-557, 2004; TIGRE's "yu-ye-wang").
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.checks import one_of, positive

@@ -4,8 +4,6 @@ Two horizontal circles of dense beads at different heights, turned against each 
 the beads of several diameters, in a light holder. Sharp round edges show blur and distortion at once.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.checks import positive

@@ -1,7 +1,5 @@
 """A phantom that is a volume on a grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

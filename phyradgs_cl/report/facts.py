@@ -1,7 +1,5 @@
 """Facts as words and numbers for people: labels with units, a few digits, nested tables flattened."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 

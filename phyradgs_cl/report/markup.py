@@ -1,7 +1,5 @@
 """HTML and SVG built from elements, so that nothing from a file gets into a page unescaped."""
 
-from __future__ import annotations
-
 import html
 import json
 

@@ -1,7 +1,5 @@
 """A reconstruction as one HTML page that needs nothing but itself."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path

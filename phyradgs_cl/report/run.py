@@ -1,7 +1,5 @@
 """What a report is about: a stored volume, the scan that it comes from, and how the two compare."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The sections of a page, each from a run to HTML; a section that has nothing to show is None."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -100,8 +98,7 @@ def projections_section(run: Run, views: Sequence[View]) -> Markup | None:
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
     shape = run.scan.geometry.detector_shape
     proportion = (
-        shape[1] * run.scan.geometry.pixel_size_mm[1],
-        shape[0] * run.scan.geometry.pixel_size_mm[0],
+        shape[1] * run.scan.geometry.pixel_size_mm[1], shape[0] * run.scan.geometry.pixel_size_mm[0]
     )
     told = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
     told += f"blue −{number(limit)}, red +{number(limit)}. "

@@ -1,7 +1,5 @@
 """From two volumes to numbers and a picture."""
 
-from __future__ import annotations
-
 import logging
 import math
 from pathlib import Path

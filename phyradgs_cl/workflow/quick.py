@@ -1,7 +1,5 @@
 """A first comparison on one's own machine: a sweep over fly-scans of two built-in phantoms, in a minute or two."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

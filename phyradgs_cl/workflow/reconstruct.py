@@ -1,7 +1,5 @@
 """From a scan file to a volume file, with checkpoints on the way."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -42,10 +40,7 @@ from phyradgs_cl.reconstructors import (
     method_options,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.interrupt import (
-    finish_despite_interrupt,
-    keep_finished_work,
-)
+from phyradgs_cl.reconstructors.interrupt import (finish_despite_interrupt, keep_finished_work)
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text

@@ -1,7 +1,5 @@
 """A reconstruction that goes on from its checkpoint where there is one of the same run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

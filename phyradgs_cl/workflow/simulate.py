@@ -1,7 +1,5 @@
 """From a phantom or volume to a scan file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Are the views spread over the turn?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Do the frames fit together under what the file says of their order, angles and geometry?"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial

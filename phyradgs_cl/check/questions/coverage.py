@@ -1,7 +1,5 @@
 """Does the detector cover the object?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Are there pixels that say the same in every frame, or always something other than their neighbours?"""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 

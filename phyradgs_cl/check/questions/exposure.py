@@ -1,7 +1,5 @@
 """Is the exposure as long as it is said to be?"""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan

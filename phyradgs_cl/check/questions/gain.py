@@ -1,7 +1,5 @@
 """Does the gain of source or detector change over the scan?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Are lines read in the order, along the axis and in the time that the file says?"""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 

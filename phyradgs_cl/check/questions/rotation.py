@@ -1,7 +1,5 @@
 """Does the gantry turn the way that the angles say?"""
 
-from __future__ import annotations
-
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.questions.offset import Offset
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic

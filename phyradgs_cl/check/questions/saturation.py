@@ -1,7 +1,5 @@
 """Are pixels at the end of the detector's range?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Do exposure, readout and the frames' times fit each other and the angles?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

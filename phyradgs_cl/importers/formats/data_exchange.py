@@ -4,8 +4,6 @@ The format describes parallel beams, so distances and pixel sizes usually come f
 sample's, in degrees unless a units attribute differs; row 0 is the top of the image.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

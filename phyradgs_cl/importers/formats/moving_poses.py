@@ -1,7 +1,5 @@
 """Poses that no circle describes: tables of them over time, row 0 the lowest, with a plain geometry to go by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Lengths are in mm, densities in 1/m and projections in density × metre: dimensionless line integrals.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ flips that the file declares, in either of the ways in which the nxtomo package 
 rotation axis's column becomes a detector offset.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -140,8 +138,7 @@ def _geometry(
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
     to_detector = distance_to_detector(source, f"{detector}/distance", to_axis, options)
     pitch = options.pixel_size_mm or (
-        stored_pitch(source, f"{detector}/y_pixel_size"),
-        stored_pitch(source, f"{detector}/x_pixel_size"),
+        stored_pitch(source, f"{detector}/y_pixel_size"), stored_pitch(source, f"{detector}/x_pixel_size")
     )
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))

@@ -5,8 +5,6 @@ down them, column 3 the panel's centre. The matrix holds where the panel stands 
 frame it has turned about +z by as much as its angle. Rows are read one after the other, the first stored one first.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -49,7 +47,7 @@ class Circle:
     angle_rad: np.ndarray
 
     @classmethod
-    def read(cls, common: Fields, views: list[Fields], body: str) -> Circle:
+    def read(cls, common: Fields, views: list[Fields], body: str) -> "Circle":
         """The circle of "source" or "detector"."""
         circle = common.table(body)
         tables = [view.table("rolling_shutter").table(body) for view in views]

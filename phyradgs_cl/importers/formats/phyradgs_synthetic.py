@@ -4,8 +4,6 @@ The arcs are all that the files say about time: the exposure takes ``exposure_s`
 gantry turns at the speed that makes the exposure's arc of it.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Folders of R2-Gaussian: meta_data.json beside .npy projections and the true volume; taken at rest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +33,7 @@ class R2Folder:
     unit_mm: float
 
     @classmethod
-    def opened(cls, given: Path, usual: str, unit_mm: float) -> R2Folder:
+    def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
         """Read the description called ``usual`` of a folder, or the description that is given itself."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name

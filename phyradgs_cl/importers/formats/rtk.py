@@ -1,7 +1,5 @@
 """Scans of RTK: a geometry XML and a stack of projections as MetaImage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 No entity is declared, no external file is looked at. RTK's own files carry an empty DOCTYPE, the only one that passes.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The tables [source], [detector], [volume], [readout] and [beam] are those of a s
 [timing] are added. Row 0 of an image is its top, column 0 its left, seen from the source.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 

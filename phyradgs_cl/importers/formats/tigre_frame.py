@@ -3,8 +3,6 @@
 Projections are stored [v, u] with row 0 at +z, volumes [x, y, z]; angles are the gantry's, in radians.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl import checks

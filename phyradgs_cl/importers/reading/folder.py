@@ -4,8 +4,6 @@ Names come from strangers' JSON, XML headers and listings: no absolute path, no 
 but regular files.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

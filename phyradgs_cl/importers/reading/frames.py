@@ -1,7 +1,5 @@
 """Raw frames of any origin to line integrals with row 0 the lowest, with bad pixels masked."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What importers of HDF5 share: numeric frames of any type, optional numbers with units, the sense of angles."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """MetaImage (.mha, .mhd), volumes and stacks of projections: a text, then voxels, raw or deflated, here or beside."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

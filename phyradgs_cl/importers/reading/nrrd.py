@@ -1,7 +1,5 @@
 """NRRD volumes (.nrrd) with their data in the same file: https://teem.sourceforge.net/nrrd/format.html"""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -5,8 +5,6 @@ file or takes a state that it does not check. The unpickler is the one written i
 before anyone can look at them: integers that share one hash, or tuples of tuples, keep it for hours.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import pickle
@@ -164,7 +162,7 @@ class _Array(np.ndarray):
 
     _spend: Callable[[int], None]
 
-    def __new__(cls, spend: Callable[[int], None]) -> _Array:
+    def __new__(cls, spend: Callable[[int], None]) -> "_Array":
         made = super().__new__(cls, (0,), np.uint8)
         made._spend = spend
         return made

@@ -1,7 +1,5 @@
 """Grey TIFF images, plain or deflated, one per file or many in one, of a size that the file can hold."""
 
-from __future__ import annotations
-
 import logging
 import math
 import zlib

@@ -1,7 +1,5 @@
 """Voxels as another program stored them, and the turn into this package's order, frame and unit."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Typed reads from an Hdf5Source: numbers with units, words and whole numbers, each checked at once."""
 
-from __future__ import annotations
-
 import logging
 import math
 import posixpath
@@ -51,10 +49,7 @@ def _damage(error: Exception) -> str:
 
 
 def read_array(
-    source: Hdf5Source,
-    address: str,
-    shape: Sequence[int | None],
-    quantity: Quantity | None = None,
+    source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None
 ) -> np.ndarray:
     """A required numeric dataset as float64 in the package's unit; every value finite."""
     dataset = source.dataset(address)
@@ -74,9 +69,7 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     return value
 
 
-def read_number(
-    source: Hdf5Source, address: str, quantity: Quantity | None = None
-) -> float:
+def read_number(source: Hdf5Source, address: str, quantity: Quantity | None = None) -> float:
     """A required finite number in the package's unit; a dataset of one element will do."""
     dataset = source.dataset(address)
     if dataset.size != 1:
@@ -86,18 +79,14 @@ def read_number(
     return float((in_unit(source, address, values, quantity) if quantity else values).reshape(()))
 
 
-def read_integers(
-    source: Hdf5Source, address: str, shape: Sequence[int | None]
-) -> np.ndarray:
+def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None]) -> np.ndarray:
     """A required dataset of whole numbers as int64."""
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     return read_values(source, address, dataset, kinds="iu").astype(np.int64)
 
 
-def read_word(
-    source: Hdf5Source, address: str, allowed: Collection[str] | None = None
-) -> str:
+def read_word(source: Hdf5Source, address: str, allowed: Collection[str] | None = None) -> str:
     """A required string, one of ``allowed`` where they are given."""
     dataset = source.dataset(address)
     if dataset.size != 1:  # many entries may all be one long text, which the file's size does not bound

@@ -4,8 +4,6 @@ Provenance and results are JSON that anybody may have edited. A schema states th
 computes with; of all others it asks no more than that they can be shown.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable, Collection, Mapping

@@ -1,7 +1,5 @@
 """The voxel grid in files, and the one that a scan without a grid gets."""
 
-from __future__ import annotations
-
 import math
 
 import h5py

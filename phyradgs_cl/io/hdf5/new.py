@@ -4,8 +4,6 @@ The library does not survive a disk that is full: it leaves objects that it cann
 process ends. So it writes through a file of ours that takes everything; what went wrong is raised afterwards.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager

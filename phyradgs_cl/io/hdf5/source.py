@@ -4,8 +4,6 @@ An `Hdf5Source` follows links inside the file only, and refuses datasets whose b
 whose declared size the file cannot hold. Every defect is an InputError about "FILE:/hdf5/path".
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import posixpath
@@ -37,7 +35,7 @@ _FREE_BYTES = 64 << 20
 
 
 @contextmanager
-def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
+def open_hdf5(path: str | Path) -> "Iterator[Hdf5Source]":
     """Open a file for reading; InputError for what is missing, a folder, truncated, not HDF5, or more than HDF5 survives.
 
     Errors of HDF5 in the body come out as InputError too, so the body should do nothing but read.

@@ -6,8 +6,6 @@ not survive is refused. Damage inside large datasets is met, and reported, by th
 for it, which takes milliseconds; elsewhere, where a copy may not use the system's libraries, an interpreter is started.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import logging
 import os

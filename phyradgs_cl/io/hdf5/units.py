@@ -1,7 +1,5 @@
 """Units in files: the names that are accepted, and their factors to millimetres, seconds and radians."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """A copy of a scan file in which the panel stands elsewhere; everything else stays as it is, raw counts included."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

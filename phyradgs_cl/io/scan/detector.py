@@ -1,7 +1,5 @@
 """The detector's part of a scan file: frames, keys, geometry, shutter and mask, all but the pixels."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Everything in a scan file except its large arrays, checked in full before those are read."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Where θ(t) comes from in a scan file: pose table, encoder table, or each frame's own two angles."""
 
-from __future__ import annotations
-
 import logging
 import math
 from dataclasses import replace
@@ -136,8 +134,7 @@ def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.n
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
     first_s, last_s = (
-        float(np.min(scan.frame_start_s)),
-        float(np.max(scan.frame_start_s)) + scan.shutter.span_s,
+        float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s)) + scan.shutter.span_s
     )
     step_s = math.sqrt(8 * _RAMP_ERROR_RAD / max(abs(kinematics.acceleration_rad_per_s2), 1e-12))
     samples = min(_MOST_RAMP_SAMPLES, max(2, math.ceil((last_s - first_s) / step_s) + 1))

@@ -1,7 +1,5 @@
 """Scan files: a NeXus NXtomo entry in HDF5, read into a Scan of line integrals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -158,8 +156,7 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
     checks.finite(source.name(address), values)
     if values.max() <= 0:
         found, expected = (
-            f"no voxel above 0 (the largest is {values.max() + 0.0:g})",
-            "a truth to compare with",
+            f"no voxel above 0 (the largest is {values.max() + 0.0:g})", "a truth to compare with"
         )
         raise InputError(source.name(address), found, expected, "take the reference out of the file")
     return in_unit(source, address, values, ATTENUATION).astype(np.float32)

@@ -1,7 +1,5 @@
 """Where things stand in a scan file (a NeXus NXtomo entry; see docs on file formats)."""
 
-from __future__ import annotations
-
 DETECTOR = "instrument/detector"
 SOURCE = "instrument/source"
 SAMPLE = "sample"

@@ -1,7 +1,5 @@
 """Writing scan files: the NXtomo entry of scan_schema, as other programs read it too."""
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scanner to scale: the orbit from above, and the fan from the side, from the poses themselves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +24,7 @@ class Plan:
     high: Points
 
     @classmethod
-    def around(cls, *points: Points) -> Plan:
+    def around(cls, *points: Points) -> "Plan":
         every = np.concatenate([p.reshape(-1, 2) for p in points])
         return cls(every.min(axis=0), every.max(axis=0))
 

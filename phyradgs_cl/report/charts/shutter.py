@@ -1,7 +1,5 @@
 """Space and time: which detector line sees light when (the paper's Fig. 3), in one frame and in successive ones."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, LineMiddles, MicroViews, Motion, PerRow, Scan, StaticStart

@@ -1,7 +1,5 @@
 """PNG pictures of 8-bit values, grey or by a table of colours, and the tables."""
 
-from __future__ import annotations
-
 import base64
 import io
 

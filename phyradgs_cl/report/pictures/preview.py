@@ -1,7 +1,5 @@
 """A picture of a volume's three middle slices, for a look at a run that is under way."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

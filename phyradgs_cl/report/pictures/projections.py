@@ -1,7 +1,5 @@
 """Frames of a scan against the same frames computed from the volume, each line at its own times."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

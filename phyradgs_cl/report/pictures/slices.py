@@ -1,7 +1,5 @@
 """The slices that a page can show: every one of a small volume, evenly chosen ones of a large one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -34,7 +32,7 @@ class Window:
     beyond: tuple[bool, bool]
 
     @classmethod
-    def of(cls, low: float, high: float, *volumes: Volume) -> Window:
+    def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
         """Room on both sides for streaks and overshoots, as far as there are any."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))

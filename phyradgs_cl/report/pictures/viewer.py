@@ -1,7 +1,5 @@
 """The part of a page in which one walks through the volume, with keyboard, mouse or finger."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

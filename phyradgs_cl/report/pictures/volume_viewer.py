@@ -1,7 +1,5 @@
 """A volume in napari, where that is installed: a window in which one turns and cuts it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a sweep's file asks for: scans by pattern, settings by product and one by one, seeds; checked whole."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

@@ -1,7 +1,5 @@
 """The runs of a sweep, each with a name that follows from what it is."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Sequence

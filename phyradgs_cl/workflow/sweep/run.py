@@ -1,7 +1,5 @@
 """Makes the runs that a sweep's results file lacks, at workers or one after the other, and then the tables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A sweep's results as tables: one line per setting in Markdown, one line per run in CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator, Sequence

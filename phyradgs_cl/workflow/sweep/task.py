@@ -1,7 +1,5 @@
 """One run of a sweep, wherever it is made: in a worker or in this process."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -3,8 +3,6 @@
 Notices of the kernel would not: a network file system sends none about what other machines write.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 import time

@@ -1,7 +1,5 @@
 """What a watched folder's scans have become: volumes, errors, and work that was interrupted."""
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Reconstructs a folder's scans as they arrive. Its state is the files that it writes: it may be killed at any moment."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

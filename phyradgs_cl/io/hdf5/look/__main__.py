@@ -5,8 +5,6 @@ LARGE where that took more memory than headers need, or by the signal of a limit
 imported, and nothing that takes long to start.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import time
