@@ -11,7 +11,7 @@ from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import foreign_volume, load_volume, recognise
-from phyradgs_cl.io import (file_kind, read_scan, read_volume, scan_summary, volume_summary)
+from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 from phyradgs_cl.io.hdf5.source import open_hdf5
 

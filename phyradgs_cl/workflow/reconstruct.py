@@ -40,7 +40,7 @@ from phyradgs_cl.reconstructors import (
     method_options,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.interrupt import (finish_despite_interrupt, keep_finished_work)
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
