@@ -5,31 +5,74 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from phyradgs_cl.commands import options
+from phyradgs_cl.commands.files import file_option, option
+from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.settings import RunSettings, run_settings
 
+_METHOD = (
+    "phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
+    "naf, sax-nerf: neural fields; the others are iterative on voxels."
+)
+_MOTION = (
+    "How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
+    "every line at its own times (per-row), or splats that move while lines integrate (exact); "
+    "not every method has all of them."
+)
+_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2); the window of fdk."
+_CONFIG = (
+    "TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
+    "the command line wins."
+)
+_SET = (
+    "Any option of the method by name, as in the file: --set tv_weight=0.002 --set order=random. "
+    "Docs: methods.md."
+)
+_RANKS = "Under mpiexec (docs: cluster.md)"  # a panel of its own at the end of a command's help
+
+
+def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
+    return Annotated[kind | None, option(help, default, *flags, **more)]
+
+
 RUN_OPTIONS: dict[str, Any] = {
-    "method": options.Method,
-    "motion": options.MotionModel,
-    "strips": options.Strips,
-    "sub_intervals": options.SubIntervals,
-    "segments": options.Segments,
-    "time_error": options.TimeError,
-    "iterations": options.Iterations,
-    "gaussians": options.GaussianCount,
+    "method": _asked(Literal[tuple(METHODS)], _METHOD, "phyradgs", case_sensitive=False),
+    "motion": _asked(
+        Literal["static", "static-start", "micro-views", "per-row", "exact"],
+        _MOTION,
+        "exact for phyradgs, else static",
+    ),
+    "strips": _asked(int, "Strips M of a frame (rolling shutter); means micro-views.", "8"),
+    "sub_intervals": _asked(
+        int, "Sub-intervals N of an exposure (motion blur); for phyradgs means micro-views.", "5"
+    ),
+    "segments": _asked(int, "Segments of a frame (motion exact); 0: by the time error.", "0"),
+    "time_error": _asked(float, "Relative error that averaging over time may leave (motion exact).", "0.005"),
+    "iterations": _asked(
+        int, "Iterations: one frame each for splats, all frames for voxels.", "preset's: 3000 for splats"
+    ),
+    "gaussians": _asked(int, "Gaussians at the start.", "preset's: from the grid"),
     "size": options.Size,
     "voxel_mm": options.VoxelMm,
     "roi_mm": options.RoiMm,
-    "seed": options.Seed,
-    "preset": options.Preset,
-    "batch": options.Batch,
-    "config": options.Config,
-    "assignments": options.Assignments,
-    "detector_model": options.LineModel,
-    "ignore_lag": options.IgnoreLag,
-    "median_filter": options.MedianFilter,
+    "seed": _asked(int, "Seed of cloud, frame order and sub-volumes.", "0"),
+    "preset": _asked(str, _PRESET, "the method's first"),
+    "batch": _asked(
+        int, "Frames per step, for splats.", "as many as ranks", metavar="B", rich_help_panel=_RANKS
+    ),
+    "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
+    "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
+    "detector_model": _asked(
+        options.DetectorModel,
+        "What is averaged over an exposure: line integrals (log) or intensity.",
+        "the scan's",
+    ),
+    "ignore_lag": Annotated[
+        bool, option("Leave the lag that the scan file states in the frames.", True, "--ignore-lag")
+    ],
+    "median_filter": _asked(int, "Median filter of the frames: 3 or 5 pixels per side, 0 none.", "0"),
     "device": options.Device,
     "memory": options.Memory,
 }
@@ -44,11 +87,7 @@ class RunRequest:
     given: dict[str, Any]
 
     def settings(self) -> RunSettings:
-        """Everything together, checked.
-
-        Raises:
-            InputError: an option, or a line of the file, is not what it should be.
-        """
+        """Everything together, checked; InputError for an option or line that is not what it should be."""
         return run_settings(self.config, self.given, self.assignments)
 
 

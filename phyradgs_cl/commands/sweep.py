@@ -9,7 +9,7 @@ import typer
 from phyradgs_cl import signals
 from phyradgs_cl.cluster import LOCAL, Workers, has_dask
 from phyradgs_cl.commands.console import complain, remark, say, scores
-from phyradgs_cl.commands.files import file_argument
+from phyradgs_cl.commands.files import file_argument, option
 from phyradgs_cl.commands.options import Scheduler, WorkerCount
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.json_lines import Line
@@ -22,29 +22,21 @@ EXAMPLE = (
     "Runs that the results file in the folder has already are not made again: interrupt and repeat at will. "
     "Docs: cluster.md."
 )
+_OUTPUT = f"Folder for {RESULTS} (one line per run), volumes and tables."
+_CHECKPOINT = "Keep a checkpoint of each run so often; a lost run goes on from it."
 
 
 def sweep_command(
     grid: Annotated[Path, file_argument("GRID", "TOML file: scans, settings and seeds (docs: cluster.md).")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="DIR", help=f"Folder for {RESULTS} (one line per run), volumes and tables."
-        ),
-    ],
+    output: Annotated[Path, option(_OUTPUT, True, "--output", "-o", metavar="DIR")],
     scheduler: Scheduler = None,
     workers: WorkerCount = None,
-    checkpoint_every: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS", help="Keep a checkpoint of each run so often; a lost run goes on from it."
-        ),
-    ] = 600.0,
+    checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     device: Annotated[
         str | None,
-        typer.Option(
-            help="Devices of local workers, with commas: indices, cpu, gpu or parts of names.",
-            show_default="all GPUs, else the best device",
+        option(
+            "Devices of local workers, with commas: indices, cpu, gpu or parts of names.",
+            "all GPUs, else the best device",
         ),
     ] = None,
 ) -> None:

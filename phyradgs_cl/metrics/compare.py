@@ -1,14 +1,13 @@
 """A volume against the truth: the numbers of the published tables."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics.psnr import psnr
 from phyradgs_cl.metrics.ssim import ssim
 
 
-def compare(volume: NDArray[np.floating], reference: NDArray[np.floating]) -> dict[str, float]:
+def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """3D PSNR and SSIM against a reference, with the range that was used: the reference's maximum.
 
     Args:
