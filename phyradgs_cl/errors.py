@@ -1,7 +1,6 @@
-"""The package's exceptions: each names the culprit, what was found, what was expected and what to do.
+"""The package's exceptions: each names the culprit, what was found, what was expected and what to do, in one line.
 
-One line of text comes out of ``str()``, so that the command line can print it as it is. The exit statuses are told apart by
-scripts and listed in docs/trouble.md; 1 is Python's own, for a defect of this program.
+Exit statuses are told apart by scripts (docs/trouble.md); 1 is Python's own, for a defect of this program.
 """
 
 from collections.abc import Iterator
@@ -11,16 +10,13 @@ from phyradgs_cl.text import plain_text
 
 
 class PhyradgsError(Exception):
-    """Base of every error that this package raises on purpose.
+    """Base of every error that this package raises on purpose; ``exit_code`` is the command line's status.
 
     Args:
         culprit: what is wrong: an option, a file with its HDF5 path, a device.
         found: the value or state met there.
         expected: what would have been right.
         remedy: what the user can do about it, as an imperative.
-
-    Attributes:
-        exit_code: status that the command line ends with.
     """
 
     exit_code = 2

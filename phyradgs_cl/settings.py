@@ -26,11 +26,9 @@ LARGEST_SEED = 2**63
 
 @dataclass(frozen=True)
 class RunSettings:
-    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked.
-
-    ``before``: what is done to the scan's frames first, whatever the method. ``origins``: where the values that are not
-    named options come from, as errors are to name it. ``memory``: a limit of the device's, bytes or text as 2GiB.
-    """
+    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, unchecked. ``before``:
+    what is done to the frames first. ``origins``: where values that are no named options come from, for errors.
+    ``memory``: the device's limit, bytes or text as 2GiB."""
 
     method: str
     preset: str | None
@@ -59,11 +57,8 @@ class RunSettings:
 def run_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> RunSettings:
-    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None.
-
-    All of them lie over the preset, which is where a method's options begin. They are checked here, so that an error
-    can say where a wrong value stands.
-    """
+    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None;
+    all over the preset. They are checked here, so that an error can say where a wrong value stands."""
     settings = read_config(config)
     origins = {key: f"config {config}: {key}" for key in settings}
     for text in assignments:

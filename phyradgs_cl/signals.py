@@ -1,9 +1,8 @@
 """Ctrl-C and SIGTERM in a process of the command line: one line on stderr and an end, whatever is running.
 
-An exception raised by a signal's handler may surface in any library, which may swallow it or complain about it. So
-nothing is raised here: the process removes its half-written files and ends. Work that is worth keeping makes signals wait
-(reconstructors/interrupt.py). Nothing is imported that takes time, nor ``signal``, which builds enums round ``_signal``:
-this is to be in force as early as can be.
+An exception from a signal's handler may surface in any library. So nothing is raised: the process removes its
+half-written files and ends. Work worth keeping makes signals wait (reconstructors/interrupt.py). Nothing that takes
+time is imported, nor ``signal``, which builds enums round ``_signal``: this is to be in force as early as can be.
 """
 
 import _signal as signal
@@ -70,10 +69,8 @@ def remove(path: str) -> None:
 
 
 def handle(caught: int) -> None:
-    """Sets the handler.
-
-    System calls go on after it: a compiler inside an OpenCL driver would take a reading that is cut short for an error.
-    """
+    """Sets the handler. System calls go on after it: a compiler inside a driver would take a short reading for an
+    error."""
     signal.signal(caught, answer)
     if hasattr(signal, "siginterrupt"):
         signal.siginterrupt(caught, False)

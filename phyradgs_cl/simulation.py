@@ -42,9 +42,9 @@ log = logging.getLogger(__name__)
 class SimulationOptions:
     """How to simulate. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    time_samples: midpoint samples per line in its own exposure; 0 chooses them so that the edge of the volume
-    moves at most half a voxel of ``grid`` between two of them (see docs/mathematics.md for the error).
-    dose: photons of a pixel without object, on a line that sees the whole pulse. lag: λ of detector/lag.py.
+    time_samples: midpoint samples per line in its own exposure; 0: the volume's edge moves at most half a voxel of ``grid``
+    between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
+    lag: λ of detector/lag.py.
     """
 
     protocol: Protocol = Protocol()
@@ -88,11 +88,8 @@ def scanner_for(
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the default.
-
-    Raises:
-        InputError: no such option; a value out of range.
-    """
+    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the
+    default. InputError: no such option; a value out of range."""
     own = {key: getattr(scanner, key) for key in ("readout_axis", "readout_direction", "lag")}
     own |= {key: getattr(scanner, key) for key in ("readout_ratio", "pulse")}
     chosen = {**own, **{key: value for key, value in given.items() if value is not None}}
@@ -116,10 +113,8 @@ def simulated_scan(
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
     """What a scanner records of a phantom, by its name, or of a volume, called ``name``; the truth is its reference.
-
-    size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples: rays
-    along each side of a pixel. Warns of an inverse crime.
-    """
+    size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples:
+    rays along each side of a pixel. Warns of an inverse crime."""
     if size is not None:
         checks.within("--size", size, SMALLEST_PHANTOM if isinstance(of, str) else 1, LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -149,10 +144,8 @@ def simulate(
     title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
-    """A scan of whatever ``source`` projects, noise included.
-
-    reference (nz, ny, nx) is stored with the scan, scaled along when ``peak`` is given.
-    """
+    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by
+    ``peak``."""
     rng = np.random.default_rng(options.seed)
     protocol = options.protocol
     shutter = protocol.shutter(options.readout_axis, options.readout_direction)
@@ -269,10 +262,8 @@ def _on_panel(
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx).
-
-    source_shape: voxels (z, y, x) that are projected, where the source is a volume from outside.
-    """
+    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx). source_shape:
+    voxels (z, y, x) that are projected, where the source is a volume from outside."""
 
     source: FrameSource
     grid: Grid
@@ -304,11 +295,9 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom by name in the box of the scanner, to be reconstructed with ``size`` voxels per side.
-
-    Closed forms are integrated exactly; procedural phantoms are drawn at twice ``size`` and projected at that
-    resolution, and the truth is their block mean. Pixels see ``pixel_samples``² rays over their area.
-    """
+    """A phantom by name in the scanner's box, with ``size`` voxels per side. Closed forms are integrated exactly;
+    procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
+    ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(name, half_size_mm, 2 * size, seed)
     if isinstance(phantom, EllipsoidPhantom):
@@ -340,12 +329,9 @@ def volume_scene(
     axis: str,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A volume, called ``name``, projected at its own resolution.
-
-    A bare array is fitted into the scanner's box, its values being attenuation per half of the longest side (so
-    that line integrals do not depend on the scanner's size); one with a grid keeps it and 1/mm. Pixels see
-    ``pixel_samples``² rays over their area.
-    """
+    """A volume, called ``name``, projected at its own resolution by ``pixel_samples``² rays per pixel. A bare array is
+    fitted into the scanner's box, its values attenuation per half of the longest side; one with a grid keeps it and
+    1/mm."""
     volume, fine = loaded.volume, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))

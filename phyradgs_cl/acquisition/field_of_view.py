@@ -9,11 +9,8 @@ from phyradgs_cl.fields import Grid
 
 
 def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
-    """Half sides (z, y, x) of the box about the origin that the cones of a full turn fill.
-
-    Its radius is the distance from the axis to the cone's edge ray, DSO·sin(atan(half width/DSD)), and its height that of
-    the cone behind the axis at that radius. A panel that is shifted counts with its far edge.
-    """
+    """Half sides (z, y, x) of the box about the origin that the cones of a full turn fill: radius DSO·sin(atan(half
+    width/DSD)), the far edge of a shifted panel, and the cone's height behind the axis at that radius."""
     half_height_mm, half_width_mm = (
         count * pitch / 2 + abs(offset)
         for count, pitch, offset in zip(

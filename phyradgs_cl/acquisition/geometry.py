@@ -1,7 +1,7 @@
 """Cone-beam geometry: where source and detector stand at a gantry angle.
 
-A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from one
-column to the next (û·du) and from one row to the next (v̂·dv). Operators take poses, never angles.
+A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
+and from row to row (v̂·dv). Operators take poses, never angles.
 """
 
 from dataclasses import dataclass, replace
@@ -15,11 +15,8 @@ POSE_LENGTH = 12
 
 @dataclass(frozen=True)
 class ConeGeometry:
-    """A circular cone-beam orbit about +z with a flat panel.
-
-    ``detector_shape`` counts (rows, columns), ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm``
-    (along v, along u) shifts the panel's centre away from the central ray.
-    """
+    """A circular cone-beam orbit about +z with a flat panel: ``detector_shape`` counts (rows, columns),
+    ``pixel_size_mm`` is (dv, du), ``detector_offset_mm`` (v, u) shifts the panel's centre from the central ray."""
 
     source_to_axis_mm: float
     source_to_detector_mm: float

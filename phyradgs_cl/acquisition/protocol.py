@@ -14,11 +14,9 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True)
 class Protocol:
-    """A full turn of ``views`` frames, each exposing ``exposure_deg`` (paper, section 3.1).
-
-    The gantry turns at constant speed, so an exposure of 1 s fixes it; ``readout_ratio`` is T_ro/T_exp.
-    ``pulse``: when the beam is on, as (start after the frame's start, length) in shares of the exposure; None always.
-    """
+    """A full turn of ``views`` frames at constant speed, each exposing ``exposure_deg`` in 1 s (paper, section 3.1);
+    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in shares of the exposure; None
+    always."""
 
     views: int = 25
     exposure_deg: float = 14.4
@@ -67,11 +65,8 @@ class Protocol:
     def orbit(
         self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
-        """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan.
-
-        Jitter is a smooth wander of the true gantry about constant speed, recorded by the encoder
-        (standard deviation ``jitter_deg``, one knot per frame).
-        """
+        """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan. Jitter is a smooth
+        wander of the gantry (standard deviation ``jitter_deg``, one knot per frame), recorded by the encoder."""
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)
         if not self.is_fly:

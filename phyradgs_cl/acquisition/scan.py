@@ -27,11 +27,10 @@ class Saturation:
 class Scan:
     """One cone-beam scan in line integrals.
 
-    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read
-    line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
-    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
-    projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
-    ``saturation`` is None where nobody looked at raw counts.
+    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read line;
+    pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
+    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the projections.
+    Lines that a pulsed beam misses are added to the mask. ``saturation`` is None where nobody looked at raw counts.
     ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
     """
 
@@ -106,10 +105,8 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
-
-        Raises InputError for that, and for an exposure too short for the scan's times.
-        """
+        """InputError for a trajectory that ends before the last frame's window, or an exposure too short for the scan's
+        times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):

@@ -79,11 +79,8 @@ class EncoderTable:
 
 @dataclass(frozen=True, eq=False)
 class FrameSweeps:
-    """Each frame's own constant speed, from its angle when the exposure starts to that when it ends.
-
-    Continued past the exposure through the readout; equal angles are a gantry at rest (stop-and-shoot).
-    All arrays are (F,).
-    """
+    """Each frame's own constant speed (all (F,)), from its angle when the exposure starts to that when it ends,
+    continued through the readout; equal angles are a gantry at rest (stop-and-shoot)."""
 
     start_s: np.ndarray
     exposure_s: float
@@ -114,11 +111,8 @@ class CircularOrbit:
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them.
-
-    Rotations go by slerp and everything else is linear in the body's own frame: interpolating the 12
-    numbers in the world would shrink an orbit (by 1 mm at 1 m over 5°).
-    """
+    """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them. Rotations go by slerp, all
+    else is linear in the body's frame: interpolating in the world would shrink an orbit (by 1 mm at 1 m over 5°)."""
 
     time_s: np.ndarray
     table: np.ndarray
@@ -155,11 +149,8 @@ class PoseTable:
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) + ``span_s``.
-
-    Raises InputError where a fine table still does not follow it, as where frames that overlap in time are elsewhere at the
-    same moment.
-    """
+    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) +
+    ``span_s``; InputError where a fine table does not, as where frames overlap in time and are elsewhere."""
     apart = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)

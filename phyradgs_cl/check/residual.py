@@ -20,11 +20,8 @@ _FREEDOM = 0.3  # of flats and levels, over the volume's own: without it their n
 
 @dataclass(frozen=True, eq=False)
 class WithFlats:
-    """A x + b + c: line integrals of a volume, a pattern b (rows, columns) of all frames and a level c (F,) of each.
-
-    b is what flats leave behind: their noise, air that is not 0. c is how bright the source was. The vector has the volume,
-    b and c one after another, in units of ``pattern`` and ``level``.
-    """
+    """A x + b + c: line integrals of a volume, a pattern b (rows, columns) of all frames (noise of flats, air that is
+    not 0) and a level c (F,) of each (the source's); one vector, b and c in units of ``pattern`` and ``level``."""
 
     operator: LinearOperator
     volume_shape: tuple[int, ...]

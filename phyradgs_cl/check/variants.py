@@ -16,11 +16,11 @@ _MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at th
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields below.
+    """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields.
 
-    is_reversed: the gantry turns the other way (a mirror image of the poses, whose columns then run backwards);
-    offset_u_mm of the panel stays on its side. shift_px: the panel moves along u, in its own columns. block: pixels
-    become blocks. frames (F,): which frames of ``base`` are used; None: all.
+    is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
+    on its side. shift_px: the panel moves along u, in its own columns. block: pixels become blocks. frames (F,): which of
+    ``base`` are used; None: all.
     """
 
     base: Trajectory
@@ -121,10 +121,8 @@ def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
 
 
 def stretched(scan: Scan, v: float, u: float) -> Scan:
-    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel.
-
-    The box grows alike if it then fits what the panel sees better than as it is.
-    """
+    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel; the box grows alike if it then
+    fits what the panel sees better than as it is."""
     rows, columns = scan.geometry.detector_shape
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:

@@ -14,10 +14,8 @@ _DASHBOARD = f"{_HOST}:8787"
 
 
 def local_cluster(workers: Workers) -> Any:
-    """Starts them; what is returned closes them. A worker that dies is replaced by its nanny.
-
-    There is no limit of memory per worker: Dask would kill a run that is larger than its share, again and again.
-    """
+    """Starts them; what is returned closes them. A worker that dies is replaced by its nanny. No limit of memory per
+    worker: Dask would kill a run that is larger than its share, again and again."""
     package = distributed()
     spec = {number: _worker(package, device) for number, device in enumerate(workers.devices())}
     scheduler = {

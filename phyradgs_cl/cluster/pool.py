@@ -1,7 +1,5 @@
-"""Runs shared out over Dask's workers: no more are handed out than there are devices, the rest waits here.
-
-What Dask holds at a worker shares that worker's deaths: so a run that kills workers takes no other with it.
-"""
+"""Runs shared out over Dask's workers: no more than there are devices, so that a run that kills workers takes no other
+along."""
 
 import asyncio
 import logging
@@ -80,11 +78,9 @@ class Pool:
         arguments: Mapping[str, Any],
         look: Callable[[PoolState], None] = lambda state: None,
     ) -> Iterator[tuple[str, Any]]:
-        """(name, ``function(argument)`` or Lost) of every argument once, as they come.
-
-        An exception of ``function`` is raised here; the other runs are then given up. ``look`` is called some times a
-        second. Raises InputError when the scheduler goes away.
-        """
+        """(name, ``function(argument)`` or Lost) of every argument once, as they come; ``look`` is called some times a
+        second. An exception of ``function`` is raised here, the other runs given up. InputError when the scheduler goes
+        away."""
         waiting, running = deque(arguments), dict[Any, str]()
         seen_s, revivals = time.monotonic(), 0
         try:

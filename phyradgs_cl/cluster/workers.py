@@ -16,11 +16,10 @@ class Workers:
     """Where runs are made.
 
     Args:
-        scheduler: ``local`` for workers of this machine; else the address of a Dask scheduler (``tcp://host:8786``) or
-            the JSON file that one has written (``dask scheduler --scheduler-file``).
+        scheduler: ``local``; else the address of a Dask scheduler (``tcp://host:8786``), or the JSON file that one has
+            written (``dask scheduler --scheduler-file``).
         count: of local workers; None is one per device.
-        device: what a worker's device is asked for by; several with commas are given out in turn. Only for local
-            workers: others say it themselves, by the environment variable PHYRADGS_DEVICE.
+        device: what local workers' devices are asked for by, several with commas; others have PHYRADGS_DEVICE.
     """
 
     scheduler: str = LOCAL

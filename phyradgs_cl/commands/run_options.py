@@ -92,10 +92,8 @@ class RunRequest:
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command all options of a reconstruction but some, in the place of its parameter ``request``.
-
-    Typer reads a command's signature: the one that it finds has the options, and the command is called with a RunRequest.
-    """
+    """Gives a command all options of a reconstruction but some, in place of its parameter ``request``: Typer, which
+    reads a command's signature, sees the options, and the command is called with a RunRequest."""
     names = [name for name in RUN_OPTIONS if name not in without]
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:

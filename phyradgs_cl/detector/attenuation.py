@@ -22,9 +22,8 @@ def counts_to_attenuation(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Line integrals of the projections of a scan.
 
-    "counts" become (I - dark) / (flat - dark) with the means of the flat and of the dark frames (dark 0
-    where there are none), "transmission" T becomes -ln T, "attenuation" stays. Frames whose key is
-    not 0 are left out.
+    "counts" become (I - dark) / (flat - dark) with the mean flat and dark (0 where there are none), "transmission" T
+    becomes -ln T, "attenuation" stays. Frames whose key is not 0 are left out.
 
     Args:
         data: (F, v, u), integers or floats.
@@ -32,9 +31,9 @@ def counts_to_attenuation(
         quantity: what `data` holds.
 
     Returns:
-        (P, v, u) float32 line integrals of the P projections, in order and always finite; and a bool
-        mask of the same shape, True where a value must not be used: not finite, a flat that is not
-        brighter than the dark, or a transmission at or below `TRANSMISSION_FLOOR`.
+        (P, v, u) float32 line integrals, in order and always finite; and a bool mask of the same shape, True where a
+        value must not be used: not finite, a flat that is not brighter than the dark, or a transmission at or below
+        `TRANSMISSION_FLOOR`.
 
     Raises:
         InputError: shapes, keys or quantity wrong, no projection, or counts without a flat frame.
@@ -54,10 +53,8 @@ def frames_to_attenuation(
     darks: NDArray[np.generic] | None = None,
     largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own.
-
-    Attenuation above ``largest`` must not be used either.
-    """
+    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own;
+    attenuation above ``largest`` must not be used either."""
     return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
 
 

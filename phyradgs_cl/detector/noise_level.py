@@ -11,16 +11,9 @@ _LARGEST_SAMPLE = 1_000_000
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
     """Standard deviation of the noise of a pixel behind the object, dimensionless.
 
-    From the median of |second differences| along rows, where an object is seen (values above 0): structure is smooth
-    beside white noise, and a median does not mind edges (Donoho and Johnstone, Biometrika 81 (1994) 425, for the idea).
-    Structure that is as fine as a pixel raises the estimate, noise that is correlated along rows lowers it.
-
-    Args:
-        line_integrals: (F, v, u).
-        valid: (F, v, u), False where a value must not be used; None: all may be.
-
-    Returns:
-        0 where nothing can be told: fewer than three columns, or nothing above 0.
+    From the median of |second differences| along rows where values are above 0: structure is smooth beside white noise, and
+    a median does not mind edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine as a pixel raises it,
+    noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all. 0 where nothing can be told.
     """
     if line_integrals.shape[-1] < 3:
         return 0.0

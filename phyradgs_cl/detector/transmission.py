@@ -7,14 +7,10 @@ from numpy.typing import NDArray
 def transmission_weights(
     line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float32]:
-    """Weights exp(−p) of a scan's pixels (F, v, u), scaled to the mean 1, so that other weights keep their meaning.
+    """Weights exp(−p) of a scan's pixels p (F, v, u), scaled to the mean 1 over those that are ``valid`` (None: all).
 
-    These are the weights of least squares for photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534).
-    What lies below 0 counts as air: noise should not be trusted more for being bright.
-
-    Args:
-        line_integrals: (F, v, u).
-        valid: broadcast to (F, v, u), False where a value must not be used; None: all may be. Only these are in the mean.
+    Those of least squares for photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534). What lies below 0
+    counts as air: noise should not be trusted more for being bright.
     """
     weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
     if valid is None:

@@ -1,7 +1,4 @@
-"""A DICOM series: a folder of CT images, one per slice, in Hounsfield units or in 1/mm with a rescale slope.
-
-Attributes of the CT Image module (DICOM PS3.3, A.3 and C.8.2): position and orientation in LPS, 16 bits per voxel.
-"""
+"""A DICOM series, an image per slice: PS3.3's CT Image module (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
 
 import hashlib
 from pathlib import Path

@@ -13,10 +13,8 @@ from phyradgs_cl.io.output import temporary_name
 
 @contextmanager
 def folder_written_beside(path: Path) -> Iterator[Path]:
-    """Yield a new folder that becomes ``path`` on success; whatever goes wrong, nothing is left of it.
-
-    A folder with something in it is never replaced: it could hold anything.
-    """
+    """Yield a new folder that becomes ``path`` on success, and of which nothing is left otherwise. A folder with
+    something in it is never replaced: it could hold anything."""
     target = Path(os.path.abspath(path))
     if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
         raise OutputError(

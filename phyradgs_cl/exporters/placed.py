@@ -1,8 +1,7 @@
 """A volume as other programs see it: values, spacing and origin in their frame of patient directions.
 
-The world's x, y, z are taken as left, posterior, superior (LPS, the frame of DICOM and ITK): z, the rotation axis, is
-up in every viewer, programs of the ITK family show this package's own millimetres, and a slice on screen looks the same
-in a viewer that knows directions and in one that shows bare images with row 0 at the top.
+The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK): z, the rotation axis, is up in
+every viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Scans and volumes in other programs' formats: read, checked as if by strangers, and turned into our conventions.
-
-`import_scan` and `load_volume` are the doors; one module per format.
-"""
+"""Scans and volumes in other programs' formats, checked as from strangers and turned into our conventions."""
 
 from collections.abc import Callable
 from pathlib import Path

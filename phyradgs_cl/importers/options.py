@@ -33,15 +33,11 @@ _TIMES = ("exposure_s", "readout_s")
 class ImportOptions:
     """Options of an import; None leaves it to the file, or to the format's custom.
 
-    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next, which says
-    that the gantry turned without a stop; ``angle_at``: whether a frame's angle is that of the opening of its
-    first line, or of the middle of that line's exposure. Readout axis and direction are those of the imported
-    scan, whose row 0 is the lowest and whose column 0 is on the left, seen from the source.
-
-    Geometry: distances, pixel size (v, u) and detector offset (v, u) in mm; ``unit_mm``: the length of one scene
-    unit in formats without a unit; ``rotates``: whether angles are the gantry's or the sample's; ``row_0`` and
-    ``column_0``: where the first stored row and column are, seen from the source.
-
+    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next: the gantry turned
+    without a stop; ``angle_at``: a frame's angle is that of its first line's opening ("start") or mid-exposure. Readout
+    axis and direction are those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
+    Geometry: distances, pixel size and detector offset (v, u) in mm; ``unit_mm``: a scene unit where formats have none;
+    ``rotates``: what the angles turn; ``row_0``, ``column_0``: where the first stored ones are, seen from the source.
     Pixels: ``quantity`` that is stored; ``flat_value``: counts without an object, where there are no flat frames.
     ``part``: which projections of a benchmark folder; ``first_view``: where this scan begins in a file of several.
     """

@@ -1,7 +1,4 @@
-"""Results files: JSON lines, one per run, only ever appended to.
-
-A run that is killed while it writes leaves a damaged last line, which reading skips and the next append closes off.
-"""
+"""Results files: JSON lines, one per run, only appended to; a damaged last line is skipped, and closed off by the next."""
 
 import json
 import logging
@@ -22,11 +19,8 @@ _MOST_BYTES = 1 << 30
 
 
 def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True) -> list[Line]:
-    """All whole and sound lines of a results file, with a word about others; none where there is no file.
-
-    Raises:
-        InputError: a file that cannot be read, or that has content but no result.
-    """
+    """All whole and sound lines of a results file, with a word about others; none where there is no file. InputError
+    for a file that cannot be read, or that has content but no result."""
     text = ""
     if path.exists():
         text = read_regular(path, str(path), _MOST_BYTES, _WANTED).decode(errors="replace")

@@ -24,10 +24,7 @@ def lock_path(output: str | Path) -> Path:
 
 @contextmanager
 def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Holds the lock of ``output``; raises BusyError if another run still does after ``wait_s``.
-
-    A dead run's file is taken over.
-    """
+    """Holds the lock of ``output``, a dead run's too; raises BusyError if another run still does after ``wait_s``."""
     from filelock import FileLock, Timeout
 
     path = lock_path(output)

@@ -24,21 +24,16 @@ _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part$")
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise OutputError now if ``path`` could not be written later; leaves nothing behind.
-
-    Meant for the start of long work: it makes, and removes, an empty file in the target's folder.
-    """
+    """Raise OutputError now if ``path`` could not be written later: makes, and removes, an empty file in its folder."""
     temporary = _create_beside(_target(path))
     _remove(temporary)
 
 
 @contextmanager
 def written_beside(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the target's folder; on success it replaces the target in one step.
-
-    The body only writes: its operating system errors are reported as OutputError about ``path``. Whatever
-    goes wrong, an existing target keeps its content and the temporary file is removed.
-    """
+    """Yield a temporary path in the target's folder that replaces the target on success, in one step. The body only
+    writes: its system errors become OutputError about ``path``. Whatever goes wrong, an existing target keeps its
+    content."""
     target = _target(path)
     temporary = _create_beside(target)
     try:

@@ -31,11 +31,9 @@ MOST_LINES = 65_536
 
 @dataclass(frozen=True)
 class Scanner:
-    """A scanner: where things stand, what volume it images, and how its panel is read by default.
-
-    ``readout_ratio`` is T_ro/T_exp, or None if the file leaves it to the protocol. ``pulse`` is when the beam is on
-    in a frame (start, length; shares of the exposure), None always; ``lag`` the panel's λ (detector/lag.py).
-    """
+    """A scanner: where things stand, what volume it images, and how its panel is read by default. ``readout_ratio``:
+    T_ro/T_exp, None is the protocol's. ``pulse``: when the beam is on in a frame (start, length; shares of the
+    exposure), None always. ``lag``: the panel's λ."""
 
     name: str
     geometry: ConeGeometry
@@ -48,11 +46,8 @@ class Scanner:
 
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
-    """A scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml.
-
-    Raises:
-        InputError: no such scanner, not TOML, unknown, missing or wrong keys: "FILE [table] key".
-    """
+    """A scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. InputError: no such scanner, not
+    TOML, unknown, missing or wrong keys: "FILE [table] key"."""
     path = _located(str(name_or_path), data_dir)
     return scanner_from(path, read_toml(path))
 

@@ -40,10 +40,8 @@ def refuse_unknown(culprit: str, found: Collection[str], known: Collection[str],
 
 
 class Fields:
-    """A mapping and the name to blame: values are taken out one by one, each checked.
-
-    ``known``: the only names that it may have; None for a table that may have more than is read of it.
-    """
+    """A mapping and the name to blame: values are taken out one by one, each checked. ``known``: the only names that it
+    may have; None for a table that may have more than is read of it."""
 
     def __init__(self, culprit: str, values: object, known: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):

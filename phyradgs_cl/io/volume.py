@@ -35,11 +35,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class StoredVolume:
-    """A volume file: volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what is kept beside it.
-
-    ``provenance``: facts of the kinds that ``facts.PROVENANCE`` states. ``gaussians`` float32 in mm and 1/mm. ``metrics``:
-    numbers by name. None where there are none.
-    """
+    """Volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what its file has beside it: ``provenance`` of the kinds
+    that ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name; None where there are
+    none."""
 
     volume: np.ndarray
     grid: Grid
@@ -65,8 +63,8 @@ def write_volume(
 ) -> None:
     """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all.
 
-    ``provenance`` and ``metrics`` are stored as JSON, plain values also as attributes; the parameters of ``gaussians``
-    as float32 datasets of their names.
+    ``provenance`` and ``metrics`` are stored as JSON, plain values also as attributes; ``gaussians`` as float32
+    datasets.
 
     Raises:
         InputError: a volume that is not finite or does not fit its grid.
@@ -90,25 +88,20 @@ def write_volume(
 
 
 def read_volume(path: str | Path) -> StoredVolume:
-    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning.
-
-    A run that was interrupted is a warning too.
-    """
+    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning,
+    and a run that was interrupted is one too."""
     with open_hdf5(path) as source:
         volume, grid = _read_voxels(source)
         return StoredVolume(volume, grid, read_provenance(source), _read_gaussians(source), _read_metrics(source))
 
 
 def load_volume(path: str | Path) -> LoadedVolume:
-    """Read a 3D volume of any origin.
-
-    Either a dataset `/volume` (z, y, x) at the root (integers are divided by their type's maximum,
-    floats stay as they are; no grid), or the voxels of a volume file. Negative values are allowed: real reconstructions
-    have them.
+    """The voxels of a volume file, or of a bare 3D dataset `/volume` (z, y, x), without a grid, whose integers are
+    divided by their type's maximum. Negative values are allowed: real reconstructions have them.
 
     Raises:
-        InputError: no such file, not HDF5, no such dataset, not 3D, empty, not numbers, NaN or infinity, larger than
-            the file can hold, kept in another file, axes that do not fit; names the file and the dataset.
+        InputError: whatever is no such file or dataset, NaN or infinity, larger than the file can hold, kept in another
+            file, axes that do not fit; names the file and the dataset.
     """
     with open_hdf5(path) as source:
         if isinstance(source.find(_BARE), h5py.Dataset):
@@ -123,9 +116,8 @@ def load_volume(path: str | Path) -> LoadedVolume:
 def load_attenuation(
     path: str | Path, *, warn: bool = True, load: Callable[[str | Path], LoadedVolume] = load_volume
 ) -> LoadedVolume:
-    """What ``load`` reads, for a volume that rays are to be sent through.
-
-    Where a tenth as much lies below 0 as above, that is worth a warning: noise about 0 in air has less.
+    """What ``load`` reads, for a volume that rays are to be sent through; a tenth as much below 0 as above is a
+    warning.
 
     Raises:
         InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units.
@@ -162,11 +154,8 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def file_kind(path: str | Path) -> str:
-    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume).
-
-    Raises:
-        InputError: not readable, or none of the three.
-    """
+    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume); InputError if none of
+    them."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"

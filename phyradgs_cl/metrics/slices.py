@@ -21,17 +21,10 @@ _INCH, _DPI = 3.2, 110
 
 
 def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str) -> None:
-    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference.
+    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference. z and y point up.
 
-    Grey values run over the truth's range in both columns, so that a wrong gain shows; the difference has
-    a scale of its own, symmetric about 0. Titles carry the slice's number and root mean square error, the
-    heading PSNR and SSIM. z and y point up in the pictures.
-
-    Args:
-        path: file to write.
-        result: (z, y, x).
-        reference: (z, y, x), the truth, or None where there is none: then there is one column.
-        title: the heading's first line.
+    Grey values run over the truth's range, so that a wrong gain shows; the difference has a scale of its own, symmetric
+    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line.
 
     Raises:
         InputError: not 3D, shapes that differ, NaN or infinity.

@@ -1,8 +1,7 @@
 """Phantoms made of additive ellipsoids: line integrals in closed form, no voxels in between.
 
-An affine map takes an ellipsoid to the unit ball and a ray to a ray, so that the chord follows from
-the ray's distance to the ball's centre (A. C. Kak and M. Slaney, Principles of Computerized
-Tomographic Imaging, IEEE Press 1988, section 3.1).
+An affine map takes an ellipsoid to the unit ball and a ray to a ray: the chord follows from the ray's distance to the
+centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1).
 """
 
 from collections.abc import Iterator
@@ -34,14 +33,9 @@ def rotation_about_z(angle_rad: float) -> Matrix:
 class Ellipsoid:
     """One solid ellipsoid whose attenuation adds to whatever else is there.
 
-    Args:
-        centre_mm: (x, y, z).
-        semi_axes_mm: (a, b, c) along the ellipsoid's own axes.
-        attenuation_per_mm: added inside; may be negative, to carve a hole.
-        rotation: 3x3 matrix whose columns are the ellipsoid's axes in world coordinates.
-
-    Raises:
-        InputError: semi-axes not positive, values not finite, or a matrix that is no rotation.
+    Centre (x, y, z); semi-axes along the ellipsoid's own axes, which are the columns of the 3x3 ``rotation``;
+    ``attenuation_per_mm`` may be negative, to carve a hole. Raises InputError for semi-axes that are not positive, values
+    that are not finite, or a matrix that is no rotation.
     """
 
     centre_mm: Triple
@@ -86,17 +80,10 @@ class EllipsoidPhantom:
         object.__setattr__(self, "ellipsoids", tuple(self.ellipsoids))
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
-        """Attenuation integrated along the segments from `source` to `target`.
+        """Attenuation integrated from `source` to `target`, (..., 3) world points (x, y, z) in mm that broadcast.
 
-        Args:
-            source: (..., 3) world points (x, y, z) in mm.
-            target: (..., 3) in mm; the two broadcast against each other.
-
-        Returns:
-            (...) float64, dimensionless; 0 for a segment that misses or has no length.
-
-        Raises:
-            InputError: last axis not 3, or shapes that do not broadcast.
+        Returns (...) float64, dimensionless; 0 for a segment that misses or has no length. Raises InputError for a last axis
+        that is not 3, or shapes that do not broadcast.
         """
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
@@ -124,11 +111,7 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Mean attenuation of every voxel, from `supersampling` points along each axis of it.
-
-        Returns:
-            (nz, ny, nx) float32 in 1/mm.
-        """
+        """Mean attenuation (nz, ny, nx) float32 in 1/mm, from `supersampling` points along each axis of a voxel."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)

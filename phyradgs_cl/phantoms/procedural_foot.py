@@ -1,8 +1,7 @@
-"""A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue.
+"""A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue, drawn from scratch.
 
-Drawn from scratch as tapered capsules with a cortical shell and a trabecular inside; no scan of
-anybody is in it. The foot points along the rotation axis (toes to +z), the big toe to -x, the sole
-to -y. Lengths are in units of half the cube's side.
+Tapered capsules with a cortical shell and a trabecular inside. Toes point to +z, the big one to -x, the sole to -y.
+Lengths are in units of half the cube's side.
 """
 
 from itertools import pairwise
@@ -58,18 +57,8 @@ _FLESH = (
 
 
 def foot(grid_shape: int, seed: int) -> Field:
-    """The phantom at a resolution; the same seed gives the same foot at every resolution.
-
-    Args:
-        grid_shape: voxels along each axis of the cube.
-        seed: proportions and texture follow from it.
-
-    Returns:
-        (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    Raises:
-        InputError: fewer than 4 voxels.
-    """
+    """The phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. The same
+    `seed` gives the same foot at every resolution; InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     bones, toes = _bones(rng), _toes(rng)

@@ -1,8 +1,7 @@
-"""A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue.
+"""A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue, drawn from scratch.
 
-Drawn from scratch: the body of the mandible is an elliptic section swept along a horizontal arc, rami
-and roots are tapered capsules, crowns are small ellipsoids with an enamel cap. The chin points to -y,
-the teeth to +z. Lengths are in units of half the cube's side.
+The body is an elliptic section swept along a horizontal arc; rami and roots are tapered capsules, crowns small
+ellipsoids with an enamel cap. The chin points to -y, the teeth to +z. Lengths are in units of half the cube's side.
 """
 
 from dataclasses import dataclass
@@ -64,18 +63,8 @@ class Tooth:
 
 
 def jaw(grid_shape: int, seed: int) -> Field:
-    """The phantom at a resolution; the same seed gives the same jaw at every resolution.
-
-    Args:
-        grid_shape: voxels along each axis of the cube.
-        seed: proportions and texture follow from it.
-
-    Returns:
-        (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    Raises:
-        InputError: fewer than 4 voxels.
-    """
+    """The phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. The same
+    `seed` gives the same jaw at every resolution; InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     teeth = _teeth(rng)

@@ -42,10 +42,8 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Four digits are more than a report's numbers deserve; powers of ten only where they save zeros.
-
-    What is a millionth of ``resolution`` or less is what rounding left of 0.
-    """
+    """Four digits at most, powers of ten only where they save zeros; a millionth of ``resolution`` or less is 0,
+    rounded."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

@@ -14,11 +14,9 @@ VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """``<name attributes>children</name>``; children and attribute values that are no Markup are escaped.
-
-    Attributes that are None or False are left out, True stands without a value. Of their names underscores become dashes
-    and one at the end goes (``class_``); SVG's camel case is written as it is.
-    """
+    """``<name attributes>children</name>``; children and attribute values that are no Markup are escaped. Attributes
+    that are None or False are left out, True has no value; underscores in names become dashes, one at the end goes
+    (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
     if name in VOID:
         return Markup(opening)

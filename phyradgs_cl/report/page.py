@@ -31,14 +31,10 @@ def write_report(
     scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page of a volume file, whole or not at all; returns what was found for it.
+    """Writes the page ``output`` of a volume file, whole or not at all; returns what was found for it.
 
-    Args:
-        volume: a volume file of ours.
-        output: the page.
-        make_runtime: gives the device that projects the volume; not asked without a scan or with ``views`` 0.
-        scan: its scan; None takes the one that the volume's provenance names, if it is there unchanged.
-        views: frames that are projected from the volume and compared with the measurement.
+    ``scan`` None takes the one that the volume's provenance names, if it is there unchanged; ``views`` frames of it are
+    projected from the volume, on the device of ``make_runtime``, which is not asked without any.
 
     Raises:
         InputError: files that cannot be read, or are of another kind; an output that is one of them.

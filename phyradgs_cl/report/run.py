@@ -23,11 +23,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction with what is known about it.
-
-    scan, scan_path, scan_facts: where the scan was found; it has the volume's grid. reference (nz, ny, nx) 1/mm: the truth
-    on that. metrics: numbers by name. notes: what a reader should know about the page itself, a sentence each.
-    """
+    """A reconstruction with what is known about it. scan, scan_path, scan_facts: its scan, on the volume's grid, where
+    found. reference (nz, ny, nx) 1/mm: the truth on that. metrics: numbers by name. notes: what a reader should know
+    about the page itself."""
 
     path: Path
     stored: StoredVolume
@@ -70,10 +68,7 @@ class Run:
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
     """Reads a volume file and its scan: ``scan_path``, or the one that the provenance names if it is still the same.
-
-    Raises:
-        InputError: not a volume file of ours; a scan that is named and cannot be read.
-    """
+    InputError: not a volume file of ours; a scan that is named and cannot be read."""
     if (kind := file_kind(path)) != "volume":
         remedy = "reconstruct one with 'phyradgs reconstruct'"
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", remedy)

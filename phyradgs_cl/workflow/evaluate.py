@@ -22,10 +22,8 @@ log = logging.getLogger(__name__)
 
 @np.errstate(all="ignore")
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
-    """Compares a volume with a scan's reference or another volume and writes the picture of slices.
-
-    On another grid it is resampled onto the reference's; values without a grid are compared voxel by voxel.
-    """
+    """Compares a volume with a scan's reference or another volume, onto whose grid it is resampled, and writes the
+    picture of slices; values without a grid are compared voxel by voxel."""
     refuse_overwriting("--picture", picture, volume_path, reference_path)
     if picture.suffix.lower() != ".png":
         raise InputError("--picture", str(picture), "a file name that ends in .png")

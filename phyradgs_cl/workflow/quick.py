@@ -26,11 +26,8 @@ _ROWS: tuple[tuple[str, Table], ...] = (
 def quick_grid(
     folder: Path, make_runtime: Callable[[], Runtime], *, seed: int = 0, iterations: int = ITERATIONS
 ) -> SweepGrid:
-    """Simulates what is missing of the scans in ``folder``/scans; every method, with and without motion, on each.
-
-    seed: of noise, cloud and frame order. iterations: of the splatting methods. Raises OutputError for a folder that cannot
-    be made.
-    """
+    """Simulates what is missing of the scans in ``folder``/scans; every method, with and without motion, on each. seed:
+    of noise, cloud and frame order; iterations: of splats. OutputError for a folder that cannot be made."""
     checks.within("--iterations", iterations, 0, 10_000_000)
     settings = []
     for method, motion in _ROWS:

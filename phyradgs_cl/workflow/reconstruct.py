@@ -70,11 +70,8 @@ class ReconstructionJob:
 
 
 class _Keeper:
-    """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end.
-
-    There is one checkpoint per run: it is replaced in one step, so that a kill at any moment leaves the last whole one.
-    Where it cannot be written the run goes on, since that is what the work is worth.
-    """
+    """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end. It is replaced
+    in one step, so that a kill leaves the last whole one; where it cannot be written the run goes on."""
 
     def __init__(self, path: Path, fingerprint: str, every_s: float, report: ProgressReport) -> None:
         self.path, self.fingerprint, self.every_s, self.report = path, fingerprint, every_s, report
@@ -121,10 +118,9 @@ def run_reconstruction(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
 
-    An interrupted run leaves what is at ``output`` alone: it writes the volume as far as it got to ``io.partial_path``, and
-    a checkpoint that ``resume`` continues; both go when a run has come to its end. A run that is killed leaves its last
-    checkpoint. Raises OutputError while another run is at work on the same output.
-    Of ``ranks``, which the runtime must have too, rank 0 alone writes; the others have no metrics.
+    An interrupted run leaves ``output`` alone: what it has goes to ``io.partial_path``, and a checkpoint that ``resume``
+    continues; both go when a run ends. One that is killed leaves its last checkpoint. Of ``ranks``, which the runtime must
+    have too, rank 0 alone writes and has metrics. Raises OutputError while another run is at work on the output.
     """
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)

@@ -14,10 +14,8 @@ _QUESTION = "angles"
 
 
 def check_angles(scan: Scan) -> Finding:
-    """The largest gap between neighbouring views, against three times the usual one; a short scan may leave its own gap.
-
-    Views that cover half a turn and the fan (or more) leave one gap that is no fault; less is one whatever the steps.
-    """
+    """The largest gap between neighbouring views, against three times the usual one. Views that cover half a turn and
+    the fan (or more) leave one gap that is no fault; less is one whatever the steps."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
     poses = np.stack([scan.trajectory.pose(f, middle_s[f : f + 1])[0] for f in range(scan.frames)])
     angles_rad = np.sort(azimuth_rad(poses) % (2 * np.pi))

@@ -32,10 +32,8 @@ CONSISTENCY = "consistency"
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The finding; the frames (indices) that fit together; whether other questions can be asked of them.
-
-    sees_angles: whether an object can be told from itself turned.
-    """
+    """The finding; the frames (indices) that fit together; whether other questions can be asked of them; sees_angles:
+    whether an object can be told from itself turned."""
 
     finding: Finding
     kept: np.ndarray
@@ -53,11 +51,9 @@ class Cause:
 
 
 def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
-    """The residual of a coarse ``scan``, over that of its frames in a random order; and whatever explains them far better.
-
-    A wrong sign of rotation or a shifted panel has a question of its own: the best of these is what other causes, an
-    order or step of angles or a size of pixels, have to halve. Frames that stand out of the rest are left out first.
-    """
+    """The residual of a coarse ``scan``, over that of its frames in a random order; and whatever explains them far
+    better. Rotation and shift have questions of their own: the best of these is what other causes (an order or step of
+    angles, a size of pixels) have to halve. Frames that stand out are left out first."""
     everything = np.arange(scan.frames)
     if scan.frames < _FEWEST_FRAMES or _pixels(scan) < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -135,9 +131,7 @@ def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan]:
 
 def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Scan, Fit, list[str]]:
     """(frames (indices) without those whose residual is far above the others', the scan of them, its fit, what to say).
-
-    The worst goes first; where one in five would go, it is not a few frames but something that all share.
-    """
+    The worst goes first; where one in five would go, it is something that all share."""
     everything = left = np.arange(scan.frames)
     current = stated
     out: list[int] = []

@@ -22,10 +22,9 @@ _QUESTION = "coverage"
 def check_coverage(scan: Scan) -> Finding:
     """What the panel's side columns see, against a tenth of the largest line integral.
 
-    A border counts as touched where the mean over a few neighbouring rows of its two outermost columns is above the
-    threshold and above the noise, in a tenth of the frames. A displaced panel may cut the object on its short side.
-    Rows are not asked: objects longer than the panel are the rule. Frames in which nothing rises above the noise have no
-    object, or another sign; line integrals beyond 30 are something else.
+    A border counts as touched where the mean over a few rows of its two outermost columns is above threshold and noise in a
+    tenth of the frames; a displaced panel may cut the object on its short side, and rows are not asked. Frames in which
+    nothing rises above the noise have no object, or another sign; line integrals beyond 30 are something else.
     """
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:

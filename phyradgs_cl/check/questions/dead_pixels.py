@@ -22,9 +22,9 @@ _QUESTION = "dead pixels"
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     """The share of pixels that are dead and not masked, against 0.02 %; and where they are (v, u) bool.
 
-    Dead is a pixel that never changes while those around it do, or one that lies beyond all its neighbours in 70 % of the
-    frames, its median distance from the median of 3 × 3 pixels being more than ten of the panel's usual deviations. Near the
-    axis, where small parts of the object stand still on the panel, it has to be sharper than these.
+    Dead is a pixel that never changes while those around it do, or one beyond all its neighbours in 70 % of the frames, more
+    than ten of the panel's usual deviations from the median of 3 × 3 pixels; near the axis, where small parts of the object
+    stand still on the panel, it has to be sharper than these.
     """
     known = _masked(scan)
     if scan.frames < _LEAST_FRAMES:

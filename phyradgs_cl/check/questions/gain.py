@@ -17,11 +17,8 @@ GAIN = "gain drift"
 
 
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
-    """The change of gain that the levels of the frames (line integrals that are the same in all pixels) give.
-
-    A ramp and the largest step are fitted beside what turns with the gantry, which an object beyond the panel does too. More
-    than 1.5 % and five standard deviations is suspicious.
-    """
+    """The change of gain that the levels of the frames (line integrals that are the same in all pixels) give: a ramp
+    and the largest step, beside what turns with the gantry. More than 1.5 % and five standard deviations is suspicious."""
     if scan.frames < _FEWEST:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST, "share", f"fewer than {_FEWEST} frames")
     level = fit(system_of(rt, scan)).level

@@ -14,10 +14,8 @@ _QUESTION = "timing"
 
 def check_timing(scan: Scan) -> Finding:
     """A line cannot open while it is open, nor a frame be read while the last one is, nor a gantry be at two angles.
-
-    The number is the worst of three shares: the exposure and the readout of the shortest time between frames (at most 1),
-    and one more than how far the angles between frames are from those that the speed within the frames gives.
-    """
+    The number is the worst of: exposure and readout over the shortest time between frames (at most 1), and one more
+    than how far the angles between frames are from those that the speed within the frames gives."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_QUESTION, OK, 0.0, 1.0, "share", "one frame: nothing to compare")

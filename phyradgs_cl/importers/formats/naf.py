@@ -1,7 +1,4 @@
-"""Pickles of NAF and SAX-NeRF: one dictionary with geometry, projections and the true volume.
-
-Lengths are in mm, densities in 1/m and projections in density × metre: dimensionless line integrals.
-"""
+"""Pickles of NAF and SAX-NeRF: a dictionary of geometry (mm), projections (dimensionless) and true volume (1/m)."""
 
 from pathlib import Path
 

@@ -1,8 +1,8 @@
 """Real scans of PhyRadGS: a JSON of calibrated views with the arcs of their rolling shutter, and 16-bit TIFF frames.
 
 A view's ``detector`` is a 4×4 matrix from the panel to the world (mm): column 0 along the rows of the image, column 1
-down them, column 3 the panel's centre. The matrix holds where the panel stands on its circle; at other times of the
-frame it has turned about +z by as much as its angle. Rows are read one after the other, the first stored one first.
+down them, column 3 the panel's centre. It holds where the panel stands on its circle, else turned about +z by its
+angle. The first stored row is read first.
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,7 @@
-"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame where its first and last line began and ended.
+"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame where its first and last line began and
+ended.
 
-The arcs are all that the files say about time: the exposure takes ``exposure_s`` (1 s unless it is given), and the
-gantry turns at the speed that makes the exposure's arc of it.
+The exposure takes ``exposure_s`` (1 s unless given); the gantry turns at the speed that makes the exposure's arc of it.
 """
 
 from pathlib import Path
@@ -46,10 +46,8 @@ def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
 
 
 def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Timing from angles (F, 3): first line's start and end, last line's end.
-
-    The first stored line is read first: column 0, or with a readout along rows the one at the top.
-    """
+    """Timing from angles (F, 3): first line's start and end, last line's end. The first stored line is read first:
+    column 0, or with a readout along rows the one at the top."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(
         culprit.culprit, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]

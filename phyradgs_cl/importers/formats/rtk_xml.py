@@ -1,6 +1,6 @@
 """RTK's geometry files (RTKThreeDCircularGeometry, version 3): nine numbers per projection, and the poses they mean.
 
-No entity is declared, no external file is looked at. RTK's own files carry an empty DOCTYPE, the only one that passes.
+No entity is declared, no external file looked at: an empty DOCTYPE, as in RTK's own files, is the only one that passes.
 """
 
 import math
@@ -55,11 +55,9 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Poses (T, 12) at frame positions (T,), numbers between and beyond frames by straight lines.
-
-        ``origin_mm`` (2,): place (u, v) of pixel (0, 0) in the image's own plane; ``step_u``, ``step_v`` (2,): steps
-        from column to column and row to row there.
-        """
+        """Poses (T, 12) at frame positions (T,), numbers between and beyond frames by straight lines. ``origin_mm``
+        (2,): place (u, v) of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and
+        row to row."""
         at = {
             name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
         }

@@ -1,7 +1,7 @@
 """A folder of TIFF frames and one TOML that says what they are, where things stood and when they were taken.
 
-The tables [source], [detector], [volume], [readout] and [beam] are those of a scanner file; [frames], [angles] and
-[timing] are added. Row 0 of an image is its top, column 0 its left, seen from the source.
+Its tables are a scanner file's, and [frames], [angles], [timing]. Row 0 is the top, column 0 the left, seen from the
+source.
 """
 
 from dataclasses import replace

@@ -1,7 +1,4 @@
-"""What R2-Gaussian's, PhyRadGS's and NAF's files share: TIGRE's frame, with images and volumes turned.
-
-Projections are stored [v, u] with row 0 at +z, volumes [x, y, z]; angles are the gantry's, in radians.
-"""
+"""TIGRE's frame, which R2-Gaussian, PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z]."""
 
 import numpy as np
 
@@ -15,10 +12,7 @@ ROW_0 = "top"
 
 
 def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
-    """The cone of a scanner's table; its lengths count in ``unit_mm``.
-
-    ``nDetector``, ``sDetector`` and ``dDetector`` run [v, u], ``offDetector`` [u, v].
-    """
+    """The cone of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v]."""
     mode = scanner.word("mode", default="cone")
     if mode != "cone":
         raise InputError(scanner.name("mode"), repr(mode), "'cone'", "parallel beams have no source distance")

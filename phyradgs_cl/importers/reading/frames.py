@@ -34,16 +34,9 @@ def line_integrals(
     darks: np.ndarray | None = None,
     custom: str | None = None,
 ) -> LineIntegrals:
-    """Line integrals of ``frames`` (P, v, u); clipped counts and values that no object has are masked, and said.
-
-    Args:
-        culprit: the file, for messages.
-        frames: as stored, in any real type.
-        options: its ``quantity`` wins over everything, its ``flat_value`` stands in for flats.
-        flats, darks: (n, v, u) or None.
-        custom: the quantity that the format, or the file, gives; None where nothing is said: then frames with
-            flats are counts, and floats without any are refused.
-    """
+    """Line integrals of ``frames`` (P, v, u) of any real type; clipped counts and values that no object has are masked,
+    and said. ``culprit`` names the file; ``flats``, ``darks``: (n, v, u) or None. The options' ``quantity`` wins over
+    ``custom``, the format's or file's; where neither says, frames with flats are counts and others refused."""
     quantity = options.quantity or custom or ("counts" if has_flats(flats, options) else None)
     if quantity is None:
         remedy = f"say {option_name('quantity')} attenuation, transmission or counts"
@@ -70,11 +63,9 @@ def line_integrals(
 def _mask_clipped(
     culprit: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
 ) -> None:
-    """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object.
-
-    Where the flat is clipped too the integral is 0: right for air, which is most of it, and without air in the frames a
-    reconstruction is further off (2 to 3 times) than with thin parts that are lost.
-    """
+    """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object. Where the
+    flat is clipped too the integral is 0: right for air, which is most of it; without air a reconstruction is 2 to 3
+    times further off than with thin parts lost."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
@@ -100,10 +91,8 @@ def compact(mask: np.ndarray) -> Mask:
 
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
-    """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source.
-
-    ``row_0`` and ``column_0`` are the format's custom; the options win.
-    """
+    """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source; ``row_0`` and
+    ``column_0`` are the format's custom, over which the options win."""
     if (options.row_0 or row_0) == "top":
         array = array[..., ::-1, :]
     if (options.column_0 or column_0) == "right":

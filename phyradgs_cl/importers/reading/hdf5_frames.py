@@ -15,10 +15,7 @@ from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
 
 @contextmanager
 def opened(path: Path) -> Iterator[Hdf5Source]:
-    """``open_hdf5``, for files whose root or names are damaged as well.
-
-    h5py has a KeyError for the one, and hands out names that are no text as bytes, which no path can be joined with.
-    """
+    """``open_hdf5``, for files whose root or names are damaged as well: h5py has a KeyError, or names that are bytes."""
     try:
         with open_hdf5(path) as source:
             yield source

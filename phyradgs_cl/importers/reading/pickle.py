@@ -1,8 +1,8 @@
 """Pickles without trust: the standard library's unpickler, with an allow-list in place of whatever a file names.
 
-What a name of the list stands for is a function of this module, not NumPy's: none of them allocates by a number in the
-file or takes a state that it does not check. The unpickler is the one written in Python, because the one in C hashes keys
-before anyone can look at them: integers that share one hash, or tuples of tuples, keep it for hours.
+What a name stands for is a function of this module that neither allocates by a number in the file nor takes a state
+unchecked. The unpickler is the one in Python: that in C hashes keys before anyone looks, and equal hashes keep it for
+hours.
 """
 
 import io

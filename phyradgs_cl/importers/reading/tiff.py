@@ -35,10 +35,8 @@ class _Header:
 
 
 def read_tiffs(paths: list[Path]) -> np.ndarray:
-    """Frames (F, v, u) in the files' own type, row 0 as stored; every image of every file, in order.
-
-    All headers are read before any pixel, so that the frames are unpacked into one array of a known size.
-    """
+    """Every image of every file, in order: frames (F, v, u) in their own type, row 0 as stored. All headers are read
+    before any pixel, so that the frames are unpacked into one array of a known size."""
     headers = [_header(path) for path in paths]
     first = headers[0]
     for path, header in zip(paths, headers, strict=True):
@@ -99,10 +97,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Voxel sizes (x, y, z) mm and the origin's place (x, y, z) in voxels, where a stack states them; and its "Info".
-
-    Of ImageJ's own stacks, and of BigTIFF in which tifffile keeps the same words as JSON. Call ``read_pages`` first.
-    """
+    """Voxel sizes (x, y, z) mm, the origin's place (x, y, z) in voxels and "Info", where a stack states them: ImageJ's
+    own, and BigTIFF in which tifffile keeps the same words as JSON. Call ``read_tiffs`` first."""
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:

@@ -1,8 +1,4 @@
-"""What a file says of how it was made: fields of known kinds, read so that damage to one costs that one.
-
-Provenance and results are JSON that anybody may have edited. A schema states the kind of every field that the package
-computes with; of all others it asks no more than that they can be shown.
-"""
+"""What a file says of how it was made: JSON that anybody may have edited, in which damage to one field costs that one."""
 
 import json
 import logging
@@ -66,10 +62,7 @@ def damage(facts: Mapping[str, object], schema: Schema, required: Collection[str
 
 
 def read_facts(culprit: str, text: str, schema: Schema) -> Facts:
-    """The JSON object in ``text`` without its damaged fields, of which the log has a word.
-
-    Raises InputError for text that is no JSON object.
-    """
+    """The JSON object in ``text`` (else InputError) without its damaged fields, of which the log has a word."""
     try:
         if len(text) > MOST_BYTES:
             raise ValueError(f"{len(text)} characters")

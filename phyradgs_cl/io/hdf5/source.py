@@ -1,8 +1,4 @@
-"""HDF5 files from strangers: opened, walked and measured without leaving the file.
-
-An `Hdf5Source` follows links inside the file only, and refuses datasets whose bytes lie elsewhere or
-whose declared size the file cannot hold. Every defect is an InputError about "FILE:/hdf5/path".
-"""
+"""HDF5 files from strangers, walked without leaving the file: no link, dataset or declared size leads out of it."""
 
 import difflib
 import math
@@ -36,10 +32,7 @@ _FREE_BYTES = 64 << 20
 
 @contextmanager
 def open_hdf5(path: str | Path) -> "Iterator[Hdf5Source]":
-    """Open a file for reading; InputError for what is missing, a folder, truncated, not HDF5, or more than HDF5 survives.
-
-    Errors of HDF5 in the body come out as InputError too, so the body should do nothing but read.
-    """
+    """Open a file for reading; InputError for whatever is no readable HDF5, errors of HDF5 in the body included."""
     path = Path(path)
     if regular_file(path, str(path), "an HDF5 file").st_size == 0:  # of /proc, or cut off
         raise InputError(str(path), "an empty file", "an HDF5 file", "copy or write it again")

@@ -7,11 +7,8 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity: factors from the accepted unit names to the one that the package computes in.
-
-    ``assumed`` is the unit of a dataset without a units attribute. ``largest``, in the package's unit, is far beyond any
-    scanner: numbers past it are damage, and would overflow later.
-    """
+    """A physical quantity: factors from the accepted unit names to the package's unit. ``assumed``: of a dataset
+    without units. ``largest``, in the package's unit: numbers past it are damage, and would overflow later."""
 
     name: str
     assumed: str

@@ -15,10 +15,8 @@ from phyradgs_cl.io.scan.header import read_header
 
 
 def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
-    """Copy a scan file with its panel ``shift_u_mm`` further along u: in detector_offset, and in poses where it has them.
-
-    Raises InputError for a file that is no scan, OutputError where the copy cannot be written.
-    """
+    """Copy a scan file with its panel ``shift_u_mm`` further along u: detector_offset, and poses where it has them.
+    Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         poses = f"{header.entry}/{schema.POSES}/pose"

@@ -31,11 +31,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ScanHeader:
-    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
-
-    ``entry`` is the NXtomo group's address, image_key (F,) runs over all stored frames, ``mask_shape`` and
-    ``has_reference`` tell which optional arrays the file has.
-    """
+    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory. ``entry``: address of the
+    NXtomo group; image_key (F,) of all stored frames; ``mask_shape``, ``has_reference``: optional arrays."""
 
     scan: Scan
     entry: str

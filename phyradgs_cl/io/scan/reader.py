@@ -24,14 +24,13 @@ ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.nda
 def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     """Read a scan file; the frames become line integrals by ``to_attenuation``.
 
-    Everything but the pixels is checked before the pixels are read. Flat, dark and invalid frames are
-    gone from the result; pixels that the file or the conversion calls bad are in its ``pixel_mask``.
-    Pixels that are not finite must be masked.
+    Everything but the pixels is checked before they are read. Flat, dark and invalid frames are left out; pixels that the
+    file or the conversion calls bad are masked, as those that are not finite must be.
 
     Args:
         path: the HDF5 file.
-        to_attenuation: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P
-            projections and a mask (v, u) or (P, v, u) of unusable values, or None.
+        to_attenuation: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P projections and
+            a mask (v, u) or (P, v, u) of unusable values, or None.
 
     Returns:
         The scan, with projections (P, v, u) float32 and a bool ``pixel_mask`` or None.
@@ -51,10 +50,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
-    """Facts about a scan file, for people: checked as for reading, but without touching the pixels.
-
-    sha256: of the file, where it is known already.
-    """
+    """Facts about a scan file, checked but for its pixels. sha256: of the file, where it is known already."""
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key

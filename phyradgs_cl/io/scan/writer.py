@@ -33,8 +33,7 @@ def write_scan(
 
     Args:
         path: the HDF5 file; one that exists is replaced.
-        scan: geometry, timing, masks, reference, and the line integrals unless ``data`` is given. A trajectory of one's own
-            is sampled into a table of poses.
+        scan: with the line integrals unless ``data`` is given; a trajectory of one's own becomes a table of poses.
         data: (F, v, u) float32 or uint16 raw frames, flats and darks included, in place of them.
         image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid; it has as many 0 as ``scan`` has frames.
         quantity: what ``data`` holds: "attenuation", "transmission" or "counts".

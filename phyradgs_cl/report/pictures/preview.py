@@ -23,17 +23,9 @@ log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
-    """Writes a grey PNG of the middle slices, axial, coronal and sagittal from left to right, whole or not at all.
-
-    Args:
-        volume: (nz, ny, nx) in 1/mm; y (axial) and z (the others) point up, x, x and y to the right.
-        grid: its grid; slices have their true proportions.
-        path: file to write.
-
-    Raises:
-        InputError: a volume that does not fit its grid, NaN or infinity.
-        OutputError: the file cannot be written.
-    """
+    """Writes a grey PNG of a volume's (nz, ny, nx) middle slices in true proportions, whole or not at all: axial (y
+    up), coronal and sagittal (z up) from left to right. InputError: a volume that does not fit its grid, NaN or
+    infinity. OutputError: the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -51,11 +43,8 @@ def check_preview(path: Path, *others: Path) -> None:
 
 
 class Preview:
-    """A report of a running method that keeps a picture of the present volume, at most one every ``every_s`` seconds.
-
-    It lies at ``io.partial_path`` of ``path`` until the run has come to its end. A picture that cannot be written ends no
-    run: it is a warning, once.
-    """
+    """A report of a running method that keeps a picture of the present volume at ``io.partial_path`` of ``path``, at
+    most one every ``every_s`` seconds. One that cannot be written is a warning, once."""
 
     def __init__(self, path: Path, report: ProgressReport, every_s: float = 5.0) -> None:
         self.path, self.partial, self.report, self.every_s = path, partial_path(path), report, every_s

@@ -46,11 +46,8 @@ def chosen_frames(frames: int, count: int) -> list[int]:
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
-    """``count`` frames of the run's scan beside those of its volume, under the scan's true motion.
-
-    The measurement is what the run's method saw: lag undone and filtered if the run did so. A panel that averages
-    intensity is compared with intensities that are averaged.
-    """
+    """``count`` frames of the run's scan, as its method saw them (lag undone, filtered), beside those of its volume
+    under the scan's true motion; intensities where the panel averages them."""
     if run.scan is None or count < 1:
         return []
     scan, chosen = prepared(run.scan, run.before), chosen_frames(run.scan.frames, count)

@@ -20,10 +20,8 @@ Volume = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Window:
-    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps of a page's slices span.
-
-    All in 1/mm. ``beyond``: whether there are smaller, and larger values than those.
-    """
+    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps span, all in 1/mm.
+    ``beyond``: whether there are smaller, and larger values than those."""
 
     low: float
     high: float
@@ -42,11 +40,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one per index.
-
-    first_mm, step_mm: centre of slice 0 and the way to the next. size_mm: (width, height) of a slice. still: the result's
-    middle slice as it is seen without a script, a PNG.
-    """
+    """The slices of one orientation: PNGs in base64 (``layers``) of ``indices`` among ``count``. first_mm, step_mm:
+    centre of slice 0 and the way to the next. size_mm: (width, height). still: the middle slice as seen without a
+    script, a PNG."""
 
     name: str
     axis: str

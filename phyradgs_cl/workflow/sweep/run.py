@@ -34,10 +34,8 @@ class SweepJob:
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """Where a sweep is: runs done of all, failed ones among them, those at workers; ``line`` of a run just done.
-
-    ``name`` and ``progress`` are of the run under way in this process, ``dashboard`` is said once.
-    """
+    """Where a sweep is: runs done of all, failed ones among them, those at workers; ``line`` of a run just done;
+    ``name`` and ``progress`` of the run under way in this process; ``dashboard`` is said once."""
 
     done: int
     total: int
@@ -54,10 +52,8 @@ Report = Callable[[SweepProgress], None]
 
 @np.errstate(all="ignore")
 def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[list[Path], int]:
-    """Makes what is missing, then tables; the files written, and how many runs of the grid have failed now.
-
-    A run is in the file once, when it is done; an interruption (KeyboardInterrupt) loses nothing that is done. Runs that
-    failed are made again by the next call.
+    """Makes what is missing, then tables; the files written, and how many runs of the grid have failed now, which the
+    next call makes again. An interruption (KeyboardInterrupt) loses nothing that is done.
 
     Raises:
         OutputError: the folder cannot be written; BusyError while another sweep is at work on it.

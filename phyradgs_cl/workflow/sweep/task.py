@@ -25,11 +25,8 @@ log = logging.getLogger(__name__)
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """The line of a run: made now, or kept beside its volume by a worker whose answer was lost.
-
-    Where the run fails, the line has its error. Raises KeyboardInterrupt for a run that was stopped, and OutputError where
-    nothing can be written: that would fail every other run too.
-    """
+    """The line of a run, with its error where it fails: made now, or kept beside its volume by a worker whose answer
+    was lost. Raises KeyboardInterrupt for a run that was stopped, OutputError where nothing can be written."""
     kept = _kept(run)
     if kept is not None:
         return kept

@@ -24,9 +24,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class WatchJob:
     """Which folder to watch, and how its scans are reconstructed into ``output``: as ``template``, but for its files.
-
-    poll_s: between two looks at the folder. settle_s: how long a file must stand still. once: end when nothing is left.
-    """
+    poll_s: between two looks at the folder. settle_s: how long a file must stand still. once: end when nothing is left."""
 
     folder: Path
     output: Path
@@ -56,10 +54,8 @@ def run_watch(
     tell: Callable[[WatchEvent], None],
     report: Callable[[Path], ProgressReport] = lambda scan: ignore_progress,
 ) -> None:
-    """Looks, reconstructs, looks again; returns only with ``once``.
-
-    A signal during a run ends it after the iteration under way, with a checkpoint that the next start goes on from, as
-    KeyboardInterrupt.
+    """Looks, reconstructs, looks again; returns only with ``once``. A signal during a run ends it after the iteration
+    under way, as KeyboardInterrupt, with a checkpoint that the next start goes on from.
 
     Raises:
         InputError: no such folder, or it is also the output.
@@ -124,10 +120,8 @@ class _Watch:
         return found
 
     def _handle(self, arrival: Arrival) -> bool:
-        """Makes the volume of a scan, or its error; False for a file that somebody has open, which waits.
-
-        A device that fails is opened anew, once; if it is gone, that ends the watch.
-        """
+        """Makes the volume of a scan, or its error; False for a file that somebody has open, which waits. A device that
+        fails is opened anew, once; if it is gone, that ends the watch."""
         try:
             return self._reconstruct(arrival)
         except OutOfMemoryError as error:
