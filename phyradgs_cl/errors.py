@@ -41,8 +41,6 @@ class InputError(PhyradgsError):
 
 
 class NumericalError(PhyradgsError):
-    """NaN or infinity arose in a computation."""
-
     exit_code = 3
 
 

@@ -172,7 +172,6 @@ def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) ->
 
 
 def _rounds(options: SplatOptions) -> int:
-    """Rounds of density control in a run."""
     return sum(options.control.is_due(i, options.iterations) for i in range(1, options.iterations + 1))
 
 

@@ -36,7 +36,6 @@ class Ticker:
             self.is_open, self.is_counting = True, False
 
     def progress(self, p: Progress) -> None:
-        """The report of a reconstruction."""
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 

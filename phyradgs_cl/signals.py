@@ -47,7 +47,6 @@ def answer(caught: int, frame: "FrameType | None") -> None:
 
 
 def _end(caught: int) -> None:
-    """Says ``farewell`` and ends with 128 + the signal's number."""
     for path in tuple(unfinished):
         remove(path)
     try:
@@ -97,7 +96,6 @@ def start_afresh() -> None:
 
 
 def say_at_the_end(text: str) -> None:
-    """Sets what the line will say."""
     global farewell
     farewell = text
 

@@ -354,7 +354,6 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
 
 
 def _resized(grid: Grid, count: int) -> Grid:
-    """The same box with ``count`` voxels along its longest side."""
     if count < 1:
         raise InputError("--size", str(count), "at least 1 voxel")
     shape = [max(1, round(n * count / max(grid.shape))) for n in grid.shape]

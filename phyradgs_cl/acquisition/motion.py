@@ -27,7 +27,6 @@ class Motion(Interface):
 
 
 def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int]:
-    """What the builders of cells begin with."""
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 

@@ -82,7 +82,6 @@ class Scan:
 
     @property
     def lines(self) -> int:
-        """Lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":

@@ -6,12 +6,6 @@ from phyradgs_cl.cluster.process import forget_runtimes, runtime_of_process
 from phyradgs_cl.cluster.workers import LOCAL, Workers
 
 __all__ = [
-    "LOCAL",
-    "Lost",
-    "Pool",
-    "PoolState",
-    "Workers",
-    "forget_runtimes",
-    "has_dask",
-    "runtime_of_process",
-]
+    "LOCAL", "Lost", "Pool", "PoolState", "Workers", "forget_runtimes", "has_dask",
+    "runtime_of_process"
+]  # fmt: skip

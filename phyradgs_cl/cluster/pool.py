@@ -155,7 +155,6 @@ class Pool:
         return package.Client(**where, timeout=_CONNECT_S, set_as_default=False)
 
     def _devices(self) -> int:
-        """How many runs the workers may have at a time."""
         try:
             workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
         except _NO_ANSWER as error:

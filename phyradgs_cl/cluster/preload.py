@@ -5,6 +5,5 @@ import threading
 
 
 def dask_setup(worker: object) -> None:
-    """Called by Dask in the worker's process."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -45,7 +45,6 @@ def rescale_slope(volume: Placed) -> str:
 
 
 def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> Any:
-    """What all slices share."""
     image = pydicom.dataset.Dataset()
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE

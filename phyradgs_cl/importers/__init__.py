@@ -20,14 +20,9 @@ from phyradgs_cl.importers.volumes import foreign_volume, load_attenuation, load
 from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 
 __all__ = [
-    "FORMATS",
-    "ImportOptions",
-    "foreign_volume",
-    "import_scan",
-    "load_attenuation",
-    "load_volume",
-    "recognise",
-]
+    "FORMATS", "ImportOptions", "foreign_volume", "import_scan", "load_attenuation", "load_volume",
+    "recognise"
+]  # fmt: skip
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], Scan]] = {
     "r2": import_r2,

@@ -26,30 +26,9 @@ from phyradgs_cl.io.volume import (
 )
 
 __all__ = [
-    "LoadedVolume",
-    "Scanner",
-    "StoredVolume",
-    "ToAttenuation",
-    "check_writable",
-    "checkpoint_path",
-    "default_grid",
-    "file_kind",
-    "former_checkpoint_path",
-    "hashing",
-    "load_scanner",
-    "load_attenuation",
-    "load_volume",
-    "only_run",
-    "partial_path",
-    "read_checkpoint",
-    "read_scan",
-    "read_volume",
-    "scan_summary",
-    "sha256_of",
-    "volume_summary",
-    "with_detector_count",
-    "write_checkpoint",
-    "write_scan",
-    "write_volume",
-    "written_beside",
-]
+    "LoadedVolume", "Scanner", "StoredVolume", "ToAttenuation", "check_writable", "checkpoint_path",
+    "default_grid", "file_kind", "former_checkpoint_path", "hashing", "load_scanner",
+    "load_attenuation", "load_volume", "only_run", "partial_path", "read_checkpoint", "read_scan",
+    "read_volume", "scan_summary", "sha256_of", "volume_summary", "with_detector_count",
+    "write_checkpoint", "write_scan", "write_volume", "written_beside"
+]  # fmt: skip

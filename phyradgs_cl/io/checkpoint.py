@@ -62,7 +62,6 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
 
 
 def _other_run(found: str, wanted: str) -> str:
-    """What a checkpoint's run had otherwise, as far as its fingerprint tells."""
     unknown = "another scan or other options"
     try:
         then, now = json.loads(found), json.loads(wanted)

@@ -76,7 +76,6 @@ def _parsed(row: str) -> Line | None:
 
 
 def _is_open_ended(file: Any) -> bool:
-    """Whether the file ends in the middle of a line."""
     if file.seek(0, os.SEEK_END) == 0:
         return False
     file.seek(-1, os.SEEK_END)

@@ -144,6 +144,5 @@ def _grid(volume: Fields) -> Grid:
 
 
 def _triple(volume: Fields, key: str) -> tuple[float, float, float]:
-    """Three numbers (z, y, x)."""
     z, y, x = volume.numbers(key, 3, LENGTH.largest).tolist()
     return z, y, x

@@ -57,7 +57,6 @@ class Fields:
         return f"{self.culprit}{self._joint}{key}"
 
     def has(self, key: str) -> bool:
-        """Whether there is a value other than None."""
         return self.values.get(key) is not None
 
     def get(self, key: str) -> object:

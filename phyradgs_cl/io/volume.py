@@ -216,7 +216,6 @@ def _plain(value: object) -> object:
 
 
 def _checked(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
-    """The volume's dataset, unread, and its grid; they fit each other."""
     dataset = source.dataset(_VOLUME)
     if dataset.ndim != 3 or min(dataset.shape) < 1:
         raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", "three axes (z, y, x), none empty")

@@ -22,18 +22,9 @@ from phyradgs_cl.phantoms.spheres import sphere_phantom
 from phyradgs_cl.phantoms.voxels import VoxelPhantom
 
 __all__ = [
-    "PHANTOMS",
-    "Ellipsoid",
-    "EllipsoidPhantom",
-    "Phantom",
-    "VoxelPhantom",
-    "foot",
-    "jaw",
-    "make_phantom",
-    "rotation_about_z",
-    "shepp_logan",
-    "sphere_phantom",
-]
+    "PHANTOMS", "Ellipsoid", "EllipsoidPhantom", "Phantom", "VoxelPhantom", "foot", "jaw",
+    "make_phantom", "rotation_about_z", "shepp_logan", "sphere_phantom"
+]  # fmt: skip
 
 
 class Phantom(Protocol):

@@ -96,7 +96,6 @@ class EllipsoidPhantom:
         return result
 
     def _segments(self, start: Array, step: Array) -> Array:
-        """(n,) integrals over start + t·step for t in [0, 1]; start and step (n, 3)."""
         total = np.zeros(len(start))
         for ellipsoid in self.ellipsoids:
             total += ellipsoid.attenuation_per_mm * _chord_fraction(ellipsoid, start, step)

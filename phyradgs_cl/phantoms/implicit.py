@@ -44,7 +44,6 @@ class Lattice:
 
     @property
     def everything(self) -> Box:
-        """All voxels."""
         return (slice(0, self.count),) * 3
 
     def axis(self) -> Field:

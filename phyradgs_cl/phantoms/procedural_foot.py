@@ -74,13 +74,11 @@ def foot(grid_shape: int, seed: int) -> Field:
 
 
 def _bones(rng: np.random.Generator) -> list[Bone]:
-    """Tarsals, leg and metatarsals; positions and thicknesses differ a little between seeds."""
     tarsals = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
     return tarsals + [_long_bone(base, head, 0.046 * thickness, rng) for base, head, thickness, _ in _RAYS]
 
 
 def _toes(rng: np.random.Generator) -> list[Bone]:
-    """The phalanges of all toes."""
     return [bone for _, head, thickness, z in _RAYS for bone in _toe(head, thickness, z, rng)]
 
 

@@ -136,7 +136,6 @@ def _rami() -> list[Capsule]:
 
 
 def _bone_distance(lattice: Lattice) -> Field:
-    """(n, n, n) distance to the whole mandible: swept body, chin, rami."""
     _, _, z = lattice.points(lattice.everything)
     section = (np.float32(_BODY_WIDTH), np.float32(_BODY_HEIGHT))
     across = _arc_distance(lattice)
@@ -184,7 +183,6 @@ def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.
 
 
 def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
-    """Root, crown with an enamel cap, pulp chamber and canals."""
     middle = _GUM_Z + tooth.height / 2
     roots = _roots(tooth, 0.40 * tooth.depth, 0.016)
     crown = Capsule(_on(tooth, 0.0, middle), _on(tooth, 0.0, middle), tooth.depth, tooth.depth)

@@ -6,12 +6,6 @@ from phyradgs_cl.report.pictures.volume_viewer import view_volume
 from phyradgs_cl.report.run import Run, load_run
 
 __all__ = [
-    "Preview",
-    "Run",
-    "check_preview",
-    "load_run",
-    "report_page",
-    "view_volume",
-    "write_preview",
-    "write_report",
-]
+    "Preview", "Run", "check_preview", "load_run", "report_page", "view_volume", "write_preview",
+    "write_report"
+]  # fmt: skip

@@ -123,7 +123,6 @@ def _top(run: Run) -> list[Markup]:
 
 
 def _tiles(run: Run) -> list[tuple[str, str]]:
-    """The numbers that one asks for first."""
     tiles = [("method", str(run.stored.provenance.get("method", "unknown"))[:40])]
     psnr, ssim = run.metrics.get("psnr_db"), run.metrics.get("ssim")
     if isinstance(psnr, int | float):

@@ -80,7 +80,6 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list[str]) -> Run:
-    """The run with its scan; what is missing is told in ``notes``."""
     found = scan_path or _scan_of(path, stored.provenance, notes)
     if found is None:
         return Run(path, stored, metrics=stored.metrics or {}, notes=tuple(notes))

@@ -60,7 +60,6 @@ def _place(grid: Grid) -> str:
 
 
 def _write_picture(picture: Path, volume: np.ndarray, reference: np.ndarray, title: str) -> None:
-    """The picture, whole or not at all."""
     with written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)

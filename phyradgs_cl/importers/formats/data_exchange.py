@@ -60,7 +60,6 @@ def _optional_frames(source: Hdf5Source, name: str, panel: tuple[int, int]) -> n
 
 
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:
-    """Distances and pitches: the options, else the instrument's group where it has them."""
     to_axis = options.source_to_axis_mm or optional_length(source, f"{_INSTRUMENT}/source/distance")
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(f"{_INSTRUMENT}/source/distance"))
     to_detector = distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)

@@ -48,7 +48,6 @@ def import_naf(path: Path, options: ImportOptions) -> Scan:
 
 
 def _frames(data: Fields, parts: tuple[str, ...], panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Projections (F, v, u) as stored and their angles (F,)."""
     stacks, angles = [], []
     for part in parts:
         table = data.table(part)

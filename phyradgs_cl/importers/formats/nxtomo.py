@@ -87,7 +87,6 @@ def _refuse_ours(source: Hdf5Source, entry: str) -> None:
 
 
 def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
-    """What every frame is (F,); all projections where the file does not say."""
     for name in ("image_key", "image_key_control"):
         if source.find(f"{detector}/{name}") is not None:
             key = read_integers(source, f"{detector}/{name}", (frames,))

@@ -178,7 +178,6 @@ def _view_poses(
 
 
 def _matrix(view: Fields) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and centre (3,) of a view's detector matrix."""
     rows = view.get("detector")
     if not isinstance(rows, list) or len(rows) != 4:
         raise InputError(view.name("detector"), "no 4×4 matrix", "four rows of four numbers")

@@ -37,7 +37,6 @@ class RtkGeometry:
 
     @property
     def frames(self) -> int:
-        """How many projections there are."""
         return len(self.values["GantryAngle"])
 
     @property
@@ -49,7 +48,6 @@ class RtkGeometry:
 
     @property
     def steady(self) -> list[tuple[str, np.ndarray]]:
-        """Everything but the gantry's angle."""
         return [(name, values) for name, values in self.values.items() if name != "GantryAngle"]
 
     def poses(
@@ -120,7 +118,6 @@ def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _root(path: Path) -> ElementTree.Element:
-    """The root element, of the version that is known here."""
     data, culprit = read_bytes(path), str(path)
     if _DECLARATIONS.search(data):
         expected, remedy = "plain elements", "nothing outside of the file is read"

@@ -90,7 +90,6 @@ def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> Import
 
 
 def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
-    """All images (n, v, u) that [frames] names, as stored."""
     found = {}
     for name in ("projections", "flats", "darks", "mask"):
         if name != "projections" and not frames.has(name):
@@ -105,7 +104,6 @@ def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.
 def _line_integrals(
     stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, culprit: str
 ) -> LineIntegrals:
-    """Line integrals of the projections, with the pixels not to be used."""
     turned = {name: oriented(stack, said, "top") for name, stack in stacks.items()}
     stack = turned["projections"]
     found = line_integrals(culprit, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
@@ -115,7 +113,6 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
-    """The files that match a pattern, in natural order of their names."""
     pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
     below, last = PurePosixPath(pattern).parent, PurePosixPath(pattern).name
     if "*" in str(below) or "**" in last:
@@ -179,7 +176,6 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
 
 
 def _mask(stack: np.ndarray, shape: tuple[int, ...], culprit: str) -> np.ndarray:
-    """Bad pixels (v, u) or (F, v, u) from images whose non-zero pixels are bad."""
     if stack.shape == (1, *shape[1:]):
         return stack[0] != 0
     if stack.shape != shape:

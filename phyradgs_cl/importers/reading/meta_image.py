@@ -69,7 +69,6 @@ def read_meta_image(path: Path) -> Voxels:
 
 
 def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
-    """(3, 3): row i is the direction of axis i."""
     keys = [key for key in ("TransformMatrix", "Rotation", "Orientation") if key in header]
     key = keys[0] if keys else "TransformMatrix"
     axes = header_numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
@@ -79,7 +78,6 @@ def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
-    """Keys and values, and where the data begin."""
     text = read_head(path)
     header: dict[str, str] = {}
     position = 0

@@ -71,7 +71,6 @@ class PlainUnpickler(pickle._Unpickler):
         return self._names[known]
 
     def persistent_load(self, pid: object) -> NoReturn:
-        """An object that lies elsewhere."""
         self.refuse("a persistent object")
 
     def refuse(self, found: str) -> NoReturn:
@@ -96,8 +95,6 @@ class PlainUnpickler(pickle._Unpickler):
 
 
 class _Opcodes(dict[int, Callable[..., None]]):
-    """What each opcode does, for as many of them as an import may take."""
-
     left = _MOST_OPCODES
 
     def __getitem__(self, code: int) -> Callable[..., None]:

@@ -27,8 +27,6 @@ _ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
 
 @dataclass(frozen=True)
 class _Header:
-    """What a file promises: so many images (v, u) of one shape and type."""
-
     images: int
     shape: tuple[int, int]
     dtype: np.dtype
@@ -148,12 +146,10 @@ def _check_page(path: Path, page: Any, before_bytes: int) -> None:
 
 
 def _chunk(page: Any) -> int:
-    """Bytes of a strip or tile."""
     return math.prod(page.chunks) * page.dtype.itemsize
 
 
 def _decode(path: Path, page: Any, into: np.ndarray) -> None:
-    """Unpack a page into frames (n, v, u)."""
     if page.compression in _DEFLATED:
         _check_inflation(path, page, _chunk(page))
     page.asarray(maxworkers=1, out=into.reshape(page.shape))

@@ -35,7 +35,6 @@ def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: 
 
 
 def _unfolded(dataset: h5py.Dataset) -> object:
-    """All that a dataset holds, in no more memory than its header promises and its filters need."""
     if dataset.nbytes > HOST_SHARE * host_bytes():
         raise MemoryError
     chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize

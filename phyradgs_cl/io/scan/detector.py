@@ -95,7 +95,6 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
 
 
 def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, float] | None:
-    """When the beam is on (start, length) in s after a frame's start, or None: always."""
     start, length = f"{entry}/{schema.EXTRA}/pulse_start", f"{entry}/{schema.EXTRA}/pulse_length"
     if source.optional(start) is None and source.optional(length) is None:
         return None

@@ -112,7 +112,6 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
 
 
 def _panel_facts(scan: Scan) -> dict[str, object]:
-    """Pulse and lag, where there are any."""
     facts: dict[str, object] = {}
     if scan.shutter.pulse_s is not None:
         facts["pulse_start_s"], facts["pulse_length_s"] = scan.shutter.pulse_s
@@ -131,7 +130,6 @@ def _trajectory_word(scan: Scan) -> str:
 
 
 def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
-    """Bad pixels, bool (v, u) or (F, v, u)."""
     if header.mask_shape is None:
         return None
     address = header.mask_address
@@ -144,7 +142,6 @@ def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
 
 
 def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
-    """The ground truth (z, y, x) float32 in 1/mm."""
     if not header.has_reference:
         return None
     address = header.reference_address

@@ -62,7 +62,6 @@ def write_scan(
 def _checked_frames(
     scan: Scan, data: np.ndarray | None, image_key: np.ndarray | None, quantity: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What to store: frames (F, v, u) float32 or uint16, and their keys (F,)."""
     checks.one_of("quantity", quantity, schema.QUANTITIES)
     if data is None:
         if quantity != "attenuation" or image_key is not None:
@@ -147,7 +146,6 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
 
 
 def _write_links(entry: h5py.Group) -> None:
-    """The NXdata group that viewers open first."""
     group = new_group(entry, "data", "NXdata")
     group.attrs["signal"] = "data"
     group.attrs["axes"] = ["rotation_angle", ".", "."]

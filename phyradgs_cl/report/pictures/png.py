@@ -22,7 +22,6 @@ def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None
 
 
 def data_uri(png: bytes) -> str:
-    """The address of a picture that is in the page itself."""
     return f"data:image/png;base64,{base64_of(png)}"
 
 

@@ -26,7 +26,6 @@ class View:
 
     @property
     def residual(self) -> Image:
-        """Measured less computed."""
         return self.measured - self.computed
 
     @property

@@ -102,7 +102,6 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
 
 
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
-    """A slice as a grey PNG, black ``low`` and white ``high``."""
     return png_bytes(top_row_first(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
 
 

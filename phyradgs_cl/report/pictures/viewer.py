@@ -39,7 +39,6 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
 
 
 def _slider(name: str, words: str, low: float, high: float, value: float, told: str, step: float = 1) -> Markup:
-    """A range with its label and an output of what it says."""
     control = element(
         "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-told"
     )
@@ -48,7 +47,6 @@ def _slider(name: str, words: str, low: float, high: float, value: float, told: 
 
 
 def _figure(plane: Plane) -> Markup:
-    """One orientation: picture, cross lines, where the slice is, slider."""
     middle, name = len(plane.indices) // 2, f"{plane.name.capitalize()} slice"
     slider_id, place_id = f"slider-{plane.name}", f"place-{plane.name}"
     slider = element(
@@ -125,5 +123,4 @@ def _plane_data(plane: Plane) -> dict[str, object]:
 
 
 def _decimals(step: float) -> int:
-    """As many as show a step, and JavaScript writes."""
     return int(min(20, max(0, math.ceil(-math.log10(step))))) if step > 0 else 0
