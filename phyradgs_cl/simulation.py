@@ -226,8 +226,7 @@ class AnalyticSource:
         for start, stop, members in line_groups(cells):
             pixels = pixel_centres(cells.pose[members], self._geometry.detector_shape)
             target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
-            source = cells.pose[members][:, None, None, :3]
-            p = factor * self._phantom.line_integrals(source, target)
+            p = factor * self._phantom.line_integrals(cells.pose[members][:, None, None, :3], target)
             mean = average(p, cells.weight[members], model)
             if by_row:
                 frame[start:stop] = mean

@@ -102,8 +102,7 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
 def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
     to_axis_mm, to_detector_mm = _length(source, "to_axis_mm"), _length(source, "to_detector_mm")
     if to_detector_mm <= to_axis_mm:
-        expected = f"more than to_axis_mm ({to_axis_mm:g})"
-        raise InputError(source.name("to_detector_mm"), f"{to_detector_mm:g}", expected)
+        raise source.error("to_detector_mm", f"{to_detector_mm:g}", f"more than to_axis_mm ({to_axis_mm:g})")
     return ConeGeometry(
         to_axis_mm,
         to_detector_mm,
@@ -115,7 +114,7 @@ def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
 
 def _length(table: Fields, key: str) -> float:
     if (value := table.number(key, highest=LENGTH.largest)) < 1 / LENGTH.largest:
-        raise InputError(table.name(key), f"{value:g}", "a length above 0")
+        raise table.error(key, f"{value:g}", "a length above 0")
     return value
 
 
@@ -126,7 +125,7 @@ def _position(table: Fields, key: str) -> float:
 def _pulse(beam: Fields) -> tuple[float, float]:
     start, length = (beam.number(key, highest=LENGTH.largest) for key in ("pulse_start", "pulse_length"))
     if length <= 0:
-        raise InputError(beam.name("pulse_length"), f"{length:g}", "a share of the exposure above 0")
+        raise beam.error("pulse_length", f"{length:g}", "a share of the exposure above 0")
     return start, length
 
 
@@ -134,11 +133,11 @@ def _grid(volume: Fields) -> Grid:
     shape, size_mm = _triple(volume, "shape"), _triple(volume, "size_mm")
     offset_mm = _triple(volume, "offset_mm") if volume.has("offset_mm") else (0.0, 0.0, 0.0)
     if any(n < 1 or n != int(n) for n in shape):
-        raise InputError(volume.name("shape"), str(list(shape)), "three counts of at least 1 (z, y, x)")
+        raise volume.error("shape", str(list(shape)), "three counts of at least 1 (z, y, x)")
     if math.prod(shape) > MOST_VOXELS:
-        raise InputError(volume.name("shape"), checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
+        raise volume.error("shape", checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
     if min(size_mm) < 1 / LENGTH.largest:
-        raise InputError(volume.name("size_mm"), str(list(size_mm)), "three lengths above 0 (z, y, x)")
+        raise volume.error("size_mm", str(list(size_mm)), "three lengths above 0 (z, y, x)")
     voxel_mm = triple(side / n for side, n in zip(size_mm, shape, strict=True))
     return Grid(triple(int(n) for n in shape), voxel_mm, offset_mm)
 

@@ -218,11 +218,11 @@ def _plain(value: object) -> object:
 def _checked(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
     dataset = source.dataset(_VOLUME)
     if dataset.ndim != 3 or min(dataset.shape) < 1:
-        raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", "three axes (z, y, x), none empty")
+        raise source.error(_VOLUME, f"shape {dataset.shape}", "three axes (z, y, x), none empty")
     stored = source.optional_group("/entry/grid")
     grid = read_grid(source, "/entry/grid") if stored is not None else _grid_of_axes(source, dataset.shape)
     if grid.shape != dataset.shape:
-        raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", f"the grid's {grid.shape}")
+        raise source.error(_VOLUME, f"shape {dataset.shape}", f"the grid's {grid.shape}")
     return dataset, grid
 
 
@@ -235,7 +235,7 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
         even_mm = axis_mm[0] + np.arange(count) * step_mm
         if count > 1 and (step_mm <= 0 or np.abs(axis_mm - even_mm).max() > _AXIS_TOLERANCE * step_mm):
             expected = "even steps in mm, or a group /entry/grid"
-            raise InputError(source.name(f"{_DATA}/{name}"), "values that do not rise evenly", expected)
+            raise source.error(f"{_DATA}/{name}", "values that do not rise evenly", expected)
         steps_mm.append(step_mm if count > 1 else None)
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
     known = [step for step in steps_mm if step is not None]  # one voxel has no spacing of its own

@@ -123,8 +123,7 @@ def provenance_section(run: Run) -> Markup:
 
 def facts_table(facts: Mapping[str, object]) -> Markup:
     """A row per fact: name, value with unit."""
-    rows = list(flattened(facts))[:_MOST_ROWS]
-    cells = [(label(key), shown(value, unit(key))) for key, value in rows]
+    cells = [(label(key), shown(value, unit(key))) for key, value in list(flattened(facts))[:_MOST_ROWS]]
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in cells]
     return element("table", element("tbody", *lines))
 

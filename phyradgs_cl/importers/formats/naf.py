@@ -6,7 +6,6 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import tigre_frame
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
@@ -62,7 +61,7 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
     values = table.get(key)
     if not isinstance(values, np.ndarray) or values.ndim != ndim or values.dtype.kind not in "iuf":
         found = f"shape {values.shape}" if isinstance(values, np.ndarray) else described(values)
-        raise InputError(table.name(key), found, f"an array of numbers with {ndim} axes")
+        raise table.error(key, found, f"an array of numbers with {ndim} axes")
     if 0 in values.shape:
-        raise InputError(table.name(key), f"shape {values.shape}", "no empty axis")
+        raise table.error(key, f"shape {values.shape}", "no empty axis")
     return np.asarray(values)

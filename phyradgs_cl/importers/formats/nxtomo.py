@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed, option_name
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
@@ -83,7 +82,7 @@ def _refuse_ours(source: Hdf5Source, entry: str) -> None:
     """A scan of this package has more to say than an import would keep."""
     if source.find(f"{entry}/{schema.EXTRA}") is not None:
         found, expected = "a scan file of this package", "a file of another program"
-        raise InputError(source.name(f"{entry}/{schema.EXTRA}"), found, expected, "use it as it is")
+        raise source.error(f"{entry}/{schema.EXTRA}", found, expected, "use it as it is")
 
 
 def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
@@ -92,7 +91,7 @@ def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
             key = read_integers(source, f"{detector}/{name}", (frames,))
             key = np.where(key == -1, schema.INVALID, key)  # nxtomo's frames taken to check the alignment
             if not np.any(key == schema.PROJECTION):
-                raise InputError(source.name(f"{detector}/{name}"), "no projection", "at least one 0")
+                raise source.error(f"{detector}/{name}", "no projection", "at least one 0")
             return key
     return np.full(frames, schema.PROJECTION)
 
@@ -105,7 +104,7 @@ def _turned(source: Hdf5Source, detector: str) -> Turned:
         if source.find(address) is not None:
             half_turns = read_number(source, address, ANGLE) / np.pi
             if abs(half_turns - round(half_turns)) > 1e-6:
-                raise InputError(source.name(address), f"{half_turns * 180:g}°", "0° or 180°: a flip")
+                raise source.error(address, f"{half_turns * 180:g}°", "0° or 180°: a flip")
             flips[index] ^= bool(round(half_turns) % 2)
     return Turned(rows=flips[0], columns=flips[1])
 
@@ -122,7 +121,7 @@ def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.nd
         return None
     mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
     if mask.shape not in (shape, shape[1:]):
-        raise InputError(source.name(address), f"shape {mask.shape}", f"{shape[1:]} or {shape}")
+        raise source.error(address, f"shape {mask.shape}", f"{shape[1:]} or {shape}")
     mask = mask if mask.ndim == 2 else mask[used]
     return mask if mask.any() else None
 
@@ -167,8 +166,7 @@ def _motion(
     sign = gantry_sign(options, read_attribute(source, f"{sample}/rotation_angle", "rotates") or "sample")
     angle = sign * read_array(source, f"{sample}/rotation_angle", used.shape, ANGLE)[used]
     sweeps = source.find(f"{sample}/rotation_angle_end") is not None and options.frame_time_s is None
-    starts = f"{detector}/frame_start_time"
-    start_s = read_array(source, starts, used.shape, TIME)[used] if sweeps else None
+    start_s = read_array(source, f"{detector}/frame_start_time", used.shape, TIME)[used] if sweeps else None
     stored = StoredTiming(
         exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
         readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
@@ -193,4 +191,4 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
         values = values[used] if values.shape == used.shape else values
         if np.ptp(values) > 0:
             found = f"{values.min():.6g} to {values.max():.6g} mm"
-            raise InputError(source.name(address), found, "a sample that stays where it is")
+            raise source.error(address, found, "a sample that stays where it is")

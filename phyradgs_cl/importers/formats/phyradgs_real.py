@@ -54,7 +54,7 @@ class Circle:
         angles = np.deg2rad([[table.number(key) for key in _ANGLES] for table in tables])
         centre = circle.numbers("center")
         if len(centre) < 2:
-            raise InputError(circle.name("center"), f"{len(centre)} numbers", "x, y and perhaps z")
+            raise circle.error("center", f"{len(centre)} numbers", "x, y and perhaps z")
         z = np.array([table.number("z") for table in tables])
         return cls(centre[:2], circle.length("radius"), z, angles)
 
@@ -180,9 +180,9 @@ def _view_poses(
 def _matrix(view: Fields) -> tuple[np.ndarray, np.ndarray]:
     rows = view.get("detector")
     if not isinstance(rows, list) or len(rows) != 4:
-        raise InputError(view.name("detector"), "no 4×4 matrix", "four rows of four numbers")
+        raise view.error("detector", "no 4×4 matrix", "four rows of four numbers")
     matrix = np.array([Fields(view.name("detector"), {"row": row}).numbers("row", 4) for row in rows])
     rotation = matrix[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
-        raise InputError(view.name("detector"), "columns that are not orthonormal", "a rotation and a centre")
+        raise view.error("detector", "columns that are not orthonormal", "a rotation and a centre")
     return rotation, matrix[:3, 3]

@@ -116,13 +116,13 @@ def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
     pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
     below, last = PurePosixPath(pattern).parent, PurePosixPath(pattern).name
     if "*" in str(below) or "**" in last:
-        raise InputError(frames.name(name), repr(pattern), "a pattern for files of one folder")
+        raise frames.error(name, repr(pattern), "a pattern for files of one folder")
     found = []
     if (folder.root / below).is_dir():
         names = [str(below / path.name) for path in (folder.root / below).iterdir() if path.match(last)]
         found = in_natural_order([folder.file(text, frames.name(name)) for text in names])
     if not found:
-        raise InputError(frames.name(name), f"no file that matches {pattern!r}", "at least one TIFF")
+        raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF")
     return found
 
 
@@ -162,7 +162,7 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
     if len(given) != 1:
         raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
     if angles.has("unit") and not angles.has("file"):
-        raise InputError(angles.name("unit"), "no file beside it", "the unit of a file of angles", "leave it out")
+        raise angles.error("unit", "no file beside it", "the unit of a file of angles", "leave it out")
     if angles.has("file"):
         unit = angles.word("unit", tuple(_TO_RAD), default="deg")
         path = folder.file(angles.get("file"), angles.name("file"))

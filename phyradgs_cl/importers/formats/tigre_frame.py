@@ -15,10 +15,10 @@ def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
     """The cone of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v]."""
     mode = scanner.word("mode", default="cone")
     if mode != "cone":
-        raise InputError(scanner.name("mode"), repr(mode), "'cone'", "parallel beams have no source distance")
+        raise scanner.error("mode", repr(mode), "'cone'", "parallel beams have no source distance")
     to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
     if to_detector <= to_axis:
-        raise InputError(scanner.name("DSD"), f"{to_detector:g}", f"more than DSO ({to_axis:g})")
+        raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
     rows, columns = scanner.counts("nDetector", 2)
     pitch = pitches(scanner, "Detector", (rows, columns))
     offset_u, offset_v = offset(scanner, "offDetector", 2)
@@ -52,7 +52,7 @@ def offset(scanner: Fields, key: str, count: int) -> np.ndarray:
         return np.zeros(count)
     values = scanner.numbers(key)
     if len(values) < count:
-        raise InputError(scanner.name(key), f"{len(values)} values", f"{count} numbers")
+        raise scanner.error(key, f"{len(values)} values", f"{count} numbers")
     return values[:count]
 
 

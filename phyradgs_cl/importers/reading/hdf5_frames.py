@@ -33,8 +33,7 @@ def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None 
     if panel is not None and dataset.shape == panel:
         return read_values(source, address, dataset)[None]
     if dataset.ndim != 3 or min(dataset.shape) < 1:
-        expected = "three axes (frame, v, u), none of them empty"
-        raise InputError(culprit, f"shape {dataset.shape}", expected)
+        raise InputError(culprit, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
     if panel is not None and dataset.shape[1:] != panel:
         expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
         raise InputError(culprit, f"shape {dataset.shape}", expected)
@@ -53,8 +52,7 @@ def stored_pitch(source: Hdf5Source, *addresses: str) -> float:
     """The size of a pixel in mm at the first of some addresses, which somebody has to give."""
     size = optional_length(source, *addresses)
     if size is None:
-        remedy = f"say {option_name('pixel_size_mm')} V,U"
-        raise InputError(source.name(addresses[0]), "nothing", "a length", remedy)
+        raise source.error(addresses[0], "nothing", "a length", f"say {option_name('pixel_size_mm')} V,U")
     return size
 
 

@@ -72,6 +72,10 @@ class Hdf5Source:
         """How messages name an object of the file."""
         return f"{self.path}:{address}"
 
+    def error(self, address: str, found: str, expected: str, remedy: str = "") -> InputError:
+        """What to raise about an object of the file."""
+        return InputError(self.name(address), found, expected, remedy)
+
     def find(self, address: str) -> h5py.Group | h5py.Dataset | None:
         """The object at an absolute address, or None; links that lead out of the file are refused."""
         return self._walk(address, _MOST_SOFT_LINKS)
@@ -92,13 +96,13 @@ class Hdf5Source:
         if found is None and parent != "/":
             self.group(parent)
         what = "nothing there" if found is None else "a dataset"
-        raise InputError(self.name(address), what, f"a group {name!r}", self.near_miss(parent, name))
+        raise self.error(address, what, f"a group {name!r}", self.near_miss(parent, name))
 
     def optional_group(self, address: str) -> h5py.Group | None:
         """The group at an address or None; InputError if there is one under a misspelt name instead."""
         found = self.find(address)
         if isinstance(found, h5py.Dataset):
-            raise InputError(self.name(address), "a dataset", "a group", "store the values inside a group")
+            raise self.error(address, "a dataset", "a group", "store the values inside a group")
         if found is None:
             self._refuse_near_miss(address, "a group")
         return found
@@ -112,7 +116,7 @@ class Hdf5Source:
         if parent != "/":
             self.group(parent)
         remedy = self.near_miss(parent, name) or "add it to the file"
-        raise InputError(self.name(address), "nothing there", f"a dataset {name!r}", remedy)
+        raise self.error(address, "nothing there", f"a dataset {name!r}", remedy)
 
     def optional(self, address: str) -> h5py.Dataset | None:
         """The dataset at an address or None; InputError if there is one under a misspelt name instead."""
@@ -121,7 +125,7 @@ class Hdf5Source:
             self._refuse_near_miss(address, "a dataset")
             return None
         if not isinstance(found, h5py.Dataset):
-            raise InputError(self.name(address), "a group", "a dataset", "store the values as a dataset")
+            raise self.error(address, "a group", "a dataset", "store the values as a dataset")
         self._check_storage(address, found)
         return found
 
@@ -139,7 +143,7 @@ class Hdf5Source:
         parent, name = posixpath.split(address)
         remedy = self.near_miss(parent, name, cutoff=0.8)
         if remedy:
-            raise InputError(self.name(address), "nothing there", f"{what} {name!r}", remedy)
+            raise self.error(address, "nothing there", f"{what} {name!r}", remedy)
 
     def _walk(self, address: str, soft_links_left: int) -> h5py.Group | h5py.Dataset | None:
         here: h5py.Group | h5py.Dataset = self.file["/"]
@@ -150,9 +154,7 @@ class Hdf5Source:
                 return None
             if isinstance(link, h5py.SoftLink):
                 if soft_links_left == 0:
-                    raise InputError(
-                        self.name(address), "a loop of links", "a dataset", "store the data itself"
-                    )
+                    raise self.error(address, "a loop of links", "a dataset", "store the data itself")
                 target = posixpath.normpath(posixpath.join(walked, link.path, *parts[index + 1 :]))
                 return self._walk(target, soft_links_left - 1)
             walked = posixpath.join(walked, part)
@@ -164,25 +166,19 @@ class Hdf5Source:
         try:
             link = group.get(part, getlink=True)
         except (TypeError, RuntimeError, OSError) as error:
-            raise InputError(
-                self.name(address), f"a link that cannot be followed ({error})", "a plain link"
-            ) from error
+            raise self.error(address, f"a link that cannot be followed ({error})", "a plain link") from error
         if strict and isinstance(link, h5py.ExternalLink):
             found = f"a link to the file {link.filename!r}"
-            raise InputError(
-                self.name(address), found, "data inside this file", "copy the data into the file"
-            )
+            raise self.error(address, found, "data inside this file", "copy the data into the file")
         return link
 
     def _opened(self, group: h5py.Group, part: str, address: str) -> h5py.Group | h5py.Dataset:
         try:
             found = group[part]
         except (KeyError, OSError, RuntimeError) as error:
-            raise InputError(
-                self.name(address), f"a damaged object ({error})", "a group or dataset"
-            ) from error
+            raise self.error(address, f"a damaged object ({error})", "a group or dataset") from error
         if not isinstance(found, (h5py.Group, h5py.Dataset)):
-            raise InputError(self.name(address), "a named type", "a group or dataset")
+            raise self.error(address, "a named type", "a group or dataset")
         return found
 
     def _check_storage(self, address: str, dataset: h5py.Dataset) -> None:
@@ -192,18 +188,16 @@ class Hdf5Source:
             shape, chunks, declared_bytes = dataset.shape, dataset.chunks, dataset.nbytes
             chunk_bytes = math.prod(chunks or ()) * dataset.dtype.itemsize
         except (OSError, RuntimeError, TypeError, ValueError) as error:
-            raise InputError(self.name(address), f"a damaged dataset ({error})", "numbers or text") from error
+            raise self.error(address, f"a damaged dataset ({error})", "numbers or text") from error
         if elsewhere:
             remedy = "copy the data into the file"
-            raise InputError(self.name(address), "data kept in other files", "data inside this file", remedy)
+            raise self.error(address, "data kept in other files", "data inside this file", remedy)
         if shape is None:
-            raise InputError(self.name(address), "an empty dataset", "a value")
+            raise self.error(address, "an empty dataset", "a value")
         file_bytes = self.path.stat().st_size
         most = file_bytes if chunks is None else _MOST_EXPANSION * file_bytes + _FREE_BYTES
         if max(declared_bytes, chunk_bytes) > most:
             what, size = ("shape", shape) if declared_bytes > most else ("chunks of", chunks)
             declared = f"{max(declared_bytes, chunk_bytes) / 2**30:.3g} GiB"
             found = f"{what} {size}, {declared} in a file of {file_bytes} bytes"
-            raise InputError(
-                self.name(address), found, "a size that the file can hold", "write the file again"
-            )
+            raise self.error(address, found, "a size that the file can hold", "write the file again")

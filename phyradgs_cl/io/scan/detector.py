@@ -52,11 +52,9 @@ def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
     if wrong.any():
         at = int(np.argmax(wrong))
         expected = "0 projection, 1 flat, 2 dark or 3 invalid"
-        raise InputError(source.name(address), f"{image_key[at]} at index {at}", expected)
+        raise source.error(address, f"{image_key[at]} at index {at}", expected)
     if not np.any(image_key == schema.PROJECTION):
-        raise InputError(
-            source.name(address), "no projection", "at least one 0", "mark the projections with 0"
-        )
+        raise source.error(address, "no projection", "at least one 0", "mark the projections with 0")
     return image_key
 
 
@@ -65,7 +63,7 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
     detector, address = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
     to_axis_mm = abs(read_number(source, address, LENGTH))  # NeXus gives it a minus sign
     if to_axis_mm == 0:
-        raise InputError(source.name(address), "0", "a length other than 0", "correct the value")
+        raise source.error(address, "0", "a length other than 0", "correct the value")
     pitch_v_mm = read_length(source, f"{detector}/y_pixel_size", LENGTH)
     pitch_u_mm = read_length(source, f"{detector}/x_pixel_size", LENGTH)
     to_detector_mm = to_axis_mm + read_length(source, f"{detector}/distance", LENGTH)
@@ -103,7 +101,7 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
     if start_s >= span_s or start_s + length_s <= 0:
         found = f"a pulse from {start_s:g} to {start_s + length_s:g} s"
         expected = f"one that meets the frame's window, 0 to {span_s:g} s"
-        raise InputError(source.name(start), found, expected, "correct the pulse, or remove both datasets")
+        raise source.error(start, found, expected, "correct the pulse, or remove both datasets")
     return start_s, length_s
 
 
@@ -146,9 +144,7 @@ def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> t
         return None
     if mask.shape not in (data_shape, data_shape[1:]):
         expected = f"{data_shape[1:]} (v, u) or {data_shape} (frame, v, u)"
-        raise InputError(source.name(address), f"shape {mask.shape}", expected)
+        raise source.error(address, f"shape {mask.shape}", expected)
     if mask.dtype.kind not in "biu":
-        raise InputError(
-            source.name(address), f"type {mask.dtype}", "whole numbers", "non-zero marks a bad pixel"
-        )
+        raise source.error(address, f"type {mask.dtype}", "whole numbers", "non-zero marks a bad pixel")
     return mask.shape

@@ -106,7 +106,7 @@ def find_entry(source: Hdf5Source) -> str:
     if len(entries) == 1:
         return entries[0]
     found = f"{len(entries)} NXentry groups" if entries else "no NXentry group"
-    raise InputError(source.name("/entry"), found, "a group 'entry'", source.near_miss("/", "entry"))
+    raise source.error("/entry", found, "a group 'entry'", source.near_miss("/", "entry"))
 
 
 def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry) -> tuple[Grid, bool]:
@@ -117,9 +117,7 @@ def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry)
         grid = default_grid(geometry)
     except InputError as error:
         remedy = "correct the geometry, or store the grid"
-        raise InputError(
-            source.name(address), "no grid, and none that follows", error.expected, remedy
-        ) from error
+        raise source.error(address, "no grid, and none that follows", error.expected, remedy) from error
     return grid, False
 
 
@@ -167,7 +165,7 @@ def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
     volume = source.dataset(address)
     if volume.shape != grid.shape:
         remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
-        raise InputError(source.name(address), f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
+        raise source.error(address, f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
     return True
 
 

@@ -90,8 +90,7 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
     sample = entry[schema.SAMPLE]
     write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
     if scan.is_fly and scan.shutter.exposure_s > 0:
-        last_deg = np.rad2deg(last_rad)[frame_of]
-        write_number(sample, "rotation_angle_end", last_deg, "degree", rotates="gantry")
+        write_number(sample, "rotation_angle_end", np.rad2deg(last_rad)[frame_of], "degree", rotates="gantry")
     path = scan.trajectory
     if isinstance(path, PoseTable):
         _write_poses(entry, path, 0.0 if scan.is_fly else scan.shutter.middle_s)
@@ -145,11 +144,11 @@ def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.n
 def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
     time_s = read_array(source, address, (None,), TIME)
     if len(time_s) < 2:
-        raise InputError(source.name(address), f"{len(time_s)} samples", "at least 2")
+        raise source.error(address, f"{len(time_s)} samples", "at least 2")
     if np.any(np.diff(time_s) <= 0):
         at = int(np.argmax(np.diff(time_s) <= 0)) + 1
         found = f"times that do not increase at index {at}"
-        raise InputError(source.name(address), found, "strictly increasing times", "sort the table by time")
+        raise source.error(address, found, "strictly increasing times", "sort the table by time")
     return time_s
 
 

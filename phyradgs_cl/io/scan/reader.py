@@ -136,8 +136,7 @@ def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
     mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
     used = mask if mask.ndim == 2 else mask[header.image_key == schema.PROJECTION]
     if used.all():
-        remedy = "non-zero means: do not use"
-        raise InputError(source.name(address), "every pixel masked", "at least one zero", remedy)
+        raise source.error(address, "every pixel masked", "at least one zero", "non-zero means: do not use")
     return mask
 
 
@@ -151,7 +150,7 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
         found, expected = (
             f"no voxel above 0 (the largest is {values.max() + 0.0:g})", "a truth to compare with"
         )
-        raise InputError(source.name(address), found, expected, "take the reference out of the file")
+        raise source.error(address, found, expected, "take the reference out of the file")
     return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 
@@ -169,7 +168,7 @@ def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None
                     f"NaN or infinity in frame {frame} at ({row}, {column}), {int(bad.sum())} in this frame"
                 )
                 remedy = "set them, or mark them in pixel_mask"
-                raise InputError(source.name(header.data_address), found, "finite values", remedy)
+                raise source.error(header.data_address, found, "finite values", remedy)
     return data
 
 

@@ -103,8 +103,7 @@ def _sample_times(scan: Scan, motion: Motion) -> list[tuple[float, float]]:
     if not isinstance(motion, MicroViews):
         shown = np.isin(line, np.unique(np.linspace(0, scan.lines - 1, _LINES_WITH_DOTS).round()))
     times_s = cells.time_s - float(scan.frame_start_s[0])
-    chosen = np.flatnonzero(shown)[:_MOST_DOTS]
-    return [(float(times_s[c]), float(line[c])) for c in chosen]
+    return [(float(times_s[c]), float(line[c])) for c in np.flatnonzero(shown)[:_MOST_DOTS]]
 
 
 def _spans(axes: Axes, scan: Scan) -> list[Markup]:
