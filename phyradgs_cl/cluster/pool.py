@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.cluster.library import distributed
-from phyradgs_cl.cluster.local import RESOURCE, local_cluster
+from phyradgs_cl.cluster.local import RESOURCE, distributed, local_cluster
 from phyradgs_cl.cluster.workers import Workers
 from phyradgs_cl.errors import DeviceError, InputError
 

@@ -13,7 +13,7 @@ from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, Voxel
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
-from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
+from phyradgs_cl.importers.options import WORDS
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 
@@ -24,13 +24,12 @@ EXAMPLE = (
 
 
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
-AngleAt = Literal[ANGLE_AT]  # type: ignore[valid-type]
-Part = Literal[PARTS]  # type: ignore[valid-type]
-Quantity = Literal[QUANTITIES]  # type: ignore[valid-type]
-Rotates = Literal[ROTATES]  # type: ignore[valid-type]
-Row0 = Literal[ROW_0]  # type: ignore[valid-type]
-Column0 = Literal[COLUMN_0]  # type: ignore[valid-type]
-
+AngleAt = Literal[WORDS["angle_at"]]  # type: ignore[valid-type]
+Part = Literal[WORDS["part"]]  # type: ignore[valid-type]
+Quantity = Literal[WORDS["quantity"]]  # type: ignore[valid-type]
+Rotates = Literal[WORDS["rotates"]]  # type: ignore[valid-type]
+Row0 = Literal[WORDS["row_0"]]  # type: ignore[valid-type]
+Column0 = Literal[WORDS["column_0"]]  # type: ignore[valid-type]
 
 
 _FIELDS = frozenset(f.name for f in fields(ImportOptions))

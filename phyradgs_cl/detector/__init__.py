@@ -10,9 +10,8 @@ from phyradgs_cl.detector.noise import (
     tigre_counts,
     tigre_noise,
 )
-from phyradgs_cl.detector.noise_level import noise_level
+from phyradgs_cl.detector.noise_level import noise_level, transmission_weights
 from phyradgs_cl.detector.saturation import clustered_share, find_saturation
-from phyradgs_cl.detector.transmission import transmission_weights
 
 __all__ = [
     "add_lag", "average", "beer_lambert_counts", "beer_lambert_noise", "clustered_share",

@@ -1,4 +1,4 @@
-"""How noisy line integrals are, estimated from themselves."""
+"""How noisy line integrals are, estimated from themselves, and how far each can be trusted."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,3 +27,20 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
         return 0.0
     second = middle.ravel()[chosen] - 0.5 * (left.ravel()[chosen] + right.ravel()[chosen])
     return float(np.median(np.abs(second))) / (_MEDIAN_OF_NORMAL * _FILTER_NORM)
+
+
+def transmission_weights(
+    line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
+    """Weights exp(−p) of a scan's pixels p (F, v, u), scaled to the mean 1 over those that are ``valid`` (None: all).
+
+    Those of least squares for photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534). What lies below 0
+    counts as air: noise should not be trusted more for being bright.
+    """
+    weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
+    if valid is None:
+        mean = float(weights.mean(dtype=np.float64))
+    else:
+        chosen = np.broadcast_to(valid, weights.shape)
+        mean = float(weights.mean(dtype=np.float64, where=chosen)) if chosen.any() else 1.0
+    return weights / np.float32(mean) if mean > 0 else np.ones_like(weights)

@@ -1,14 +1,19 @@
 """A DICOM series, an image per slice: PS3.3's CT Image module (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
 
 import hashlib
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
-from phyradgs_cl.exporters.folder_beside import folder_written_beside
+from phyradgs_cl import checks, signals
+from phyradgs_cl.errors import OutputError
 from phyradgs_cl.exporters.placed import Placed
+from phyradgs_cl.io.output import temporary_name
 
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
@@ -81,3 +86,27 @@ def _place(image: Any, volume: Placed, index: int) -> None:
 def _decimal(number: float) -> str:
     """At most 16 characters, as DICOM's decimal strings must be."""
     return f"{number:.10g}" if 1e-4 <= abs(number) < 1e9 or number == 0 else f"{number:.8e}"
+
+
+@contextmanager
+def folder_written_beside(path: Path) -> Iterator[Path]:
+    """Yield a new folder that becomes ``path`` on success, and of which nothing is left otherwise. A folder with
+    something in it is never replaced: it could hold anything."""
+    target = Path(os.path.abspath(path))
+    if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
+        raise OutputError(
+            str(path), "something that is there already", "a new or an empty folder", "choose another name"
+        )
+    temporary = temporary_name(target)
+    try:
+        temporary.mkdir()
+        yield temporary
+        os.replace(temporary, target)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            found = error.strerror or str(error)
+            raise OutputError(str(path), found, "a folder that can be written", "choose another") from error
+        raise
+    finally:
+        signals.unfinished.discard(str(temporary))

@@ -23,22 +23,17 @@ def recognise(path: Path) -> str:
     if len(found) == 1:
         return found[0]
     if not found and _holds_tiffs(path):
-        what, expected = (
-            "TIFF images and no TOML that describes them", "geometry and angles in a TOML beside them"
-        )
-        raise InputError(
-            str(path), what, expected, "docs/import.md and docs/tutorial.md have one to start from"
-        )
+        what, expected = "TIFF images and no TOML that describes them", "geometry and angles in a TOML beside them"
+        remedy = "docs/import.md and docs/tutorial.md have one to start from"
+        raise InputError(str(path), what, expected, remedy)
     what = f"several: {', '.join(found)}" if found else "no known format"
     raise InputError(str(path), what, "one of the formats of docs/import.md", "say which with --format")
 
 
 def _holds_tiffs(path: Path) -> bool:
-    return (
-        bool(SafeFolder(path).matching(*tiff.SUFFIXES))
-        if path.is_dir()
-        else path.suffix.lower() in tiff.SUFFIXES
-    )
+    if path.is_dir():
+        return bool(SafeFolder(path).matching(*tiff.SUFFIXES))
+    return path.suffix.lower() in tiff.SUFFIXES
 
 
 def _of_folder(folder: SafeFolder) -> list[str]:

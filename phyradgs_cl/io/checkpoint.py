@@ -8,8 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.names import beside
-from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.io.output import beside, written_beside
 
 _FORMAT = 1
 _MOST_DIFFERENCES, _LONGEST_NAME = 3, 60

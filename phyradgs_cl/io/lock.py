@@ -7,7 +7,7 @@ from pathlib import Path
 
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
-from phyradgs_cl.io.names import beside
+from phyradgs_cl.io.output import beside
 
 _LOOK_EVERY_S = 0.2
 

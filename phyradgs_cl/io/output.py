@@ -1,7 +1,8 @@
-"""Outputs that are there whole or not at all: written beside the target, then moved over it."""
+"""Outputs that are there whole or not at all: written beside the target, then moved over it; names of files beside."""
 
 import errno
 import glob
+import hashlib
 import os
 import platform
 import re
@@ -29,6 +30,15 @@ def check_writable(path: str | Path) -> None:
     _remove(temporary)
 
 
+def make_folder(folder: Path, culprit: Path) -> None:
+    """Makes a folder, and those above it; OutputError about ``culprit`` where that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise OutputError(str(culprit), found, "a folder that can be written") from error
+
+
 @contextmanager
 def written_beside(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the target's folder that replaces the target on success, in one step. The body only
@@ -38,7 +48,8 @@ def written_beside(path: str | Path) -> Iterator[Path]:
     temporary = _create_beside(target)
     try:
         yield temporary
-        _flush_to_disk(temporary)
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
         if target.exists():
             shutil.copymode(target, temporary)
         os.replace(temporary, target)
@@ -131,11 +142,6 @@ def _remove(temporary: Path) -> None:
     temporary.unlink()
 
 
-def _flush_to_disk(path: Path) -> None:
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
-
-
 def _flush_folder(folder: Path) -> None:
     """Make the renaming itself durable where folders can be opened; elsewhere there is nothing to do."""
     with suppress(OSError):
@@ -158,3 +164,22 @@ def _output_error(target: Path, error: BaseException) -> OutputError:
         return OutputError(str(target), "a file name that is too long", "a shorter name", "shorten the name")
     found = getattr(error, "strerror", None) or str(error)
     return OutputError(str(target), found, "a file that can be written", "choose another folder")
+
+
+_LONGEST_BYTES = 255  # of a name, in every file system that is common
+
+
+def shortened(name: str, most_bytes: int) -> str:
+    """``name``, or as much of it as fits in front of a digest of all of it."""
+    raw = os.fsencode(name)
+    if len(raw) <= most_bytes:
+        return name
+    ending = f"~{hashlib.sha256(raw).hexdigest()[:12]}"
+    return raw[: most_bytes - len(ending)].decode("utf-8", "ignore") + ending
+
+
+def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
+    """The path ``beginning`` + name + ``ending`` in the same folder, shortened where no file system would take it."""
+    room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
+    path = Path(path)
+    return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")

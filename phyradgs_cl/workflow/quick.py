@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from phyradgs_cl import checks
-from phyradgs_cl.errors import OutputError
+from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import scanner_for, scanner_options
@@ -36,11 +36,7 @@ def quick_grid(
     scans = {name: folder / "scans" / f"{name}_seed{seed}.h5" for name in PHANTOMS}
     missing = [name for name, path in scans.items() if not path.exists()]
     if missing:
-        try:
-            (folder / "scans").mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise OutputError(str(folder), found, "a folder that can be written") from error
+        make_folder(folder / "scans", folder)
         rt = make_runtime()
         for name in missing:
             _simulate(scans[name], name, seed, rt)

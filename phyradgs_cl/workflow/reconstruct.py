@@ -7,7 +7,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -280,3 +280,23 @@ def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint
                 outdated.unlink()
     else:
         write_checkpoint(path, dict(result.state), fingerprint)
+
+
+def go_on(
+    job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
+) -> tuple[Reconstruction, dict[str, float]]:
+    """As ``run_reconstruction``; a checkpoint of another scan or other options, or a damaged one, is set aside."""
+    checkpoint = checkpoint_path(job.output)
+    if checkpoint.is_file() and METHODS[job.method].is_resumable:
+        try:
+            return run_reconstruction(replace(job, resume=True), make_runtime, report)
+        except InputError as error:
+            named = ("--resume", str(checkpoint))
+            if error.culprit not in named and not error.culprit.startswith("checkpoint"):
+                raise
+    return run_reconstruction(replace(job, resume=False), make_runtime, report)
+
+
+def is_whole(result: Reconstruction) -> bool:
+    """Whether the run came to its end; a stopped one has left a checkpoint."""
+    return result.facts.get("interrupted_at") is None

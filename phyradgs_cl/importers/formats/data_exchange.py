@@ -6,8 +6,6 @@ in degrees unless units differ; row 0 is the top of the image.
 
 from pathlib import Path
 
-import numpy as np
-
 from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
@@ -36,27 +34,18 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
     with opened(path) as source:
         frames = read_frames(source, f"{_EXCHANGE}/data")
         panel = (frames.shape[1], frames.shape[2])
-        stacks = {name: _optional_frames(source, name, panel) for name in ("data_white", "data_dark")}
+        places = {name: f"{_EXCHANGE}/data_{name}" for name in ("white", "dark")}
+        stacks = {n: read_frames(source, a, panel) for n, a in places.items() if source.find(a) is not None}
         theta_rad = read_array(source, f"{_EXCHANGE}/theta", (len(frames),), ANGLE)
         geometry = _geometry(source, panel, options)
         exposure_s = optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
         title = read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
-    turned = {name: None if s is None else oriented(s, options, "top") for name, s in stacks.items()}
-    integrals = line_integrals(
-        f"{path}:{_EXCHANGE}/data",
-        oriented(frames, options, "top"),
-        options,
-        flats=turned["data_white"],
-        darks=turned["data_dark"],
-    )
+    turned = {name: oriented(stack, options, "top") for name, stack in stacks.items()}
+    culprit, flats, darks = f"{path}:{_EXCHANGE}/data", turned.get("white"), turned.get("dark")
+    integrals = line_integrals(culprit, oriented(frames, options, "top"), options, flats=flats, darks=darks)
     trajectory = turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
-
-
-def _optional_frames(source: Hdf5Source, name: str, panel: tuple[int, int]) -> np.ndarray | None:
-    address = f"{_EXCHANGE}/{name}"
-    return None if source.find(address) is None else read_frames(source, address, panel)
 
 
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:

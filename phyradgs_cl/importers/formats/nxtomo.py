@@ -48,7 +48,9 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     options.refuse_unused("nxtomo", OF_BARE_FRAMES)
     with opened(path) as source:
         entry = find_entry(source)
-        _refuse_ours(source, entry)
+        if source.find(ours := f"{entry}/{schema.EXTRA}") is not None:  # it has more to say than an import keeps
+            found, expected = "a scan file of this package", "a file of another program"
+            raise source.error(ours, found, expected, "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
         frames = read_frames(source, f"{detector}/data")
         key = _image_key(source, detector, len(frames))
@@ -76,13 +78,6 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
-
-
-def _refuse_ours(source: Hdf5Source, entry: str) -> None:
-    """A scan of this package has more to say than an import would keep."""
-    if source.find(f"{entry}/{schema.EXTRA}") is not None:
-        found, expected = "a scan file of this package", "a file of another program"
-        raise source.error(f"{entry}/{schema.EXTRA}", found, expected, "use it as it is")
 
 
 def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:

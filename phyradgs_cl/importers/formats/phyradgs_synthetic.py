@@ -12,7 +12,6 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.r2_gaussian import R2Folder, entries_of
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io.tables import Fields
 
@@ -30,19 +29,7 @@ def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
     marks = np.array([[entry.number(key) for key in _KEYS] for entry in entries])
     timing = timing_of_marks(opened.meta, marks, options)
     sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
-    grid, reference = opened.reference()
-    integrals = opened.projections(entries, options)
-    return put_together(
-        integrals,
-        CircularOrbit(opened.geometry, sweeps),
-        opened.geometry,
-        timing,
-        options,
-        title=path.resolve().name,
-        source=str(path),
-        grid=grid,
-        reference=reference,
-    )
+    return opened.scan(path, entries, CircularOrbit(opened.geometry, sweeps), timing, options)
 
 
 def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:

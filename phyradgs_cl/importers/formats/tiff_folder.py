@@ -6,20 +6,13 @@ source.
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import (
-    ANGLE_AT,
-    COLUMN_0,
-    OF_BARE_FRAMES,
-    QUANTITIES,
-    ROTATES,
-    ROW_0,
-    ImportOptions,
-)
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_numbers
 from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
@@ -79,14 +72,11 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
     """The options, and under them what the file says in the same words."""
-    said = {
-        "quantity": frames.word("quantity", QUANTITIES) if frames.has("quantity") else None,
-        "flat_value": frames.length("flat_value") if frames.has("flat_value") else None,
-        "row_0": frames.word("row_0", ROW_0) if frames.has("row_0") else None,
-        "column_0": frames.word("column_0", COLUMN_0) if frames.has("column_0") else None,
-        "rotates": angles.word("rotates", ROTATES) if angles.has("rotates") else None,
-    }
-    return ImportOptions(**{**vars(options), **{k: getattr(options, k) or v for k, v in said.items()}})
+    tables = {"quantity": frames, "row_0": frames, "column_0": frames, "rotates": angles}
+    said: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in tables.items() if t.has(k)}
+    if frames.has("flat_value"):
+        said["flat_value"] = frames.length("flat_value")
+    return replace(options, **{k: v for k, v in said.items() if not getattr(options, k)})
 
 
 def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
@@ -151,7 +141,7 @@ def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTi
         axis=scanner.readout_axis,
         direction=scanner.readout_direction,
         pulse=scanner.pulse,
-        angle_at=angles.word("at", ANGLE_AT, default="start"),
+        angle_at=angles.word("at", WORDS["angle_at"], default="start"),
         written=(*written, *([angles.name("at")] if angles.has("at") else [])),
     )
 

@@ -37,7 +37,8 @@ def line_integrals(
     """Line integrals of ``frames`` (P, v, u) of any real type; clipped counts and values that no object has are masked,
     and said. ``culprit`` names the file; ``flats``, ``darks``: (n, v, u) or None. The options' ``quantity`` wins over
     ``custom``, the format's or file's; where neither says, frames with flats are counts and others refused."""
-    quantity = options.quantity or custom or ("counts" if has_flats(flats, options) else None)
+    has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
+    quantity = options.quantity or custom or ("counts" if has_flats else None)
     if quantity is None:
         remedy = f"say {option_name('quantity')} attenuation, transmission or counts"
         raise InputError(f"{culprit} quantity", "nothing that says it", "what the pixels hold", remedy)
@@ -46,8 +47,9 @@ def line_integrals(
         if options.flat_value is not None or flats is None or len(flats) == 0:
             flats = _constant_flat(culprit, frames, options)
         for stack in (flats, darks):
-            if stack is not None and len(stack):
-                _check_panel(culprit, stack, frames)
+            if stack is not None and len(stack) and stack.shape[1:] != frames.shape[1:]:
+                found = f"flats or darks of {stack.shape[1:]}"
+                raise InputError(culprit, found, f"the projections' {frames.shape[1:]} pixels")
         with np.errstate(over="ignore", invalid="ignore"):
             flat = flats.mean(axis=0, dtype=np.float64)
             saturation = find_saturation(frames, flat)
@@ -72,11 +74,6 @@ def _mask_clipped(
     fate = "masked, each in its own frame" if brighter.any() else "taken as air, for the flats are clipped too"
     text = "%s: %.3g %% of the projections' pixels are clipped at %g counts: %s"
     _log.warning(text, culprit, 100 * saturation.share, saturation.level, fate)
-
-
-def has_flats(flats: np.ndarray | None, options: ImportOptions) -> bool:
-    """Whether there is anything to divide counts by."""
-    return (flats is not None and len(flats) > 0) or options.flat_value is not None
 
 
 def compact(mask: np.ndarray) -> Mask:
@@ -105,9 +102,3 @@ def _constant_flat(culprit: str, frames: np.ndarray, options: ImportOptions) -> 
         remedy = f"add flat frames, or say {option_name('flat_value')}"
         raise InputError(f"{culprit} flats", "none", "flat frames to divide counts by", remedy)
     return np.full((1, *frames.shape[1:]), options.flat_value, np.float32)
-
-
-def _check_panel(culprit: str, stack: np.ndarray, frames: np.ndarray) -> None:
-    if stack.shape[1:] != frames.shape[1:]:
-        found = f"flats or darks of {stack.shape[1:]}"
-        raise InputError(culprit, found, f"the projections' {frames.shape[1:]} pixels")

@@ -11,16 +11,9 @@ from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.voxels import Voxels, header_numbers
 
 SUFFIXES = (".mha", ".mhd")
-_TYPES = {
-    **{"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4"},
-    **{
-        "MET_UINT": "u4",
-        "MET_LONG_LONG": "i8",
-        "MET_ULONG_LONG": "u8",
-        "MET_FLOAT": "f4",
-        "MET_DOUBLE": "f8",
-    },
-}
+_NAMES = ("CHAR", "UCHAR", "SHORT", "USHORT", "INT", "UINT", "LONG_LONG", "ULONG_LONG", "FLOAT", "DOUBLE")
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+_TYPES = {f"MET_{name}": code for name, code in zip(_NAMES, _CODES, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +49,8 @@ def read_meta_image(path: Path) -> Voxels:
     word = header.get("ElementType", "nothing")
     if word not in _TYPES:
         raise InputError(f"{culprit} ElementType", word[:40], ", ".join(_TYPES))
-    big = _first(header, "BinaryDataByteOrderMSB", "ElementByteOrderMSB") in ("True", "true", "1")
+    orders = [header[key] for key in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB") if key in header]
+    big = orders[:1] and orders[0] in ("True", "true", "1")
     dtype = np.dtype(_TYPES[word]).newbyteorder(">" if big else "<")
     values = _voxels(path, header, start, shape, dtype)
     spacing = header_numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
@@ -104,7 +98,3 @@ def _voxels(
         raise InputError(f"{path} HeaderSize", header["HeaderSize"][:20], "0")
     packed = header.get("CompressedData", "False").lower() in ("true", "1")
     return read_raw(data_path, start, shape, dtype, packed)
-
-
-def _first(header: dict[str, str], *keys: str) -> str:
-    return next((header[key] for key in keys if key in header), "False")

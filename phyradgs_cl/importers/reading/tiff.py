@@ -49,7 +49,9 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
         with _opened(path) as tiff:
             for page in tiff.pages:
                 images = math.prod(page.shape[:-2])
-                _decode(path, page, stack[at : at + images])
+                if page.compression in _DEFLATED:
+                    _check_inflation(path, page, _chunk(page))
+                page.asarray(maxworkers=1, out=stack[at : at + images].reshape(page.shape))
                 at += images
     return stack
 
@@ -147,12 +149,6 @@ def _check_page(path: Path, page: Any, before_bytes: int) -> None:
 
 def _chunk(page: Any) -> int:
     return math.prod(page.chunks) * page.dtype.itemsize
-
-
-def _decode(path: Path, page: Any, into: np.ndarray) -> None:
-    if page.compression in _DEFLATED:
-        _check_inflation(path, page, _chunk(page))
-    page.asarray(maxworkers=1, out=into.reshape(page.shape))
 
 
 def _check_inflation(path: Path, page: Any, most: int) -> None:

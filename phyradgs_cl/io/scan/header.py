@@ -43,21 +43,6 @@ class ScanHeader:
     has_reference: bool
     has_grid: bool
 
-    @property
-    def data_address(self) -> str:
-        """Where the frames are stored."""
-        return f"{self.entry}/{schema.DETECTOR}/data"
-
-    @property
-    def mask_address(self) -> str:
-        """Where the pixel mask is stored, if there is one."""
-        return f"{self.entry}/{schema.DETECTOR}/pixel_mask"
-
-    @property
-    def reference_address(self) -> str:
-        """Where the ground truth is stored, if there is one."""
-        return f"{self.entry}/{schema.REFERENCE}/volume"
-
 
 def read_header(source: Hdf5Source) -> ScanHeader:
     """Read and check everything but pixels, mask and reference; InputError names what is wrong."""

@@ -43,7 +43,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
         mask = _read_mask(source, header)
         reference = _read_reference(source, header)
         data = _read_frames(source, header, mask)
-    projections, bad = _convert(source.name(header.data_address), header, data, to_attenuation)
+    projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
     kept = mask[used] if mask is not None and mask.ndim == 3 else mask
     return replace(header.scan, projections=projections, pixel_mask=united(kept, bad), reference=reference)
@@ -64,7 +64,7 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         "data": f"{header.data_type} {header.quantity}",
         "fly_scan": scan.is_fly,
         "trajectory": _trajectory_word(scan),
-        **_geometry_facts(scan),
+        **vars(scan.geometry),
         **_timing_facts(scan),
         "detector_model": scan.detector_model,
         **_panel_facts(scan),
@@ -74,17 +74,6 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         "grid_stored": header.has_grid,
         "reference": header.has_reference,
         "sha256": sha256 or sha256_of(path),
-    }
-
-
-def _geometry_facts(scan: Scan) -> dict[str, object]:
-    geometry = scan.geometry
-    return {
-        "source_to_axis_mm": geometry.source_to_axis_mm,
-        "source_to_detector_mm": geometry.source_to_detector_mm,
-        "detector_shape": geometry.detector_shape,
-        "pixel_size_mm": geometry.pixel_size_mm,
-        "detector_offset_mm": geometry.detector_offset_mm,
     }
 
 
@@ -132,7 +121,7 @@ def _trajectory_word(scan: Scan) -> str:
 def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
     if header.mask_shape is None:
         return None
-    address = header.mask_address
+    address = f"{header.entry}/{schema.MASK}"
     mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
     used = mask if mask.ndim == 2 else mask[header.image_key == schema.PROJECTION]
     if used.all():
@@ -143,7 +132,7 @@ def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
 def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
     if not header.has_reference:
         return None
-    address = header.reference_address
+    address = f"{header.entry}/{schema.TRUTH}"
     values = read_values(source, address, source.dataset(address))
     checks.finite(source.name(address), values)
     if values.max() <= 0:
@@ -156,7 +145,7 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
 
 def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None) -> np.ndarray:
     """All stored frames (F, v, u); every value of a frame in use is finite unless it is masked."""
-    data = read_values(source, header.data_address, source.dataset(header.data_address))
+    data = read_values(source, f"{header.entry}/{schema.DATA}", source.dataset(f"{header.entry}/{schema.DATA}"))
     if data.dtype.kind == "f":
         for frame in np.flatnonzero(header.image_key != schema.INVALID):
             bad = ~np.isfinite(data[frame])
@@ -168,7 +157,7 @@ def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None
                     f"NaN or infinity in frame {frame} at ({row}, {column}), {int(bad.sum())} in this frame"
                 )
                 remedy = "set them, or mark them in pixel_mask"
-                raise source.error(header.data_address, found, "finite values", remedy)
+                raise source.error(f"{header.entry}/{schema.DATA}", found, "finite values", remedy)
     return data
 
 

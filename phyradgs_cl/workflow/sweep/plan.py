@@ -9,7 +9,7 @@ from typing import Any
 
 from phyradgs_cl.io.hdf5.facts import FINITE, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
 from phyradgs_cl.io.json_lines import Line
-from phyradgs_cl.io.names import shortened
+from phyradgs_cl.io.output import shortened
 from phyradgs_cl.reconstructors import input_options
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob

@@ -11,6 +11,7 @@ from phyradgs_cl.cluster import Lost, Pool, PoolState, Workers, runtime_of_proce
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import only_run
 from phyradgs_cl.io.json_lines import Line, append_line, read_lines, refuse_irregular
+from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.workflow.sweep.grid import SweepGrid
@@ -118,9 +119,9 @@ class _Batch:
 
 def _results_file(folder: Path) -> Path:
     path = folder / RESULTS
+    make_folder(folder / VOLUMES, folder)
+    refuse_irregular(path)
     try:
-        (folder / VOLUMES).mkdir(parents=True, exist_ok=True)
-        refuse_irregular(path)
         path.open("ab").close()
     except OSError as error:
         found = error.strerror or str(error)

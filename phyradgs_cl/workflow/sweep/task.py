@@ -16,7 +16,7 @@ from phyradgs_cl.io.json_lines import Line, json_text
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.reconstructors import ProgressReport, ignore_progress
 from phyradgs_cl.runtime.environment import environment
-from phyradgs_cl.workflow.resumable import go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import go_on, is_whole
 from phyradgs_cl.workflow.sweep.plan import SweepRun, is_sound, same_run
 
 _BUSY_S, _BUSY_EVERY_S = 600.0, 1.0

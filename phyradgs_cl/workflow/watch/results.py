@@ -5,9 +5,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, partial_path, written_beside
-from phyradgs_cl.io.names import beside
+from phyradgs_cl.io.output import beside, make_folder
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.watch.arrivals import Arrival
 
@@ -22,11 +21,7 @@ class Results:
 
     def make_folders(self) -> None:
         """Raises OutputError where the folder cannot be written."""
-        try:
-            (self.folder / _WORK).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise OutputError(str(self.folder), found, "a folder that can be written") from error
+        make_folder(self.folder / _WORK, self.folder)
 
     def sweep_up(self) -> None:
         """Removes what a killed run was writing: nobody else is at work here."""

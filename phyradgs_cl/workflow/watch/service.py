@@ -12,8 +12,7 @@ from phyradgs_cl.io import checkpoint_path, only_run
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow.reconstruct import ReconstructionJob
-from phyradgs_cl.workflow.resumable import go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import ReconstructionJob, go_on, is_whole
 from phyradgs_cl.workflow.watch.arrivals import Arrival, Arrivals
 from phyradgs_cl.workflow.watch.results import Results
 
