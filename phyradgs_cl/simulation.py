@@ -72,6 +72,10 @@ class SimulationOptions:
         checks.within("--seed", self.seed, 0, 2**63)
 
 
+OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
+"""What ``scanner_options`` takes."""
+
+
 def scanner_for(
     name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None
 ) -> Scanner:
@@ -90,12 +94,11 @@ def scanner_for(
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
     """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the
     default. InputError: no such option; a value out of range."""
-    own = {key: getattr(scanner, key) for key in ("readout_axis", "readout_direction", "lag")}
-    own |= {key: getattr(scanner, key) for key in ("readout_ratio", "pulse")}
+    usual = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse")
+    own = {key: getattr(scanner, key) for key in usual}
     chosen = {**own, **{key: value for key, value in given.items() if value is not None}}
-    known = ({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
-    if unknown := sorted(set(chosen) - known):
-        expected = f"one of {', '.join(sorted(known))}"
+    if unknown := sorted(set(chosen) - OPTION_NAMES):
+        expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
     timing = {key: chosen.pop(key) for key in _TIMING if key in chosen}
     return SimulationOptions(protocol=make_protocol(protocol, **timing), **chosen)
@@ -169,9 +172,8 @@ def simulate(
     for frame, cells in enumerate(tables):
         frames[frame] = source.frame(cells, options.detector_model, factor)
         if not np.all(np.isfinite(frames[frame])):
-            raise NumericalError(
-                f"frame {frame}", "line integrals that are not finite", "a smaller geometry or attenuation"
-            )
+            found, expected = "line integrals that are not finite", "a smaller geometry or attenuation"
+            raise NumericalError(f"frame {frame}", found, expected)
         report(frame + 1, protocol.views)
     if frames.max() <= 0:
         log.warning("no ray meets anything that attenuates: all %d frames are empty", protocol.views)
@@ -228,10 +230,7 @@ class AnalyticSource:
             target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
             p = factor * self._phantom.line_integrals(cells.pose[members][:, None, None, :3], target)
             mean = average(p, cells.weight[members], model)
-            if by_row:
-                frame[start:stop] = mean
-            else:
-                frame[:, start:stop] = mean
+            frame[(slice(start, stop),) if by_row else (slice(None), slice(start, stop))] = mean
         return frame.astype(np.float32)
 
 
@@ -254,9 +253,7 @@ def _on_panel(
 ) -> FrameSource:
     """What ``make`` gives for the panel, or for a finer one behind the area of its pixels."""
     checks.within("--pixel-samples", pixel_samples, 1, 32)
-    if pixel_samples == 1:
-        return make(geometry)
-    return PixelAreaSource(make(geometry.finer(pixel_samples)), pixel_samples)
+    return make(geometry) if pixel_samples == 1 else PixelAreaSource(make(geometry.finer(pixel_samples)), pixel_samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,13 +272,9 @@ class Scene:
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
-        log.warning(
-            "%s: %s voxels are projected and a grid of %s is to be reconstructed: discretisation errors will not show "
-            "(inverse crime); take a smaller --size or a finer volume",
-            self.title,
-            "×".join(map(str, shape)),
-            "×".join(map(str, self.grid.shape)),
-        )
+        text = "%s: %s voxels are projected and a grid of %s is to be reconstructed: discretisation errors will not show "
+        told = text + "(inverse crime); take a smaller --size or a finer volume"
+        log.warning(told, self.title, *("×".join(map(str, counts)) for counts in (shape, self.grid.shape)))
 
 
 def phantom_scene(
@@ -305,17 +298,12 @@ def phantom_scene(
         return Scene(source, grid, phantom.voxelise(grid, 4), f"phantom {name}")
     fine = Grid.cube(2 * size, 2 * half_size_mm)
     if not (np.allclose(box.size_mm, fine.size_mm) and np.allclose(box.offset_mm, 0)):
-        log.warning(
-            "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
-            "are not used",
-            name,
-            2 * half_size_mm,
-        )
+        text = "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
+        log.warning(text + "are not used", name, 2 * half_size_mm)
     volume = phantom.voxelise(fine)
     source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
-    return Scene(
-        source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}"
-    )
+    truth = block_mean(volume, (size,) * 3)
+    return Scene(source, Grid.cube(size, 2 * half_size_mm), truth, f"phantom {name}")
 
 
 def volume_scene(
@@ -347,9 +335,8 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
         return volume.astype(np.float32)
     from skimage.transform import resize_local_mean  # slow to import
 
-    return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(
-        np.float32
-    )
+    mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
+    return mean.astype(np.float32)
 
 
 def _resized(grid: Grid, count: int) -> Grid:
@@ -371,8 +358,7 @@ def _recorded(
     frames: np.ndarray, options: SimulationOptions, shutter: Shutter, rng: np.random.Generator
 ) -> np.ndarray:
     """What the panel shows of frames (F, v, u): light, noise and lag; lines without light are 0 (and masked)."""
-    share = shutter.lit_share(shutter.lines(frames.shape[1:]))
-    share = shutter.readout.spread(share)
+    share = shutter.readout.spread(shutter.lit_share(shutter.lines(frames.shape[1:])))
     recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
     return recorded if np.all(share > 0) else recorded * (share > 0)
 

@@ -181,9 +181,8 @@ def micro_view_cells(
             last.append(np.full(sub_intervals, line_stop))
     times = np.concatenate(time_s)
     weight = np.full(times.size, 1.0 / sub_intervals)
-    return _table(
-        trajectory, shutter, frame, times, np.concatenate(first), np.concatenate(last), weight, lines
-    )
+    ranges = np.concatenate(first), np.concatenate(last)
+    return _table(trajectory, shutter, frame, times, *ranges, weight, lines)
 
 
 def per_line_cells(
@@ -282,9 +281,8 @@ def segments_for(
     pose = trajectory.pose(frame, time_s)
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
     contrast = np.sqrt(max(1.0, intensity_peak / _HARMLESS_PEAK))
-    return int(
-        np.clip(np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error)), 1, _MOST_SEGMENTS)
-    )
+    count = np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error))
+    return int(np.clip(count, 1, _MOST_SEGMENTS))
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
@@ -293,11 +291,8 @@ def _turns_rad(pose: np.ndarray) -> np.ndarray:
     normal = np.cross(u_hat, pose[:, 9:12])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
-    steps = [
-        2 * np.arcsin(np.linalg.norm(np.diff(x, axis=0), axis=1).clip(0, 2) / 2)
-        for x in (u_hat, normal, source)
-    ]
-    largest: np.ndarray = np.max(steps, axis=0)
+    chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
+    largest: np.ndarray = np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0)
     return largest
 
 

@@ -25,21 +25,17 @@ class ConeGeometry:
     detector_offset_mm: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        dso, dsd = float(self.source_to_axis_mm), float(self.source_to_detector_mm)
-        if not (np.isfinite(dso) and dso > 0):
-            raise InputError("source_to_axis_mm", str(dso), "a positive length in mm")
-        if not (np.isfinite(dsd) and dsd > 0):
-            raise InputError("source_to_detector_mm", str(dsd), "a positive length in mm")
+        for name in ("source_to_axis_mm", "source_to_detector_mm"):
+            if not (np.isfinite(length := float(getattr(self, name))) and length > 0):
+                raise InputError(name, str(length), "a positive length in mm")
         if len(self.detector_shape) != 2 or min(self.detector_shape) < 1:
-            raise InputError(
-                "detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1"
-            )
+            expected = "two counts (rows, columns) of at least 1"
+            raise InputError("detector_shape", str(self.detector_shape), expected)
         if len(self.pixel_size_mm) != 2 or not all(np.isfinite(d) and d > 0 for d in self.pixel_size_mm):
             raise InputError("pixel_size_mm", str(self.pixel_size_mm), "two positive lengths in mm (v, u)")
         if len(self.detector_offset_mm) != 2 or not np.all(np.isfinite(self.detector_offset_mm)):
-            raise InputError(
-                "detector_offset_mm", str(self.detector_offset_mm), "two finite lengths in mm (v, u)"
-            )
+            expected = "two finite lengths in mm (v, u)"
+            raise InputError("detector_offset_mm", str(self.detector_offset_mm), expected)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
         """Poses (..., 12) float64 at gantry angles (...) (design: source at (DSO cos θ, DSO sin θ, 0))."""

@@ -38,9 +38,7 @@ class Protocol:
         last = 1 + self.readout_ratio
         fits = np.isfinite(start) and np.isfinite(length) and start < last and start + length > 0
         if not (fits and length > 0):
-            expected = (
-                f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
-            )
+            expected = f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
             raise InputError("pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
 
     @property
@@ -86,10 +84,8 @@ class Protocol:
         end_s = start_s[-1] + self.shutter().span_s
         speed_rad_per_s = np.deg2rad(self.exposure_deg) / self.exposure_s
         knot_s = np.linspace(0.0, end_s, self.views + 1)
-        wander = np.interp(
-            np.linspace(0, end_s, 16 * self.views + 1), knot_s, rng.normal(0, jitter_rad, knot_s.size)
-        )
-        time_s = np.linspace(0.0, end_s, wander.size)
+        time_s = np.linspace(0.0, end_s, 16 * self.views + 1)
+        wander = np.interp(time_s, knot_s, rng.normal(0, jitter_rad, knot_s.size))
         return EncoderTable(time_s, np.deg2rad(self.start_deg) + speed_rad_per_s * time_s + wander)
 
 

@@ -53,9 +53,8 @@ class Scan:
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
         if self.projections.shape != expected:
-            raise InputError(
-                "projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}"
-            )
+            found = f"shape {self.projections.shape}"
+            raise InputError("projections", found, f"(frames, rows, columns) = {expected}")
         if frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
         if np.shape(self.frame_start_s) != (frames,):
@@ -91,7 +90,8 @@ class Scan:
         reference = self.reference
         if reference is not None:
             first = grid.start_in(self.grid)
-            reference = None if first is None else _part(reference, first, grid.shape)
+            parts = None if first is None else [slice(s, s + n) for s, n in zip(first, grid.shape, strict=True)]
+            reference = None if parts is None else reference[tuple(parts)]
         return replace(self, grid=grid, reference=reference)
 
     def with_grid(self, choice: GridChoice) -> "Scan":
@@ -110,8 +110,3 @@ class Scan:
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
-
-
-def _part(volume: np.ndarray, first: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    z, y, x = (slice(start, start + count) for start, count in zip(first, shape, strict=True))
-    return volume[z, y, x]

@@ -28,16 +28,14 @@ class Shutter:
     pulse_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
-            raise InputError("exposure_s", str(self.exposure_s), "a time of at least 0 s")
-        if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
-            raise InputError("readout_s", str(self.readout_s), "a time of at least 0 s")
+        for name in ("exposure_s", "readout_s"):
+            if not (np.isfinite(time_s := getattr(self, name)) and time_s >= 0):
+                raise InputError(name, str(time_s), "a time of at least 0 s")
         if self.axis not in AXES:
             raise InputError("readout axis", repr(self.axis), "'rows' or 'columns'")
         if self.direction not in (1, -1):
-            raise InputError(
-                "readout direction", str(self.direction), "1 (index 0 first) or -1 (index 0 last)"
-            )
+            expected = "1 (index 0 first) or -1 (index 0 last)"
+            raise InputError("readout direction", str(self.direction), expected)
         if self.pulse_s is not None:
             self._check_pulse(*self.pulse_s)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.trajectory import Trajectory
-from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.questions.timing import azimuth_rad, start_azimuths_rad, wrapped
 
 _MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at the plane y = 0
 
@@ -110,8 +110,7 @@ def read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
     """Frames turned about z by ``angle_rad`` (F,), the gantry ``speed`` times as fast within them."""
-    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
-    first_rad = azimuth_rad(np.concatenate(starts))
+    first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
         since = wrapped(azimuth_rad(pose) - first_rad[frame])

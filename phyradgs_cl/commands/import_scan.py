@@ -24,12 +24,12 @@ EXAMPLE = (
 
 
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
-AngleAt = Literal[WORDS["angle_at"]]  # type: ignore[valid-type]
-Part = Literal[WORDS["part"]]  # type: ignore[valid-type]
-Quantity = Literal[WORDS["quantity"]]  # type: ignore[valid-type]
-Rotates = Literal[WORDS["rotates"]]  # type: ignore[valid-type]
-Row0 = Literal[WORDS["row_0"]]  # type: ignore[valid-type]
-Column0 = Literal[WORDS["column_0"]]  # type: ignore[valid-type]
+AngleAt = Literal[WORDS["angle_at"]]  # type: ignore[name-defined, valid-type]
+Part = Literal[WORDS["part"]]  # type: ignore[name-defined, valid-type]
+Quantity = Literal[WORDS["quantity"]]  # type: ignore[name-defined, valid-type]
+Rotates = Literal[WORDS["rotates"]]  # type: ignore[name-defined, valid-type]
+Row0 = Literal[WORDS["row_0"]]  # type: ignore[name-defined, valid-type]
+Column0 = Literal[WORDS["column_0"]]  # type: ignore[name-defined, valid-type]
 
 
 _FIELDS = frozenset(f.name for f in fields(ImportOptions))

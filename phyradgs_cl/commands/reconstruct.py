@@ -19,7 +19,7 @@ from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow import ReconstructionJob, profile_report, run_reconstruction
+from phyradgs_cl.workflow import profile_report, run_reconstruction
 
 EXAMPLE = (
     "Example: phyradgs reconstruct scan.h5 -o volume.h5 --iterations 2000\n\n"
@@ -42,19 +42,7 @@ def reconstruct_command(
 ) -> None:
     """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
     settings = request.settings()
-    job = ReconstructionJob(
-        scan,
-        output,
-        method=settings.method,
-        seed=settings.seed,
-        preset=settings.preset,
-        changes=settings.changes,
-        resume=resume,
-        config=request.config,
-        before=settings.before,
-        checkpoint_every_s=checkpoint_every,
-    )
-
+    job = request.job(settings, scan, output, resume=resume, checkpoint_every_s=checkpoint_every)
     ranks = launched_ranks()
     runtimes: list[Runtime] = []
     ticker = Ticker("iteration")

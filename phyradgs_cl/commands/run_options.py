@@ -11,6 +11,7 @@ from phyradgs_cl.commands import options
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.settings import RunSettings, run_settings
+from phyradgs_cl.workflow import ReconstructionJob
 
 _METHOD = (
     "phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
@@ -89,6 +90,11 @@ class RunRequest:
     def settings(self) -> RunSettings:
         """Everything together, checked; InputError for an option or line that is not what it should be."""
         return run_settings(self.config, self.given, self.assignments)
+
+    def job(self, settings: RunSettings, scan: Path, output: Path, **more: Any) -> ReconstructionJob:
+        """What is to be done with ``scan``, by the ``settings`` of this request."""
+        known = {name: getattr(settings, name) for name in ("method", "seed", "preset", "changes", "before")}
+        return ReconstructionJob(scan, output, config=self.config, **known, **more)
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

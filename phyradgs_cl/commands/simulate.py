@@ -10,7 +10,7 @@ from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Ou
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, pair_parser
-from phyradgs_cl.simulation import scanner_for, scanner_options
+from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options
 from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_options, run_simulation
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
@@ -36,7 +36,9 @@ def simulate_command(
     exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,
     readout_ratio: Annotated[float | None, option("Readout over exposure time, T_ro/T_exp.", "0.86")] = None,
     start_deg: Annotated[float | None, option("Gantry angle at the start, degrees.", "0")] = None,
-    readout: Annotated[Axis | None, option("What is read out at one time.", "scanner's")] = None,
+    readout_axis: Annotated[
+        Axis | None, option("What is read out at one time.", "scanner's", "--readout")
+    ] = None,
     readout_direction: Annotated[int | None, option("1 reads index 0 first, -1 last.", "scanner's")] = None,
     pulse: Annotated[
         Any,
@@ -91,30 +93,12 @@ def simulate_command(
     memory: Memory = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
+    given = {name: value for name, value in locals().items() if name in OPTION_NAMES}
     refuse_jitter(protocol, jitter_deg)
     refuse_noise_options(noise, {"--dose": dose, "--electronic-noise": electronic_noise})
     wish = device_wish(device)
     described = scanner_for(scanner, detector, detector_offset)
-    options = scanner_options(
-        described,
-        protocol,
-        views=views,
-        exposure_deg=exposure_deg,
-        readout_ratio=readout_ratio,
-        pulse=pulse,
-        start_deg=start_deg,
-        readout_axis=readout,
-        readout_direction=readout_direction,
-        detector_model=detector_model,
-        peak=peak,
-        noise=noise,
-        dose=dose,
-        electronic_noise=electronic_noise,
-        jitter_deg=jitter_deg,
-        lag=lag,
-        time_samples=time_samples,
-        seed=seed,
-    )
+    options = scanner_options(described, protocol, **given)
     job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples)
     with Ticker("frame") as ticker:
         scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)

@@ -12,7 +12,6 @@ from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow import ReconstructionJob
 from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch
 
 EXAMPLE = (
@@ -42,17 +41,7 @@ def watch_command(
 ) -> None:
     """Reconstruct the scans of a folder as they arrive, each once; failures are set aside with their message."""
     settings = request.settings()
-    template = ReconstructionJob(
-        folder,
-        output,
-        method=settings.method,
-        preset=settings.preset,
-        changes=settings.changes,
-        seed=settings.seed,
-        config=request.config,
-        before=settings.before,
-        checkpoint_every_s=checkpoint_every,
-    )
+    template = request.job(settings, folder, output, checkpoint_every_s=checkpoint_every)
     job = WatchJob(folder, output, template, poll_s, settle_s, once)
 
     def runtime() -> Runtime:

@@ -36,9 +36,8 @@ def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
             continue
         middle = at[1:-1, 1:-1]
         inner += int(np.count_nonzero(middle))
-        touching += int(
-            np.count_nonzero(middle & at[:-2, 1:-1] & at[2:, 1:-1] & at[1:-1, :-2] & at[1:-1, 2:])
-        )
+        sides = at[:-2, 1:-1] & at[2:, 1:-1] & at[1:-1, :-2] & at[1:-1, 2:]
+        touching += int(np.count_nonzero(middle & sides))
     return count / pixels if inner and touching / inner > _TOUCHING else 0.0
 
 

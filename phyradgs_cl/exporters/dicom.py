@@ -24,17 +24,13 @@ def write_dicom(path: Path, volume: Placed) -> None:
     """A new folder with 0001.dcm from the lowest slice up."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     slope = rescale_slope(volume)
-    seed = hashlib.sha256(
-        volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
-    ).hexdigest()
-    uid = {
-        name: pydicom.uid.generate_uid(entropy_srcs=[seed, volume.unit, name])
-        for name in ("study", "series", "frame")
-    }
+    content = volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
+    seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
+    uid = {n: generate(entropy_srcs=[seed, volume.unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:
         for index, plane in enumerate(volume.values):
             image = _common(pydicom, volume, slope, uid)
-            instance = pydicom.uid.generate_uid(entropy_srcs=[seed, volume.unit, str(index)])
+            instance = generate(entropy_srcs=[seed, volume.unit, str(index)])
             image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = instance
             _place(image, volume, index)
             image.PixelData = np.rint(plane / float(slope)).astype("<i2").tobytes()
@@ -94,9 +90,8 @@ def folder_written_beside(path: Path) -> Iterator[Path]:
     something in it is never replaced: it could hold anything."""
     target = Path(os.path.abspath(path))
     if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
-        raise OutputError(
-            str(path), "something that is there already", "a new or an empty folder", "choose another name"
-        )
+        found = "something that is there already"
+        raise OutputError(str(path), found, "a new or an empty folder", "choose another name")
     temporary = temporary_name(target)
     try:
         temporary.mkdir()

@@ -51,9 +51,8 @@ def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
     with np.errstate(over="ignore"):
         hu = (1000.0 * (values.astype(np.float64) / mu_water_per_mm - 1.0)).astype(np.float32)
     if not np.isfinite(hu).all():
-        raise InputError(
-            "--mu-water-per-mm", f"{mu_water_per_mm:g}", "water's attenuation in 1/mm, near 0.02"
-        )
+        expected = "water's attenuation in 1/mm, near 0.02"
+        raise InputError("--mu-water-per-mm", f"{mu_water_per_mm:g}", expected)
     return hu
 
 

@@ -36,9 +36,8 @@ def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None,
     shape("result", volume, (None, None, None))
     finite("result", volume)
     truth = None if reference is None else np.asarray(reference)
-    figure = Figure(
-        figsize=((1 if truth is None else 3) * _INCH * 1.25, 3 * _INCH + 0.6), layout="constrained"
-    )
+    width = (1 if truth is None else 3) * _INCH * 1.25
+    figure = Figure(figsize=(width, 3 * _INCH + 0.6), layout="constrained")
     heading = plain_text(title if truth is None else f"{title}\n{_numbers(volume, truth)}")
     figure.suptitle(heading, parse_math=False)  # a dollar in a file's name is one
     _fill(figure, volume, truth)

@@ -4,7 +4,6 @@ An affine map takes an ellipsoid to the unit ball and a ray to a ray: the chord 
 centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -88,7 +87,8 @@ class EllipsoidPhantom:
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
         flat = result.reshape(-1)
-        for chunk in _chunks(flat.size):
+        for first in range(0, flat.size, RAYS_PER_CHUNK):
+            chunk = slice(first, min(first + RAYS_PER_CHUNK, flat.size))
             # Indexing the broadcast views copies a chunk's points only, never all of them.
             where = np.unravel_index(np.arange(chunk.start, chunk.stop), result.shape) if result.ndim else ()
             p = start[where].reshape(-1, 3)
@@ -129,11 +129,6 @@ def _broadcast_points(source: ArrayLike, target: ArrayLike) -> tuple[Array, Arra
         found = f"shapes {start.shape} and {end.shape}"
         raise InputError("ray source and target", found, "shapes (..., 3) that broadcast")
     return np.broadcast_to(start, common), np.broadcast_to(end, common)
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    for first in range(0, count, RAYS_PER_CHUNK):
-        yield slice(first, min(first + RAYS_PER_CHUNK, count))
 
 
 def _chord_fraction(ellipsoid: Ellipsoid, start: Array, step: Array) -> Array:

@@ -100,7 +100,7 @@ def _long_bone(start: Point, end: Point, radius: float, rng: np.random.Generator
     waist = radius * 0.66
     points = (ends[0], 0.65 * ends[0] + 0.35 * ends[1], 0.3 * ends[0] + 0.7 * ends[1], ends[1])
     radii = (radius, waist, waist, radius * 0.95)
-    return _chain([(_point(p), r) for p, r in zip(points, radii, strict=True)], rng)
+    return _chain([((float(x), float(y), float(z)), r) for (x, y, z), r in zip(points, radii, strict=True)], rng)
 
 
 def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.random.Generator) -> list[Bone]:
@@ -112,10 +112,6 @@ def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.rando
         q = (head[0] + spread * (z1 - joints[0]), head[1] - 0.10 * (z1 - joints[0]), z1)
         bones.append(_long_bone(p, q, 0.038 * thickness * 0.9**i, rng))
     return bones
-
-
-def _point(values: np.ndarray) -> Point:
-    return (float(values[0]), float(values[1]), float(values[2]))
 
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:

@@ -188,18 +188,14 @@ def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
     crown = Capsule(_on(tooth, 0.0, middle), _on(tooth, 0.0, middle), tooth.depth, tooth.depth)
     box = capsule_box(lattice, [*roots, crown], 0.03)
     x, y, z = lattice.points(box)
-    along = (x - np.float32(tooth.centre[0])) * tooth.along[0] + (
-        y - np.float32(tooth.centre[1])
-    ) * tooth.along[1]
-    across = (x - np.float32(tooth.centre[0])) * tooth.along[1] - (
-        y - np.float32(tooth.centre[1])
-    ) * tooth.along[0]
+    dx, dy = x - np.float32(tooth.centre[0]), y - np.float32(tooth.centre[1])
+    along = dx * tooth.along[0] + dy * tooth.along[1]
+    across = dx * tooth.along[1] - dy * tooth.along[0]
     axes = (0.47 * tooth.width, 0.5 * tooth.depth, 0.58 * tooth.height)
     cap = ratio_distance((along, across, z - np.float32(middle)), axes)
     root = capsule_union(lattice, roots, 0.008, box)
-    pulp = np.minimum(
-        capsule_union(lattice, _roots(tooth, 0.014, 0.006), 0.004, box), cap + 0.36 * tooth.width
-    )
+    canals = capsule_union(lattice, _roots(tooth, 0.014, 0.006), 0.004, box)
+    pulp = np.minimum(canals, cap + 0.36 * tooth.width)
     enamel, core = lattice.coverage(cap), lattice.coverage(cap + np.float32(_ENAMEL_DEPTH))
     dentine = np.maximum(lattice.coverage(root), core)
     hollow = lattice.coverage(pulp) * dentine

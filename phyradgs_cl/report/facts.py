@@ -7,6 +7,7 @@ UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
 _RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # finer than anything a scanner knows
 _WORDS = {"psnr": "PSNR", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def flattened(facts: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
@@ -51,12 +52,8 @@ def number(value: float, resolution: float = 0.0) -> str:
     text = f"{value:.4g}"
     if "e" in text:
         mantissa, exponent = text.split("e")
-        text = f"{mantissa}·10{_superscript(int(exponent))}"
+        text = f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}"
     return text.replace("-", "−")
-
-
-def _superscript(exponent: int) -> str:
-    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def _text(value: object, resolution: float) -> str:

@@ -19,7 +19,6 @@ from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
-_HEADINGS = ("slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance")
 
 
 @np.errstate(all="ignore")  # absurd values are shown as they are
@@ -55,17 +54,20 @@ def write_report(
 
 def report_page(run: Run, views: Sequence[View] = ()) -> str:
     """The page as text; ``views`` as from ``computed_views``."""
+    of_scan = {} if run.scan is None else {
+        "projections": sections.projections_section(run.scan, views),
+        "scan": sections.scan_section(run),
+        "geometry": sections.geometry_section(run.scan),
+        "shutter": sections.shutter_section(run, run.scan),
+    }  # fmt: skip
     parts = {
         "slices": sections.slices_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
-        "projections": sections.projections_section(run, views),
-        "scan": sections.scan_section(run),
-        "geometry": sections.geometry_section(run),
-        "shutter": sections.shutter_section(run),
+        **of_scan,
         "provenance": sections.provenance_section(run),
     }
-    there = {name: part for name in _HEADINGS if (part := parts[name]) is not None}
+    there = {name: part for name, part in parts.items() if part is not None}
     links = [element("a", name.capitalize(), href=f"#{name}") for name in there]
     skip = element("a", "To the content", href="#slices", class_="skip")
     body = joined(
@@ -74,7 +76,9 @@ def report_page(run: Run, views: Sequence[View] = ()) -> str:
         element("main", *_in_pairs(there)),
         element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
     )
-    return "<!doctype html>\n" + element("html", _head(_title(run)), _body(body), lang="en") + "\n"
+    title = f"{run.path.name} – {run.stored.provenance.get('method', 'volume')}"
+    page = element("body", body, raw_text("script", _file("page.js")))
+    return "<!doctype html>\n" + element("html", _head(title), page, lang="en") + "\n"
 
 
 def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
@@ -99,15 +103,6 @@ def _head(title: str) -> Markup:
         element("title", title),
         raw_text("style", _file("page.css")),
     )
-
-
-def _body(content: Markup) -> Markup:
-    return element("body", content, raw_text("script", _file("page.js")))
-
-
-def _title(run: Run) -> str:
-    method = run.stored.provenance.get("method", "volume")
-    return f"{run.path.name} – {method}"
 
 
 def _top(run: Run) -> list[Markup]:

@@ -88,9 +88,7 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
     known = stored.provenance.get("scan_sha256")
     facts = scan_summary(found, str(known) if scan_path is None else None)
     if known is not None and facts["sha256"] != known:
-        notes.append(
-            "The scan shown here is not the file that this volume was reconstructed from: its hash differs."
-        )
+        notes.append("The scan shown here is not the file that this volume was reconstructed from: its hash differs.")
     whole = read_scan(found, counts_to_attenuation)
     scan = whole.on_grid(stored.grid)
     if whole.reference is not None and scan.reference is None:

@@ -158,7 +158,9 @@ def _reconstructed(
                 return result, metrics
             with finish_despite_interrupt():
                 metrics = _metrics(scan, result)
-                _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
+                path = job.output if result.state is None else partial_path(job.output)
+                told = _provenance(result, scan_hash, job, rt)
+                write_volume(path, result.volume, result.grid, told, result.gaussians, metrics or None)
                 _keep_checkpoint(job, result, fingerprint)
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
@@ -177,11 +179,8 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     """Says what can be reconstructed, but is hardly what was meant."""
     motion = options.motion
-    if (
-        scan.detector_model == "intensity"
-        and not hasattr(options, "detector_model")
-        and _averages(scan, options)
-    ):
+    is_ignored = scan.detector_model == "intensity" and not hasattr(options, "detector_model")
+    if is_ignored and _averages(scan, options):
         found = "%s averages intensity over an exposure; --method %s averages line integrals"
         log.warning(found, job.scan, job.method)
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
@@ -193,9 +192,7 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
         log.warning(found, job.scan, job.method)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:
-        found = (
-            "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
-        )
+        found = "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
         log.warning(found, job.scan, late[0] + 1, late[0])
     if (largest := float(scan.projections.max())) <= 0:
         found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
@@ -210,9 +207,8 @@ def _averages(scan: Scan, options: Any) -> bool:
 
 def profile_report(rt: Runtime, result: Reconstruction) -> str:
     """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
-    uses = rt.kernel_uses()
     pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
-    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)
+    return profile_text(rt.kernel_uses(), float(result.facts["seconds"]), rt.best_rates(), pairs)
 
 
 def _refuse_foreign_suffix(output: Path) -> None:
@@ -221,13 +217,6 @@ def _refuse_foreign_suffix(output: Path) -> None:
     if ending is not None:
         remedy = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as volume.h5", remedy)
-
-
-def _write_result(
-    job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
-) -> None:
-    path = job.output if result.state is None else partial_path(job.output)
-    write_volume(path, result.volume, result.grid, provenance, result.gaussians, metrics or None)
 
 
 def _provenance(
@@ -256,9 +245,8 @@ def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
 def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
     resumable = [name for name, method in METHODS.items() if method.is_resumable]
     if job.method not in resumable:
-        raise InputError(
-            "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(resumable)}"
-        )
+        expected = f"a method with checkpoints: {', '.join(resumable)}"
+        raise InputError("--resume", f"--method {job.method}", expected)
     return read_checkpoint(checkpoint_path(job.output), fingerprint)
 
 

@@ -10,9 +10,7 @@ from phyradgs_cl.acquisition import PROTOCOLS, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import LoadedVolume, Scanner, check_writable, only_run, write_scan
-from phyradgs_cl.reconstructors.interrupt import (
-    finish_despite_interrupt,
-)
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
 from phyradgs_cl.workflow.files import expecting, refuse_overwriting

@@ -23,10 +23,8 @@ def check_angles(scan: Scan) -> Finding:
     apart_deg = gaps_deg[gaps_deg > math.degrees(_SAME_RAD)]
     if apart_deg.size < 3:
         count = max(apart_deg.size, 1)
-        text, advice = (
-            f"{count} different angle{'s' if count > 1 else ''}",
-            "check rotation_angle and its unit (degrees)",
-        )
+        text = f"{count} different angle{'s' if count > 1 else ''}"
+        advice = "check rotation_angle and its unit (degrees)"
         return Finding(_QUESTION, SUSPICIOUS, float(apart_deg.size), 3.0, "angles", text, advice)
     usual_deg = float(np.median(apart_deg))
     widest = np.sort(apart_deg)[::-1]
@@ -47,9 +45,8 @@ def check_angles(scan: Scan) -> Finding:
 def _half_fan_deg(scan: Scan) -> float:
     """Half the fan that the reconstruction's box takes, no more than the panel sees."""
     geometry = scan.geometry
-    seen = math.atan2(
-        geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm
-    )
+    half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
+    seen = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2
     taken = math.asin(min(1.0, radius_mm / geometry.source_to_axis_mm))
     return math.degrees(min(seen, taken))

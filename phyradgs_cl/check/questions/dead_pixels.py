@@ -29,9 +29,8 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     known = _masked(scan)
     if scan.frames < _LEAST_FRAMES:
         text = f"fewer than {_LEAST_FRAMES} frames"
-        return Finding(_QUESTION, CANNOT_TELL, 0.0, _SHARE, "share of pixels", text), np.zeros(
-            known.shape, bool
-        )
+        finding = Finding(_QUESTION, CANNOT_TELL, 0.0, _SHARE, "share of pixels", text)
+        return finding, np.zeros(known.shape, bool)
     chosen = np.unique(np.linspace(0, scan.frames - 1, _MOST_FRAMES).round().astype(int))
     frames = np.asarray(scan.projections)[chosen]
     apart = _apart(frames) & ~(_shared(frames) & _near_axis(scan))

@@ -6,7 +6,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.questions.timing import azimuth_rad
+from phyradgs_cl.check.questions.timing import start_azimuths_rad
 from phyradgs_cl.check.residual import fit, system_of
 from phyradgs_cl.runtime import Runtime
 
@@ -22,8 +22,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
     if scan.frames < _FEWEST:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST, "share", f"fewer than {_FEWEST} frames")
     level = fit(system_of(rt, scan)).level
-    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
-    angle = azimuth_rad(np.concatenate(starts))
+    angle = start_azimuths_rad(scan)
     share = np.linspace(-0.5, 0.5, scan.frames)
     turning = np.stack([np.ones(scan.frames), np.cos(angle), np.sin(angle)], 1)
     frames = np.arange(scan.frames)

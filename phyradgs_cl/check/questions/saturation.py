@@ -1,6 +1,6 @@
 """Are pixels at the end of the detector's range?"""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -24,7 +24,7 @@ class CountReader:
     the projections' pixels at ``ceiling``, the largest count of any frame; None of files without counts."""
 
     ceiling: float | None = None
-    at_ceiling: float = field(default=0.0)
+    at_ceiling: float = 0.0
 
     def __call__(
         self, data: np.ndarray, image_key: np.ndarray, quantity: str
@@ -44,9 +44,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     if scan.saturation is not None and scan.saturation.share > _SHARE:
         return _clipped(scan.saturation, "lower the exposure; the import has masked these pixels, or taken them as air")
     p = np.asarray(scan.projections)
-    masked = (
-        np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)
-    )
+    masked = np.broadcast_to(False if scan.pixel_mask is None else scan.pixel_mask != 0, p.shape)
     cliffs = _cliffs(p, masked)
     if cliffs > _CLIFFS:
         text = f"from a pixel to the next {100 * cliffs:.3g} % go from brightest to darkest"

@@ -102,7 +102,5 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 
 def _resampled(image: NDArray[np.uint8], shape: list[int]) -> NDArray[np.uint8]:
     """The nearest pixel's value at every place: voxels stay visible as such."""
-    rows, columns = (
-        ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(shape, image.shape, strict=True)
-    )
+    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(shape, image.shape, strict=True))
     return image[rows[:, None], columns]

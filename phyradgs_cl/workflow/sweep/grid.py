@@ -50,7 +50,8 @@ class Setting:
         """The setting in a line: the preset where it is not the method's first, options with dotted names."""
         usual = next(iter(METHODS[self.method].presets))
         named = [] if self.preset == usual else [f"preset={self.preset}"]
-        named += [f"{name}={_shown(value)}" for name, value in flat({**self.before, **self.changes})]
+        for name, value in flat({**self.before, **self.changes}):
+            named.append(f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
         return " ".join([self.method, *named])
 
 
@@ -103,10 +104,6 @@ def _nested(pairs: Iterator[tuple[str, Any]]) -> dict[str, Any]:
     return table
 
 
-def _shown(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
 # --- scans and seeds --------------------------------------------------------------------------------------
 
 
@@ -126,13 +123,9 @@ def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
 
 
 def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
-    fits = _is_list_of(int, seeds) and all(
-        not isinstance(seed, bool) and 0 <= seed <= _LARGEST_SEED for seed in seeds
-    )
-    if not fits:
-        raise InputError(
-            f"{path}: seeds", checks.shown(seeds), f"a list of whole numbers from 0 to {_LARGEST_SEED}"
-        )
+    if not (_is_list_of(int, seeds) and all(type(s) is int and 0 <= s <= _LARGEST_SEED for s in seeds)):
+        expected = f"a list of whole numbers from 0 to {_LARGEST_SEED}"
+        raise InputError(f"{path}: seeds", checks.shown(seeds), expected)
     return tuple(dict.fromkeys(seeds))
 
 
@@ -206,8 +199,4 @@ def _checked(values: dict[str, Any]) -> Setting:
     input_options(before)
     nested = _nested(iter(changes.items()))
     method_options(method, preset, nested)
-    return Setting(method, _preset(method, preset), nested, before)
-
-
-def _preset(method: str, preset: str | None) -> str:
-    return next(iter(METHODS[method].presets)) if preset is None else preset
+    return Setting(method, next(iter(METHODS[method].presets)) if preset is None else preset, nested, before)

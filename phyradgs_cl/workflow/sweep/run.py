@@ -17,7 +17,7 @@ from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_
 from phyradgs_cl.workflow.sweep.grid import SweepGrid
 from phyradgs_cl.workflow.sweep.plan import VOLUMES, SweepRun, is_sound, missing_runs, plan_sweep
 from phyradgs_cl.workflow.sweep.tables import write_tables
-from phyradgs_cl.workflow.sweep.task import lost_line, make_run
+from phyradgs_cl.workflow.sweep.task import failed_line, make_run
 
 RESULTS = "results.jsonl"
 
@@ -111,7 +111,7 @@ class _Batch:
         with Pool(workers) as pool:
             self._say(dashboard=pool.dashboard)
             for name, found in pool.results(make_run, by_name, look):
-                yield lost_line(by_name[name], found.reason) if isinstance(found, Lost) else found
+                yield failed_line(by_name[name], found.reason) if isinstance(found, Lost) else found
 
     def _say(self, **more: Any) -> None:
         self.report(SweepProgress(self.done, self.total, self.failed, **more))
