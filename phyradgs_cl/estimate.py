@@ -167,12 +167,9 @@ def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) ->
         through_s = min(through_s, trials.run_beside_control(more))
     rounds = trials.last.facts["density_control_rounds"]
     each_s = max(through_s - again_s, 0.0) / (more - few)
-    control_s = trials.control_s * _rounds(options) / max(rounds, 1)
+    due = sum(options.control.is_due(i, total) for i in range(1, total + 1))
+    control_s = trials.control_s * due / max(rounds, 1)
     return first_s + (total - few) * each_s + control_s, each_s + control_s / total
-
-
-def _rounds(options: SplatOptions) -> int:
-    return sum(options.control.is_due(i, options.iterations) for i in range(1, options.iterations + 1))
 
 
 def _of_alike(trials: _Trials, total: int, few: int, more: int) -> tuple[float, float]:

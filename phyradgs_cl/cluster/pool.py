@@ -94,11 +94,14 @@ class Pool:
                         waiting.extendleft(running.values())
                         running.clear()
                     else:
-                        self._say_no_worker()
+                        start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
+                        log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)
                     seen_s = time.monotonic()
                 while waiting and len(running) < devices:
                     name = waiting.popleft()
-                    running[self._submitted(function, arguments[name], name)] = name
+                    key = f"{name}-{time.time_ns():x}"  # of this call alone: no earlier result is taken for it
+                    how = {"key": key, "resources": {RESOURCE: 1}, "pure": False}
+                    running[self._client.submit(function, arguments[name], **how)] = name
                 look(PoolState(len(waiting), len(running), devices))
                 for future in self._finished(running):
                     revivals = 0
@@ -106,10 +109,6 @@ class Pool:
         finally:
             if self._client.status == "running":
                 self._client.cancel(list(running))
-
-    def _submitted(self, function: Callable[[Any], Any], argument: Any, name: str) -> Any:
-        key = f"{name}-{time.time_ns():x}"  # of this call alone: no result of an earlier one is taken for it
-        return self._client.submit(function, argument, key=key, resources={RESOURCE: 1}, pure=False)
 
     def _finished(self, running: Mapping[Any, str]) -> set[Any]:
         if not running:
@@ -172,7 +171,3 @@ class Pool:
         log.warning("no local worker is left: starting them anew")
         self.__exit__()
         self.__enter__()
-
-    def _say_no_worker(self) -> None:
-        start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
-        log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)

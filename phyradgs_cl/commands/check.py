@@ -67,9 +67,8 @@ def _write_copy(scan: Path, target: Path, found: CheckResult, quiet: bool) -> No
         remedy = "set right what is suspicious, and check again"
         raise InputError("--fix-offset", "frames that do not fit together", "an offset that means something", remedy)
     if not (math.isfinite(found.offset_mm) and math.isfinite(found.offset_spread_mm)):
-        raise InputError(
-            "--fix-offset", "no offset that fits best", "a scan whose frames tell it", "leave it out"
-        )
+        expected = "a scan whose frames tell it"
+        raise InputError("--fix-offset", "no offset that fits best", expected, "leave it out")
     with only_run(target), finish_despite_interrupt():
         copy_with_offset(scan, target, found.offset_mm)
     if not quiet:

@@ -12,7 +12,6 @@ from phyradgs_cl.commands.console import complain, remark, say, scores
 from phyradgs_cl.commands.files import file_argument, option
 from phyradgs_cl.commands.options import Scheduler, WorkerCount
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.json_lines import Line
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.settings import device_wish, read_config
 from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, SweepProgress, read_grid, run_sweep
@@ -94,7 +93,9 @@ class SweepTicker:
             return
         if p.line is not None:
             self._end_lines()
-            say(f"{p.done}/{p.total} {p.line['run']} ({p.line['label']}): {_found(p.line)}")
+            error = p.line.get("error")
+            found = f"failed: {error}" if error else f"{p.line['seconds']:.1f} s{scores(p.line['metrics'])}"
+            say(f"{p.done}/{p.total} {p.line['run']} ({p.line['label']}): {found}")
         if p.progress is not None:
             if p.name != self.name:
                 self.name, self.one = p.name, Ticker(f"{p.done + 1}/{p.total} {p.name}: iteration")
@@ -109,9 +110,3 @@ class SweepTicker:
         for ticker in (self.all, self.one):
             with ticker:
                 pass
-
-
-def _found(line: Line) -> str:
-    if "error" in line:
-        return f"failed: {line['error']}"
-    return f"{line['seconds']:.1f} s{scores(line['metrics'])}"

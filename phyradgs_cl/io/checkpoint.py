@@ -54,9 +54,8 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
     found = str(arrays.pop("fingerprint", ""))
     if found != fingerprint:
         remedy = f"use the same scan and options, or {_RESTART}"
-        raise InputError(
-            str(path), f"a checkpoint of {_other_run(found, fingerprint)}", "one of this run", remedy
-        )
+        expected = "one of this run"
+        raise InputError(str(path), f"a checkpoint of {_other_run(found, fingerprint)}", expected, remedy)
     return arrays
 
 

@@ -57,9 +57,8 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise OutputError(
-            str(path), error.strerror or str(error), "a file that can be appended to"
-        ) from error
+        expected = "a file that can be appended to"
+        raise OutputError(str(path), error.strerror or str(error), expected) from error
 
 
 def json_text(value: object) -> str:

@@ -78,13 +78,11 @@ def _target(path: str | Path) -> Path:
     if mode is not None and not stat.S_ISREG(mode):
         raise OutputError(shown, "something that is not a regular file", "a file name")
     if mode is not None and not os.access(target, os.W_OK):
-        raise OutputError(
-            shown, "a write-protected file", "a file that may be replaced", "choose another name"
-        )
+        expected = "a file that may be replaced"
+        raise OutputError(shown, "a write-protected file", expected, "choose another name")
     if not target.parent.is_dir():
-        raise OutputError(
-            shown, f"no folder {target.parent}", "an existing folder", "create the folder first"
-        )
+        expected = "an existing folder"
+        raise OutputError(shown, f"no folder {target.parent}", expected, "create the folder first")
     return target
 
 
@@ -157,9 +155,8 @@ def _output_error(target: Path, error: BaseException) -> OutputError:
     full = code in NO_SPACE or any(f"errno = {number}," in str(error) for number in NO_SPACE)
     if full:
         found = f"no room left in folder {target.parent}"
-        return OutputError(
-            str(target), found, "enough space on the disk", "free some space or choose another folder"
-        )
+        expected = "enough space on the disk"
+        return OutputError(str(target), found, expected, "free some space or choose another folder")
     if code == errno.ENAMETOOLONG:
         return OutputError(str(target), "a file name that is too long", "a shorter name", "shorten the name")
     found = getattr(error, "strerror", None) or str(error)

@@ -14,6 +14,7 @@ from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
+from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.text import plain_text
@@ -63,7 +64,7 @@ class Run:
     def record(self) -> list[dict[str, float]]:
         """The convergence record: finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
-        return [{k: float(v) for k, v in line.items() if _is_number(v)} for line in lines]
+        return [{k: float(v) for k, v in line.items() if NUMBER.fits(v)} for line in lines]
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
@@ -111,7 +112,3 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
                 return place
     notes.append(f"The scan {plain_text(named)} was not found, or has changed since; --scan names it.")
     return None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < 1e300)

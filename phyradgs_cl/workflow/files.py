@@ -80,9 +80,8 @@ def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
     if foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
-            raise InputError(
-                f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth"
-            )
+            expected = "a scan with a known truth"
+            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
         return scan.reference, scan.grid
     volume, grid, _ = load_result(path)
     return volume, grid

@@ -93,7 +93,10 @@ def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
 
 def _turned(source: Hdf5Source, detector: str) -> Turned:
     """Flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
-    flips = [_flag(source, f"{detector}/{name}") for name in ("y_flipped", "x_flipped")]
+    flips = [False, False]
+    for index, address in enumerate((f"{detector}/y_flipped", f"{detector}/x_flipped")):
+        if source.find(address) is not None:
+            flips[index] = bool(np.any(read_values(source, address, source.dataset(address), kinds="biu")))
     for index, name in enumerate(("rx", "ry")):
         address = f"{detector}/transformations/{name}"
         if source.find(address) is not None:
@@ -102,12 +105,6 @@ def _turned(source: Hdf5Source, detector: str) -> Turned:
                 raise source.error(address, f"{half_turns * 180:g}°", "0° or 180°: a flip")
             flips[index] ^= bool(round(half_turns) % 2)
     return Turned(rows=flips[0], columns=flips[1])
-
-
-def _flag(source: Hdf5Source, address: str) -> bool:
-    if source.find(address) is None:
-        return False
-    return bool(np.any(read_values(source, address, source.dataset(address), kinds="biu")))
 
 
 def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.ndarray) -> np.ndarray | None:

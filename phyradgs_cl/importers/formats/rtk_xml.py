@@ -42,13 +42,10 @@ class RtkGeometry:
     @property
     def is_circular(self) -> bool:
         """Whether every projection stands on one untilted circle with one panel."""
-        still = all(np.ptp(self.values[name]) <= 1e-9 * (1 + np.abs(v).max()) for name, v in self.steady)
+        steady = [v for name, v in self.values.items() if name != "GantryAngle"]
+        still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)
         tilts = ("SourceOffsetX", "SourceOffsetY", "InPlaneAngle", "OutOfPlaneAngle")
         return still and all(np.all(self.values[name] == 0) for name in tilts)
-
-    @property
-    def steady(self) -> list[tuple[str, np.ndarray]]:
-        return [(name, values) for name, values in self.values.items() if name != "GantryAngle"]
 
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray

@@ -66,9 +66,8 @@ def checked_name(name: object, culprit: str) -> str:
     text = name.replace("\\", "/")
     outside = PureWindowsPath(name).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if outside:
-        raise InputError(
-            culprit, repr(name)[:80], "a name inside the folder", "copy the file into the folder"
-        )
+        expected = "a name inside the folder"
+        raise InputError(culprit, repr(name)[:80], expected, "copy the file into the folder")
     return text
 
 

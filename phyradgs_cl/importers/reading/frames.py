@@ -81,9 +81,8 @@ def compact(mask: np.ndarray) -> Mask:
     if not mask.any():
         return None
     if mask.all():
-        raise InputError(
-            "pixels", "no usable value", "frames brighter than the dark", "check flats and darks"
-        )
+        expected = "frames brighter than the dark"
+        raise InputError("pixels", "no usable value", expected, "check flats and darks")
     return mask[0] if all(np.array_equal(frame, mask[0]) for frame in mask) else mask
 
 

@@ -20,9 +20,8 @@ def opened(path: Path) -> Iterator[Hdf5Source]:
         with open_hdf5(path) as source:
             yield source
     except (KeyError, TypeError) as error:
-        raise InputError(
-            str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
-        ) from error
+        expected = "readable HDF5"
+        raise InputError(str(path), f"a damaged file ({error})", expected, "copy the file again") from error
 
 
 def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:

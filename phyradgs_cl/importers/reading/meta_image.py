@@ -1,6 +1,5 @@
 """MetaImage (.mha, .mhd), volumes and stacks of projections: a text, then voxels, raw or deflated, here or beside."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +15,15 @@ _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _TYPES = {f"MET_{name}": code for name, code in zip(_NAMES, _CODES, strict=True)}
 
 
-@dataclass(frozen=True, eq=False)
-class MetaStack:
-    """Frames (F, v, u) as stored, and where pixels are: place (2,) of pixel (0, 0) and steps (2,), all (u, v) in mm."""
-
-    frames: np.ndarray
-    origin_mm: np.ndarray
-    step_u_mm: np.ndarray
-    step_v_mm: np.ndarray
-
-
-def read_meta_stack(path: Path) -> MetaStack:
-    """A stack of projections, third axis the frames, which must lie on top of each other."""
+def read_meta_stack(path: Path) -> Voxels:
+    """A stack of projections (F, v, u), third axis the frames, which must lie on top of each other; u, v are its x, y."""
     image = read_meta_image(path)
-    assert image.steps_mm is not None and image.origin_mm is not None  # every MetaImage has them
     step = image.steps_mm
+    assert step is not None  # every MetaImage has them
     if np.abs(step[:2, 2]).max() + np.abs(step[2, :2]).max() > 1e-9 * np.abs(step).max():
         found = str(step.tolist())[:80]
         raise InputError(f"{path} TransformMatrix", found, "axes of a stack: columns, rows, frames")
-    return MetaStack(image.values, image.origin_mm[:2], step[0, :2], step[1, :2])
+    return image
 
 
 def read_meta_image(path: Path) -> Voxels:

@@ -31,9 +31,7 @@ WHOLE = Kind("a whole number", lambda value: type(value) is int)
 NUMBER = Kind("a finite number", lambda value: _is_number(value) and abs(value) < _LARGEST)  # type: ignore[arg-type]
 SECONDS = Kind("a time of at least 0 s", lambda value: NUMBER.fits(value) and value >= 0)  # type: ignore[operator]
 TABLE = Kind("a table", lambda value: isinstance(value, dict))
-TABLES = Kind(
-    "a list of tables", lambda value: isinstance(value, list) and all(isinstance(v, dict) for v in value)
-)
+TABLES = Kind("a list of tables", lambda value: isinstance(value, list) and all(map(TABLE.fits, value)))
 FINITE = Kind(
     "a table of finite numbers",
     lambda value: isinstance(value, dict) and all(v is None or NUMBER.fits(v) for v in value.values()),

@@ -45,9 +45,8 @@ def open_hdf5(path: str | Path) -> "Iterator[Hdf5Source]":
         with file:
             yield Hdf5Source(file, path)
     except (OSError, RuntimeError, KeyError, TypeError, UnicodeError) as error:  # damage between datasets
-        raise InputError(
-            str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
-        ) from error
+        expected = "readable HDF5"
+        raise InputError(str(path), f"a damaged file ({error})", expected, "copy the file again") from error
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
@@ -55,9 +54,8 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     if "truncated" in reason:
         return InputError(str(path), "a truncated HDF5 file", "a complete file", "copy or write it again")
     if "signature not found" in reason:
-        return InputError(
-            str(path), "a file that is not HDF5", "an HDF5 file", "check the path or convert it"
-        )
+        expected = "an HDF5 file"
+        return InputError(str(path), "a file that is not HDF5", expected, "check the path or convert it")
     return InputError(str(path), f"a file that HDF5 cannot open ({reason})", "a readable HDF5 file")
 
 

@@ -33,14 +33,12 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
     quantity = read_attribute(source, address, "quantity")
     if quantity is None:
         remedy = "add the attribute to the dataset"
-        raise InputError(
-            f"{culprit} @quantity", "no attribute", "one of " + ", ".join(schema.QUANTITIES), remedy
-        )
+        expected = "one of " + ", ".join(schema.QUANTITIES)
+        raise InputError(f"{culprit} @quantity", "no attribute", expected, remedy)
     checks.one_of(f"{culprit} @quantity", quantity, schema.QUANTITIES)
     if quantity != "counts" and data.dtype.kind == "u":
-        raise InputError(
-            culprit, f"{quantity} as {data.dtype}", "float32", "store float32, or counts as uint16"
-        )
+        remedy = "store float32, or counts as uint16"
+        raise InputError(culprit, f"{quantity} as {data.dtype}", "float32", remedy)
     return data, quantity
 
 
@@ -120,9 +118,8 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
     if values.min() < 0:
         raise InputError(culprit, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
     if np.ptp(values) > 1e-6 * values.max():
-        raise InputError(
-            culprit, f"{values.min():.6g} to {values.max():.6g} s", "one time for all projections"
-        )
+        expected = "one time for all projections"
+        raise InputError(culprit, f"{values.min():.6g} to {values.max():.6g} s", expected)
     return float(values[0])
 
 

@@ -76,8 +76,11 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     mask_shape = check_mask(source, entry, data.shape)
     has_reference = _check_reference(source, entry, grid)
     if not has_grid:
-        _warn_of_grid(source, entry, grid)
-    _warn_of_ignored(source, entry)
+        where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
+        _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
+    for address in (f"{entry}/{name}" for name in schema.IGNORED):
+        if source.find(address) is not None:
+            _log.warning("%s: not read by this package", source.name(address))
     return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, has_grid)
 
 
@@ -104,11 +107,6 @@ def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry)
         remedy = "correct the geometry, or store the grid"
         raise source.error(address, "no grid, and none that follows", error.expected, remedy) from error
     return grid, False
-
-
-def _warn_of_grid(source: Hdf5Source, entry: str, grid: Grid) -> None:
-    where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
-    _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
 
 
 def _read_model(source: Hdf5Source, entry: str) -> str:
@@ -152,9 +150,3 @@ def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
         remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
         raise source.error(address, f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
     return True
-
-
-def _warn_of_ignored(source: Hdf5Source, entry: str) -> None:
-    for address in (f"{entry}/{name}" for name in schema.IGNORED):
-        if source.find(address) is not None:
-            _log.warning("%s: not read by this package", source.name(address))

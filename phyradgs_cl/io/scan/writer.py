@@ -43,7 +43,9 @@ def write_scan(
         OutputError: the file cannot be written.
     """
     frames, key = _checked_frames(scan, data, image_key, quantity)
-    _check_expressible(scan)
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file it would stand
+        remedy = "give the exposure its real length"
+        raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
     with written_beside(path) as temporary, new_hdf5(temporary) as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
@@ -65,9 +67,8 @@ def _checked_frames(
     checks.one_of("quantity", quantity, schema.QUANTITIES)
     if data is None:
         if quantity != "attenuation" or image_key is not None:
-            raise InputError(
-                "data", "None", "raw frames with an image_key", "pass the frames of this quantity"
-            )
+            expected = "raw frames with an image_key"
+            raise InputError("data", "None", expected, "pass the frames of this quantity")
         data = scan.projections
     key = np.zeros(len(data), np.int64) if image_key is None else np.asarray(image_key)
     frames = data if data.dtype == np.uint16 else data.astype(np.float32, copy=False)
@@ -79,13 +80,6 @@ def _checked_frames(
     if frames.dtype == np.uint16 and quantity != "counts":
         raise InputError("data", f"{quantity} as uint16", "float32", "only counts may be whole numbers")
     return frames, key
-
-
-def _check_expressible(scan: Scan) -> None:
-    """In a file a scan is a fly-scan only with an exposure."""
-    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:
-        remedy = "give the exposure its real length"
-        raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
 
 
 def _write_instrument(

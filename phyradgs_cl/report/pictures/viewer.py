@@ -27,6 +27,9 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     ]
     choice = _choice(list(windows)) if len(windows) > 1 else None
     figures = element("div", *(_figure(plane) for plane in planes), class_="slices")
+    layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
+    colours = base64_of(diverging().tobytes()) if "difference" in windows else None
+    data = {plane.name: _plane_data(plane) for plane in planes}
     first = windows["result"]
     legend = f"Black is {number(first.low, first.high)}, white {number(first.high)} 1/mm."
     return joined(
@@ -34,7 +37,7 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
         figures,
         element("p", element("output", legend, id="reading"), class_="note"),
         element("p", _HELP, class_="note help"),
-        json_block("slice-data", _data(planes, windows)),
+        json_block("slice-data", {"planes": data, "windows": layers, "colours": colours}),
     )
 
 
@@ -81,15 +84,10 @@ def _picture(plane: Plane, name: str) -> Markup:
     sheet = element("div", image, element("canvas", aria_hidden="true"), class_="sheet")
     ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
     marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
-    bar_mm = _round_length(_BAR * width_mm)
+    power = 10.0 ** math.floor(math.log10(most_mm := _BAR * width_mm))
+    bar_mm = max(f * power for f in (1, 2, 5) if f * power <= most_mm * (1 + 1e-9))
     bar = element("span", f"{number(bar_mm)} mm", class_="bar", style=f"width: {100 * bar_mm / width_mm:.6g}%")
     return element("div", sheet, *lines, *marks, bar, class_="picture")
-
-
-def _round_length(most: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten up to ``most``."""
-    power = 10.0 ** math.floor(math.log10(most))
-    return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))
 
 
 def _place(plane: Plane, k: int) -> str:
@@ -106,13 +104,6 @@ def _choice(layers: list[str]) -> Markup:
         return element("label", button, _LAYER_NAMES[layer])
 
     return element("fieldset", element("legend", "Show"), *(one(layer) for layer in layers), class_="choice")
-
-
-def _data(planes: list[Plane], windows: Mapping[str, Window]) -> dict[str, object]:
-    """What the script needs: slices and where they are, windows with the decimals that 256 steps deserve, colours."""
-    layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
-    colours = base64_of(diverging().tobytes()) if "difference" in windows else None
-    return {"planes": {plane.name: _plane_data(plane) for plane in planes}, "windows": layers, "colours": colours}
 
 
 def _plane_data(plane: Plane) -> dict[str, object]:

@@ -165,15 +165,10 @@ class _Watch:
             return False
 
     def _fail(self, arrival: Arrival, error: BaseException) -> bool:
-        if not arrival.is_unchanged() or _is_open_elsewhere(error):
+        if not arrival.is_unchanged() or "unable to lock file" in str(error):  # HDF5 locks a file that it writes
             return False
         message = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
         with finish_despite_interrupt():
             self.results.set_aside(arrival, message)
         self.tell(WatchEvent(arrival.path, error=message))
         return True
-
-
-def _is_open_elsewhere(error: BaseException) -> bool:
-    """HDF5 locks a file that it writes."""
-    return "unable to lock file" in str(error)
