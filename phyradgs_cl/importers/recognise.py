@@ -8,8 +8,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import phyradgs_real, phyradgs_synthetic, r2_gaussian
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.folder import SafeFolder
-from phyradgs_cl.importers.reading.hdf5_frames import opened
 from phyradgs_cl.importers.reading.meta_image import SUFFIXES as STACKS
+from phyradgs_cl.io.hdf5.source import open_hdf5
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _BY_SUFFIX = {".pickle": "naf", ".pkl": "naf", ".xml": "rtk", ".toml": "tiff"}
@@ -71,7 +71,7 @@ def _of_file(path: Path) -> list[str]:
 
 
 def _of_hdf5(path: Path) -> str:
-    with opened(path) as source:
+    with open_hdf5(path) as source:
         if isinstance(source.find("/exchange"), h5py.Group):
             return "data-exchange"
         for member in ("/entry/reconstruction", "/volume"):

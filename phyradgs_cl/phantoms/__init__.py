@@ -7,7 +7,6 @@ size.
 """
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,22 +26,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-class Phantom(Protocol):
-    """What every phantom offers."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def kind(self) -> str:
-        """ "analytic" or "voxel"."""
-        ...
-
-    def voxelise(self, grid: Grid, supersampling: int = ...) -> NDArray[np.float32]:
-        """(nz, ny, nx) in 1/mm."""
-        ...
-
-
+Phantom = EllipsoidPhantom | VoxelPhantom
 # (half_size_mm, resolution, seed) -> phantom; closed forms have no use for the last two.
 Factory = Callable[[float, int, int], Phantom]
 

@@ -8,19 +8,12 @@ from pathlib import Path
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
+from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.reading.hdf5_frames import (
-    distance_to_detector,
-    gantry_sign,
-    opened,
-    optional_length,
-    read_frames,
-    stored_pitch,
-)
 from phyradgs_cl.importers.scan_parts import checked, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import read_array, read_title
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.units import ANGLE, TIME
 
 _EXCHANGE = "/exchange"
@@ -31,29 +24,31 @@ _DETECTOR = f"{_INSTRUMENT}/detector"
 def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
     """The projections of /exchange, with its flats and darks."""
     options.refuse_unused("data-exchange", OF_BARE_FRAMES)
-    with opened(path) as source:
-        frames = read_frames(source, f"{_EXCHANGE}/data")
+    with open_hdf5(path) as source:
+        frames = hdf5_frames.read_frames(source, f"{_EXCHANGE}/data")
         panel = (frames.shape[1], frames.shape[2])
         places = {name: f"{_EXCHANGE}/data_{name}" for name in ("white", "dark")}
-        stacks = {n: read_frames(source, a, panel) for n, a in places.items() if source.find(a) is not None}
+        there = {name: address for name, address in places.items() if source.find(address) is not None}
+        stacks = {name: hdf5_frames.read_frames(source, there[name], panel) for name in there}
         theta_rad = read_array(source, f"{_EXCHANGE}/theta", (len(frames),), ANGLE)
         geometry = _geometry(source, panel, options)
-        exposure_s = optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
+        exposure_s = hdf5_frames.optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
         title = read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
     turned = {name: oriented(stack, options, "top") for name, stack in stacks.items()}
     culprit, flats, darks = f"{path}:{_EXCHANGE}/data", turned.get("white"), turned.get("dark")
     integrals = line_integrals(culprit, oriented(frames, options, "top"), options, flats=flats, darks=darks)
-    trajectory = turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
+    trajectory = turning(geometry, hdf5_frames.gantry_sign(options, "sample") * theta_rad, timing)
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:
-    to_axis = options.source_to_axis_mm or optional_length(source, f"{_INSTRUMENT}/source/distance")
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(f"{_INSTRUMENT}/source/distance"))
-    to_detector = distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
+    where = f"{_INSTRUMENT}/source/distance"
+    to_axis = options.source_to_axis_mm or hdf5_frames.optional_length(source, where)
+    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
+    to_detector = hdf5_frames.distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
     pitch = options.pixel_size_mm or (
-        stored_pitch(source, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
-        stored_pitch(source, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
+        hdf5_frames.stored_pitch(source, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
+        hdf5_frames.stored_pitch(source, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
     )
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, options.detector_offset_mm or (0.0, 0.0)))

@@ -12,12 +12,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
 from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
-from phyradgs_cl.importers.formats.phyradgs_synthetic import (
-    exposure_of_blurred_s,
-    readout_ratio,
-    start_times_s,
-)
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_json
@@ -132,11 +128,11 @@ def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
 
 def _timing(culprit: str, detector: Circle, options: ImportOptions) -> Timing:
     """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
-    exposure_s = exposure_of_blurred_s(options)
+    exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
-    ratio = readout_ratio(culprit, closed - first, done - closed)
+    ratio = synthetic.readout_ratio(culprit, closed - first, done - closed)
     shutter = Shutter(exposure_s, ratio * exposure_s)
-    start_s = start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
+    start_s = synthetic.start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
     least_s = shutter.span_s * (1 + _GAP)
     steps_s = np.maximum(np.diff(start_s), least_s)
     return Timing(shutter, np.concatenate([[0.0], np.cumsum(steps_s)]), True)

@@ -1,27 +1,13 @@
 """What importers of HDF5 share: numeric frames of any type, optional numbers with units, the sense of angles."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions, needed, option_name
 from phyradgs_cl.io.hdf5.datasets import read_length, read_values
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[Hdf5Source]:
-    """``open_hdf5``, for files whose root or names are damaged as well: h5py has a KeyError, or names that are bytes."""
-    try:
-        with open_hdf5(path) as source:
-            yield source
-    except (KeyError, TypeError) as error:
-        expected = "readable HDF5"
-        raise InputError(str(path), f"a damaged file ({error})", expected, "copy the file again") from error
 
 
 def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:

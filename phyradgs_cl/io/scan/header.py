@@ -15,15 +15,7 @@ from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_title
 from phyradgs_cl.io.hdf5.facts import read_facts
 from phyradgs_cl.io.hdf5.grid import default_grid, read_grid
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.scan import schema
-from phyradgs_cl.io.scan.detector import (
-    check_mask,
-    read_data_kind,
-    read_geometry,
-    read_image_key,
-    read_shutter,
-    read_starts,
-)
+from phyradgs_cl.io.scan import detector, schema
 from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
 
 _log = logging.getLogger(__name__)
@@ -47,14 +39,14 @@ class ScanHeader:
 def read_header(source: Hdf5Source) -> ScanHeader:
     """Read and check everything but pixels, mask and reference; InputError names what is wrong."""
     entry = find_entry(source)
-    data, quantity = read_data_kind(source, entry)
-    image_key = read_image_key(source, entry, len(data))
+    data, quantity = detector.read_data_kind(source, entry)
+    image_key = detector.read_image_key(source, entry, len(data))
     used = image_key == schema.PROJECTION
-    geometry = read_geometry(source, entry, (data.shape[1], data.shape[2]))
+    geometry = detector.read_geometry(source, entry, (data.shape[1], data.shape[2]))
     moving = has_motion(source, entry)
-    shutter = read_shutter(source, entry, used, moving)
+    shutter = detector.read_shutter(source, entry, used, moving)
     is_fly = moving and shutter.exposure_s > 0
-    start_s = read_starts(source, entry, used, shutter, moving)
+    start_s = detector.read_starts(source, entry, used, shutter, moving)
     shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
@@ -73,7 +65,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         saturation=_read_saturation(source, entry),
     )
     scan.check_timing()
-    mask_shape = check_mask(source, entry, data.shape)
+    mask_shape = detector.check_mask(source, entry, data.shape)
     has_reference = _check_reference(source, entry, grid)
     if not has_grid:
         where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
