@@ -68,8 +68,7 @@ def remove(path: str) -> None:
 
 
 def handle(caught: int) -> None:
-    """Sets the handler. System calls go on after it: a compiler inside a driver would take a short reading for an
-    error."""
+    """Sets the handler. System calls go on after it: a compiler inside a driver would take a short reading for an error."""
     signal.signal(caught, answer)
     if hasattr(signal, "siginterrupt"):
         signal.siginterrupt(caught, False)

@@ -147,8 +147,7 @@ def simulate(
     title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
-    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by
-    ``peak``."""
+    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by ``peak``."""
     rng = np.random.default_rng(options.seed)
     protocol = options.protocol
     shutter = protocol.shutter(options.readout_axis, options.readout_direction)
@@ -287,7 +286,7 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom by name in the scanner's box, with ``size`` voxels per side. Closed forms are integrated exactly;
+    """A phantom in the scanner's box, with ``size`` voxels per side. Closed forms are integrated exactly;
     procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
     ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
@@ -317,8 +316,7 @@ def volume_scene(
     pixel_samples: int = 1,
 ) -> Scene:
     """A volume, called ``name``, projected at its own resolution by ``pixel_samples``² rays per pixel. A bare array is
-    fitted into the scanner's box, its values attenuation per half of the longest side; one with a grid keeps it and
-    1/mm."""
+    fitted into the scanner's box, its values attenuation per half of the longest side; one with a grid keeps it and 1/mm."""
     volume, fine = loaded.volume, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))

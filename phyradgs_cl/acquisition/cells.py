@@ -94,7 +94,7 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Poses (lines, 12) in the middle of each line's exposure, of the nearest cell; (1, 12) of one cell. InputError
+        """Poses (lines, 12) in mid-exposure of each line, of the nearest cell; (1, 12) of one cell. InputError
         for a line without a cell."""
         if self.count == 1:
             return self.pose
@@ -204,8 +204,7 @@ def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
     """``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md) and every line
-    integrates over its own window. A gantry at rest, or a frame that takes no time, gives the one cell of
-    ``static_cells``."""
+    integrates over its own window. A gantry at rest, or no time, gives the cell of ``static_cells``."""
     if segments < 1:
         raise InputError("segments", str(segments), "at least 1")
     first_s, last_s = shutter.lit_span_s
@@ -217,23 +216,14 @@ def exact_cells(
     kept = np.flatnonzero(served.any(axis=1))
     middle_s = start_s + (edges_s[:-1] + edges_s[1:])[kept] / 2
     line_start = served[kept].argmax(axis=1)
-    line_stop = lines - served[kept, ::-1].argmax(axis=1)
     order = np.argsort(line_start, kind="stable")
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[kept][order]
-    pose, end_poses = trajectory.pose(frame, middle_s[order]), trajectory.pose(frame, ends_s)
-    if np.all(end_poses == pose[0]) and np.all(pose == pose[0]):
+    ends = line_start, lines - served[kept, ::-1].argmax(axis=1)
+    table = _table(trajectory, shutter, frame, middle_s, *ends, np.ones(kept.size), lines)
+    end_poses = trajectory.pose(frame, ends_s)
+    if np.all(end_poses == table.pose[0]) and np.all(table.pose == table.pose[0]):
         return static_cells(trajectory, shutter, frame, start_s, lines)
-    return TimeCells(
-        pose=pose,
-        time_s=middle_s[order],
-        line_start=line_start[order].astype(np.int32),
-        line_stop=line_stop[order].astype(np.int32),
-        weight=np.ones(order.size),
-        lines=lines,
-        axis=shutter.axis,
-        end_poses=end_poses,
-        line_times=times[kept][order],
-    )
+    return replace(table, end_poses=end_poses, line_times=times[kept][order])
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:

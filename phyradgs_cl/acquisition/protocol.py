@@ -14,8 +14,8 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True)
 class Protocol:
-    """A full turn of ``views`` frames at constant speed, each exposing ``exposure_deg`` in 1 s (paper, section 3.1);
-    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in shares of the exposure; None
+    """``views`` frames of a turn at constant speed, each exposing ``exposure_deg`` in 1 s (paper, section 3.1);
+    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on (start, length) in shares of the exposure; None
     always."""
 
     views: int = 25

@@ -104,8 +104,7 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """InputError for a trajectory that ends before the last frame's window, or an exposure too short for the scan's
-        times."""
+        """InputError for a trajectory that ends before the last frame's window, an exposure too short for its times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):

@@ -112,8 +112,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Line ranges [start, stop) of the strips, as they are read; may be empty. Line r (in reading order) is in
-        floor(r·M/H)."""
+        """[start, stop) of the strips, as they are read; may be empty. Line r (in reading order) is in floor(r·M/H)."""
         edges = [-(-strip * lines // strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

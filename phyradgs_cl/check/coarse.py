@@ -31,9 +31,8 @@ FINE = Level(32, 1.0)
 
 
 def coarse(scan: Scan, level: Level) -> Scan:
-    """The scan with at most 60 frames, spread evenly, its pixels averaged in blocks, and a grid to match; no reference.
-    Rows and columns that fill no block are left out at the far end; a block of lines opens when its lines do on
-    average."""
+    """The scan with at most 60 frames, spread evenly, its pixels averaged in blocks, and a grid to match; no reference. Rows
+    and columns that fill no block are left out at the far end; a block of lines opens when its lines do on average."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / level.columns), shape[0], max(1, shape[1] // _KEPT_COLUMNS))
     small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), _SMOOTH * block), block)
@@ -102,7 +101,7 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: ConeGeometry, voxels: float) -> Grid:
-    """The same box and a voxel around it, in cubes (nearly) that are a pixel at the axis over ``voxels`` wide, never
+    """The same box and a voxel around it, in cubes (nearly) of a pixel at the axis over ``voxels`` wide, never
     finer than the scan's own."""
     pixel_mm = min(geometry.pixel_size_mm) / geometry.magnification
     wanted_mm = max(pixel_mm / voxels, max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))

@@ -54,9 +54,8 @@ def check(
     counts: CountReader | None = None,
     report: Callable[[int, int, str], None] = lambda done, total, question: None,
 ) -> CheckResult:
-    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was. ``report`` gets
-    how many questions are answered, of how many, and the next. InputError: every pixel masked; NaN or infinity
-    elsewhere."""
+    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was. ``report`` gets how
+    many questions are answered, of how many, and the next. InputError: every pixel masked; NaN or infinity elsewhere."""
     scan = prepared(_usable(scan), InputOptions())
     asks_readout = scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0
     asks_exposure = scan.shutter.exposure_s > 0
@@ -114,7 +113,7 @@ def _looks_alike(question: str) -> Finding:
 def _turning(
     rt: Runtime, quick: Scan, add: Callable[[Finding], Finding], sees_angles: bool
 ) -> tuple[bool, Offset, Finding]:
-    """(whether the gantry turns the other way, where its axis is on the panel, what was found about the axis); a panel
+    """(does the gantry turn the other way, where is its axis on the panel, what was found about that); a panel
     of few columns says neither."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         add(too_narrow(SIGN, "standard errors"))

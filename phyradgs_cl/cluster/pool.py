@@ -1,5 +1,4 @@
-"""Runs shared out over Dask's workers: no more than there are devices, so that a run that kills workers takes no other
-along."""
+"""Runs shared out over Dask's workers, no more than there are devices, and a run that kills workers takes no other along."""
 
 import asyncio
 import logging
@@ -78,8 +77,7 @@ class Pool:
         look: Callable[[PoolState], None] = lambda state: None,
     ) -> Iterator[tuple[str, Any]]:
         """(name, ``function(argument)`` or Lost) of every argument once, as they come; ``look`` is called some times a
-        second. An exception of ``function`` is raised here, the other runs given up. InputError when the scheduler goes
-        away."""
+        second. An exception of ``function`` is raised here and ends the others. InputError when the scheduler goes away."""
         waiting, running = deque(arguments), dict[Any, str]()
         seen_s, revivals = time.monotonic(), 0
         try:

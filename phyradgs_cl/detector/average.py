@@ -36,9 +36,8 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
 def intensity_average(
     p: Iterable[np.ndarray], weights: Iterable[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """−ln Σ w exp(−p) over S times, and each time's share w exp(−p) / Σ w exp(−p), without overflow. p: S arrays, of
-    the result's precision. weights: S numbers or arrays that broadcast with them, sum 1; where all are 0, so are both
-    results."""
+    """−ln Σ w exp(−p) over S times, and each time's share w exp(−p) / Σ w exp(−p), without overflow. p: S arrays of the
+    result's precision. weights: S numbers or arrays that broadcast, sum 1; where all are 0, so are both results."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # of the brightest time
     least = np.where(np.isfinite(least), least, 0)

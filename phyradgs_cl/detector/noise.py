@@ -23,8 +23,7 @@ COUNT_FLOOR = 0.5
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:
-    """Expected counts dose · exp(-p/m) of p (F, v, u), and the scale m: the scan's largest line integral, of an empty
-    scan 1."""
+    """Expected counts dose · exp(-p/m) of p (F, v, u), and the scale m: its largest value, of an empty scan 1."""
     p = np.asarray(line_integrals, dtype=np.float64)
     largest = float(p.max(initial=0.0))
     scale = largest if largest > 0 else 1.0
@@ -85,9 +84,8 @@ def beer_lambert_noise(
     light: ArrayLike = 1.0,
     lag: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Noisy line integrals -ln(counts/dose), counts clamped at `COUNT_FLOOR`; negatives are kept, else air would
-    attenuate. Arguments, result and errors as in `tigre_noise`. Lag λ mixes the photons of successive frames;
-    electronic noise comes after it."""
+    """-ln(counts/dose), counts clamped at `COUNT_FLOOR`; negatives are kept, else air would attenuate. Arguments, result and
+    errors as in `tigre_noise`. Lag λ mixes the photons of successive frames; electronic noise comes after it."""
     _check(line_integrals, dose, electronic_noise)
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)

@@ -1,5 +1,4 @@
-"""A TIFF stack as ImageJ writes it: a page per slice from the lowest up, row 0 the smallest y; sizes in mm, its origin
-in pixels."""
+"""TIFF as ImageJ writes it: a page per slice from the lowest up, row 0 the smallest y; sizes in mm, its origin in pixels."""
 
 from pathlib import Path
 

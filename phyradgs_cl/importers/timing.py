@@ -103,12 +103,9 @@ def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: 
 
 def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray) -> None:
     if shutter.exposure_s <= 0:
-        raise InputError(
-            f"{culprit} exposure",
-            "none, with a gantry that does not stop",
-            "a time above 0 s",
-            f"say {option_name('exposure_s')}, or leave the frame time out for frames taken at rest",
-        )
+        found = "none, with a gantry that does not stop"
+        remedy = f"say {option_name('exposure_s')}, or leave the frame time out for frames taken at rest"
+        raise InputError(f"{culprit} exposure", found, "a time above 0 s", remedy)
     checks.finite(f"{culprit} start times", start_s)
     if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):
         found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"

@@ -26,8 +26,7 @@ _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part$")
 
 def check_writable(path: str | Path) -> None:
     """Raise OutputError now if ``path`` could not be written later: makes, and removes, an empty file in its folder."""
-    temporary = _create_beside(_target(path))
-    _remove(temporary)
+    _remove(_create_beside(_target(path)))
 
 
 def make_folder(folder: Path, culprit: Path) -> None:
@@ -41,9 +40,8 @@ def make_folder(folder: Path, culprit: Path) -> None:
 
 @contextmanager
 def written_beside(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the target's folder that replaces the target on success, in one step. The body only
-    writes: its system errors become OutputError about ``path``. Whatever goes wrong, an existing target keeps its
-    content."""
+    """Yield a temporary path in the target's folder that replaces the target on success, in one step. The body only writes:
+    its system errors become OutputError about ``path``. Whatever goes wrong, an existing target keeps its content."""
     target = _target(path)
     temporary = _create_beside(target)
     try:
@@ -93,12 +91,9 @@ def _create_beside(target: Path) -> Path:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
         signals.unfinished.discard(str(temporary))
-        raise OutputError(
-            str(target),
-            f"{error.strerror or error} in folder {target.parent}",
-            "a folder that can be written",
-            "choose another folder or change its permissions",
-        ) from error
+        found = f"{error.strerror or error} in folder {target.parent}"
+        remedy = "choose another folder or change its permissions"
+        raise OutputError(str(target), found, "a folder that can be written", remedy) from error
     return temporary
 
 

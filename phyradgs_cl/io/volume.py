@@ -35,9 +35,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class StoredVolume:
-    """Volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what its file has beside it: ``provenance`` of the kinds
-    that ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name; None where there are
-    none."""
+    """Volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what its file has beside it: ``provenance`` of the kinds that
+    ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name; None where there are none."""
 
     volume: np.ndarray
     grid: Grid
@@ -154,8 +153,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def file_kind(path: str | Path) -> str:
-    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume); InputError if none of
-    them."""
+    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume); InputError if none of them."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"

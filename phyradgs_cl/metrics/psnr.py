@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError
 def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
     """10 · log10(data_range² / mean squared error) in dB, over all voxels, without clipping; infinity for equals.
 
-    ``data_range``: by default the reference's maximum. Raises InputError for shapes that differ, NaN or infinity, a range
+    ``data_range``: by default the reference's maximum. InputError: shapes that differ, NaN or infinity, a range
     that is not positive.
     """
     a, b, peak = checked_pair(result, reference, data_range)

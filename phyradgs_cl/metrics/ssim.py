@@ -20,8 +20,7 @@ _VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size live at onc
 
 
 def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """Mean structural similarity, at most 1, of the slices of a volume (z, y, x); those whose truth is zero do not
-    count.
+    """Mean structural similarity, at most 1, of the slices of a volume (z, y, x); those whose truth is zero do not count.
 
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for what is
     not 3D, shapes that differ, NaN or infinity, a range that is not positive.

@@ -1,9 +1,7 @@
-"""Phantoms: objects whose attenuation is known, for simulations and for truth to compare with; `make_phantom` is the
-door.
+"""Phantoms: objects whose attenuation is known, for simulations and for truth to compare with; `make_phantom` is the door.
 
 All have `name`, `kind` and `voxelise(grid)`; an "analytic" one also `line_integrals(source, target)` in closed form, a
-"voxel" one `volume` and `grid`. Attenuation scales with 1 / half-size, so that line integrals do not depend on the
-size.
+"voxel" one `volume` and `grid`. Attenuation scales with 1 / half-size, so that line integrals do not depend on the size.
 """
 
 from collections.abc import Callable

@@ -26,8 +26,7 @@ class VoxelPhantom:
         object.__setattr__(self, "volume", np.ascontiguousarray(self.volume, dtype=np.float32))
 
     def voxelise(self, grid: Grid, supersampling: int = 1) -> NDArray[np.float32]:
-        """The volume (nz, ny, nx) itself, the analytic phantoms' counterpart; InputError for another grid: nothing is
-        resampled."""
+        """The volume (nz, ny, nx) itself,  InputError for another grid: nothing is resampled."""
         if grid != self.grid:
             remedy = "make the phantom at this resolution and size"
             raise InputError(f"grid for phantom {self.name}", str(grid), str(self.grid), remedy)

@@ -43,8 +43,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Four digits at most, powers of ten only where they save zeros; a millionth of ``resolution`` or less is 0,
-    rounded."""
+    """Four digits at most, powers of ten only where they save zeros; a millionth of ``resolution`` or less is 0, rounded."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

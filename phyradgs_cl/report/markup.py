@@ -14,9 +14,8 @@ VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """``<name attributes>children</name>``; children and attribute values that are no Markup are escaped. Attributes
-    that are None or False are left out, True has no value; underscores in names become dashes, one at the end goes
-    (``class_``)."""
+    """``<name attributes>children</name>``; what is no Markup is escaped. Attributes that are None or False are left out,
+    True has no value; underscores in names become dashes, one at the end goes (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
     if name in VOID:
         return Markup(opening)

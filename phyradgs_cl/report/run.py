@@ -24,9 +24,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction with what is known about it. scan, scan_path, scan_facts: its scan, on the volume's grid, where
-    found. reference (nz, ny, nx) 1/mm: the truth on that. metrics: numbers by name. notes: what a reader should know
-    about the page itself."""
+    """A reconstruction and what is known of it. scan, scan_path, scan_facts: its scan, on the volume's grid, where found.
+    reference (nz, ny, nx) 1/mm: the truth on that. metrics: by name. notes: what to know about the page itself."""
 
     path: Path
     stored: StoredVolume

@@ -1,5 +1,4 @@
-"""NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from
-options.
+"""NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from options.
 
 The format does not say which row is on top: row 0 is taken as the lowest, and this is said, after flips that the file
 declares in either of the nxtomo package's ways. The rotation axis's column becomes a detector offset.

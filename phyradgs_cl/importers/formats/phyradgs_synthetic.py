@@ -1,5 +1,4 @@
-"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame where its first and last line began and
-ended.
+"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame where its first and last line began and ended.
 
 The exposure takes ``exposure_s`` (1 s unless given); the gantry turns at the speed that makes the exposure's arc of it.
 """

@@ -50,9 +50,8 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Poses (T, 12) at frame positions (T,), numbers between and beyond frames by straight lines. ``origin_mm``
-        (2,): place (u, v) of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and
-        row to row."""
+        """Poses (T, 12) at frame positions (T,), straight lines between and beyond frames. ``origin_mm`` (2,): place (u, v)
+        of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to row."""
         at = {
             name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
         }

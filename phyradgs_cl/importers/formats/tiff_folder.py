@@ -1,7 +1,6 @@
 """A folder of TIFF frames and one TOML that says what they are, where things stood and when they were taken.
 
-Its tables are a scanner file's, and [frames], [angles], [timing]. Row 0 is the top, column 0 the left, seen from the
-source.
+Its tables are a scanner file's, and [frames], [angles], [timing]. Row 0 is the top, column 0 the left, seen from the source.
 """
 
 from dataclasses import replace

@@ -1,8 +1,7 @@
 """Pickles without trust: the standard library's unpickler, with an allow-list in place of whatever a file names.
 
 What a name stands for is a function of this module that neither allocates by a number in the file nor takes a state
-unchecked. The unpickler is the one in Python: that in C hashes keys before anyone looks, and equal hashes keep it for
-hours.
+unchecked. The unpickler is the one in Python: that in C hashes keys before anyone looks, and equal hashes keep it for hours.
 """
 
 import io

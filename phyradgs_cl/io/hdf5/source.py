@@ -80,9 +80,8 @@ class Hdf5Source:
 
     def root_groups(self) -> list[str]:
         """Addresses of the groups at the root that are in this file and no mere links."""
-        names = [
-            name for name in self.file if isinstance(self._link(self.file, name, "/", False), h5py.HardLink)
-        ]
+        links = {name: self._link(self.file, name, "/", False) for name in self.file}
+        names = [name for name, link in links.items() if isinstance(link, h5py.HardLink)]
         return [f"/{name}" for name in names if isinstance(self.find(f"/{name}"), h5py.Group)]
 
     def group(self, address: str) -> h5py.Group:
@@ -130,10 +129,8 @@ class Hdf5Source:
     def near_miss(self, parent: str, name: str, cutoff: float = 0.6) -> str:
         """What to do about a name that is nearly ``name`` and means nothing else; "" if there is none."""
         group = self.find(parent)
-        strangers = (
-            [n for n in group if n != name and n not in _KNOWN] if isinstance(group, h5py.Group) else []
-        )
-        by_lower = {n.lower(): n for n in strangers}
+        names = group if isinstance(group, h5py.Group) else ()
+        by_lower = {n.lower(): n for n in names if n != name and n not in _KNOWN}
         close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
         return f"rename {by_lower[close[0]]!r} to {name!r}" if close else ""
 

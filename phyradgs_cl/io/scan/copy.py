@@ -26,11 +26,8 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:
             entry = file[header.entry]
-            extra = (
-                entry[schema.EXTRA]
-                if schema.EXTRA in entry
-                else new_group(entry, schema.EXTRA, "NXcollection")
-            )
+            there = schema.EXTRA in entry
+            extra = entry[schema.EXTRA] if there else new_group(entry, schema.EXTRA, "NXcollection")
             _replace(extra, "detector_offset", np.array([offset_v_mm, offset_u_mm + shift_u_mm]))
             if table is not None:
                 step = table[:, 6:9]

@@ -54,10 +54,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
-    counts = {
-        name: int(np.count_nonzero(key == number))
-        for number, name in enumerate(("projections", "flats", "darks", "invalid"))
-    }
+    kinds = ("projections", "flats", "darks", "invalid")
+    counts = {name: int(np.count_nonzero(key == number)) for number, name in enumerate(kinds)}
     return {
         "title": scan.title,
         **counts,
@@ -89,9 +87,7 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
     }
     if isinstance(scan.trajectory, CircularOrbit):
         orbit, last = scan.trajectory, scan.frames - 1
-        ends = [
-            float(orbit.angle_rad(frame, scan.frame_start_s[frame : frame + 1])[0]) for frame in (0, last)
-        ]
+        ends = [float(orbit.angle_rad(f, scan.frame_start_s[f : f + 1])[0]) for f in (0, last)]
         facts["first_angle_deg"], facts["last_angle_deg"] = np.rad2deg(ends).tolist()
     if scan.is_fly and isinstance(scan.trajectory, CircularOrbit):
         marks_s = scan.frame_start_s[0] + np.array([0.0, shutter.exposure_s, shutter.span_s])
@@ -136,10 +132,8 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
     values = read_values(source, address, source.dataset(address))
     checks.finite(source.name(address), values)
     if values.max() <= 0:
-        found, expected = (
-            f"no voxel above 0 (the largest is {values.max() + 0.0:g})", "a truth to compare with"
-        )
-        raise source.error(address, found, expected, "take the reference out of the file")
+        found = f"no voxel above 0 (the largest is {values.max() + 0.0:g})"
+        raise source.error(address, found, "a truth to compare with", "take the reference out of the file")
     return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 

@@ -40,9 +40,8 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation: PNGs in base64 (``layers``) of ``indices`` among ``count``. first_mm, step_mm:
-    centre of slice 0 and the way to the next. size_mm: (width, height). still: the middle slice as seen without a
-    script, a PNG."""
+    """The slices of one orientation: PNGs in base64 (``layers``) of ``indices`` among ``count``. first_mm, step_mm: centre
+    of slice 0 and the way to the next. size_mm: (width, height). still: the middle slice as seen without a script, a PNG."""
 
     name: str
     axis: str

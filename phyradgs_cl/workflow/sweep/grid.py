@@ -65,9 +65,8 @@ class SweepGrid:
 
 
 def read_grid(document: Table, path: Path) -> SweepGrid:
-    """The content of GRID.toml as scans, settings and seeds; patterns start at the folder of ``path``. InputError for
-    whatever a run would stumble over: unknown keys, values out of range, patterns that match nothing, files that are no
-    scans."""
+    """GRID.toml as scans, settings and seeds; patterns start at the folder of ``path``. InputError for whatever a run would
+    stumble over: unknown keys, values out of range, patterns that match nothing, files that are no scans."""
     refuse_unknown(f"{path}:", document, _KEYS)
     settings = _settings(document, path)
     seeds = _seeds(document.get("seeds", [0]), path)

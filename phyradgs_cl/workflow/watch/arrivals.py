@@ -1,5 +1,4 @@
-"""Which files of a folder are complete, by looking again and again: network file systems send no notices of others'
-writes."""
+"""Which files of a folder are complete, by looking again: network file systems send no notice of others' writes."""
 
 import os
 import stat

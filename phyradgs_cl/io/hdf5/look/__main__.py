@@ -1,8 +1,7 @@
 """Looks at one HDF5 file within limits: python FOLDER FILE SMALL_BYTES MOST_OBJECTS MEMORY_BYTES CPU_SECONDS SECONDS.
 
-Opens every object, reads every attribute and every dataset of at most SMALL_BYTES. Ends with status 0, with LARGE where
-that took more memory than headers need, or by the signal of a limit or a crash. Imports nothing of phyradgs_cl, and
-nothing slow.
+Opens every object, reads every attribute and every dataset of at most SMALL_BYTES. Ends with status 0, with LARGE where that
+took more memory than headers need, or by the signal of a limit or a crash. Imports nothing of phyradgs_cl, and nothing slow.
 """
 
 import signal
