@@ -107,9 +107,7 @@ def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
 
 def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
-    if path is None:
-        return {}
-    return read_toml(path, f"{option} {path}")
+    return {} if path is None else read_toml(path, f"{option} {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:

@@ -80,6 +80,12 @@ class Scan:
         return len(self.projections)
 
     @property
+    def valid(self) -> np.ndarray:
+        """Which pixels may be used, bool (F, nv, nu): a view."""
+        unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
+        return np.broadcast_to(unmasked, self.projections.shape)
+
+    @property
     def lines(self) -> int:
         return self.shutter.lines(self.geometry.detector_shape)
 

@@ -47,7 +47,7 @@ def smooth(scan: Scan, pixels: float) -> Scan:
     p = np.asarray(scan.projections, np.float32)
     if scan.pixel_mask is None:
         return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
-    valid = np.broadcast_to(np.asarray(scan.pixel_mask) == 0, p.shape).astype(np.float32)
+    valid = scan.valid.astype(np.float32)
     weight = gaussian_filter(valid, sigma, truncate=3)
     mean = gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6)
     return replace(scan, projections=mean)
@@ -79,10 +79,9 @@ def binned(scan: Scan, block: int) -> Scan:
     rows, columns = (n // block for n in scan.geometry.detector_shape)
     if block == 1:
         return replace(scan, reference=None)
-    valid = np.ones(scan.geometry.detector_shape, bool) if scan.pixel_mask is None else scan.pixel_mask == 0
     shape = (scan.frames, rows, block, columns, block)
     inside = (slice(None), slice(rows * block), slice(columns * block))
-    weight = np.broadcast_to(valid, scan.projections.shape)[inside].reshape(shape)
+    weight = scan.valid[inside].reshape(shape)
     values = np.asarray(scan.projections)[inside].reshape(shape)
     share = weight.mean((2, 4))
     mean = (values * weight).mean((2, 4)) / np.where(share > 0, share, 1.0)

@@ -136,13 +136,12 @@ def _turning(
 def _usable(scan: Scan) -> Scan:
     """The scan with zeros for masked values that are not finite."""
     p = np.asarray(scan.projections)
-    valid = np.broadcast_to(True if scan.pixel_mask is None else np.asarray(scan.pixel_mask) == 0, p.shape)
-    if not valid.any():
+    if not scan.valid.any():
         raise InputError("pixel_mask", "every pixel masked", "pixels that say something", "check the mask")
     finite = np.isfinite(p)
     if finite.all():
         return scan
-    checks.finite("projections", p[valid])
+    checks.finite("projections", p[scan.valid])
     return replace(scan, projections=np.where(finite, p, 0).astype(np.float32))
 
 

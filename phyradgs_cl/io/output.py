@@ -123,10 +123,8 @@ def _is_dead(process: int) -> bool:
         return False
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    except OSError:  # somebody else's
-        return False
+    except OSError as error:
+        return isinstance(error, ProcessLookupError)  # others say that it is somebody else's
     return False
 
 

@@ -17,9 +17,7 @@ def element(name: str, /, *children: object, **attributes: object) -> Markup:
     """``<name attributes>children</name>``; what is no Markup is escaped. Attributes that are None or False are left out,
     True has no value; underscores in names become dashes, one at the end goes (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
-    if name in VOID:
-        return Markup(opening)
-    return Markup(f"{opening}{joined(*children)}</{name}>")
+    return Markup(opening) if name in VOID else Markup(f"{opening}{joined(*children)}</{name}>")
 
 
 def joined(*children: object) -> Markup:

@@ -55,7 +55,8 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
     better. Rotation and shift have questions of their own: the best of these is what other causes (an order or step of
     angles, a size of pixels) have to halve. Frames that stand out are left out first."""
     everything = np.arange(scan.frames)
-    if scan.frames < _FEWEST_FRAMES or _pixels(scan) < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
+    pixels = float(scan.valid.sum()) / scan.frames
+    if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
         return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
     kept, notes = _without_odd(scan)
@@ -87,12 +88,6 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
         return Consistency(_finding(SUSPICIOUS, share, "; ".join([*notes, text]), advice), kept, False, True)
     finding = _finding(SUSPICIOUS if notes else OK, share, "; ".join([*notes, text]), _about(notes))
     return Consistency(finding, kept, True, True)
-
-
-def _pixels(scan: Scan) -> float:
-    """How many pixels of a frame may be used, on average."""
-    pixels = scan.projections[0].size
-    return pixels if scan.pixel_mask is None else float((np.asarray(scan.pixel_mask) == 0).mean()) * pixels
 
 
 def _finding(verdict: str, share: float, text: str, advice: str) -> Finding:

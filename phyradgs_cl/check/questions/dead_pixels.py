@@ -26,7 +26,7 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     than ten of the panel's usual deviations from the median of 3 × 3 pixels; near the axis, where small parts of the object
     stand still on the panel, it has to be sharper than these.
     """
-    known = _masked(scan)
+    known = ~scan.valid.any(0)
     if scan.frames < _LEAST_FRAMES:
         text = f"fewer than {_LEAST_FRAMES} frames"
         finding = Finding(_QUESTION, CANNOT_TELL, 0.0, _SHARE, "share of pixels", text)
@@ -44,14 +44,6 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     text += f", the first at row {row}, column {column}"
     advice = "add them to pixel_mask: phyradgs reconstruct then leaves them out"
     return Finding(_QUESTION, SUSPICIOUS, share, _SHARE, "share of pixels", text, advice), dead
-
-
-def _masked(scan: Scan) -> np.ndarray:
-    """Pixels (v, u) that are masked in every frame."""
-    if scan.pixel_mask is None:
-        return np.zeros(scan.geometry.detector_shape, bool)
-    mask = np.asarray(scan.pixel_mask) != 0
-    return mask if mask.ndim == 2 else mask.all(0)
 
 
 def _constant(frames: np.ndarray) -> np.ndarray:

@@ -44,7 +44,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
     if scan.saturation is not None and scan.saturation.share > _SHARE:
         return _clipped(scan.saturation, "lower the exposure; the import has masked these pixels, or taken them as air")
     p = np.asarray(scan.projections)
-    masked = np.broadcast_to(False if scan.pixel_mask is None else scan.pixel_mask != 0, p.shape)
+    masked = ~scan.valid
     cliffs = _cliffs(p, masked)
     if cliffs > _CLIFFS:
         text = f"from a pixel to the next {100 * cliffs:.3g} % go from brightest to darkest"

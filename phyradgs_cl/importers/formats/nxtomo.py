@@ -155,9 +155,8 @@ def _motion(
     if not sweeps:
         return timing, turning(geometry, angle, timing)
     last = sign * h5.read_array(source, f"{sample}/rotation_angle_end", used.shape, ANGLE)[used]
-    return timing, CircularOrbit(
-        geometry, FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
-    )
+    sweep = FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
+    return timing, CircularOrbit(geometry, sweep)
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:

@@ -127,11 +127,11 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
 
 
 def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTiming:
-    exposure_s = timing.number("exposure_s") if timing.has("exposure_s") else None
-    readout_s = timing.number("readout_s") if timing.has("readout_s") else None
+    names = ("exposure_s", "readout_s")
+    exposure_s, readout_s = (timing.number(name) if timing.has(name) else None for name in names)
     if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
         readout_s = scanner.readout_ratio * exposure_s
-    written = [timing.name(key) for key in ("exposure_s", "readout_s") if timing.has(key)]
+    written = [timing.name(key) for key in names if timing.has(key)]
     return StoredTiming(
         exposure_s=exposure_s,
         readout_s=readout_s,

@@ -50,6 +50,8 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
+    model, told = (f"{entry}/{schema.EXTRA}/{name}" for name in ("detector_model", "provenance"))
+    has_model, has_told = source.optional(model) is not None, source.optional(told) is not None
     scan = Scan(
         projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])),
         geometry=geometry,
@@ -58,9 +60,9 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         frame_start_s=start_s,
         grid=grid,
         is_fly=is_fly,
-        detector_model=_read_model(source, entry),
+        detector_model=read_word(source, model, DETECTOR_MODELS) if has_model else "log",
         title=read_title(source, f"{entry}/title", "cone-beam scan"),
-        provenance=_read_provenance(source, entry),
+        provenance=read_facts(source.name(told), read_word(source, told), {}) if has_told else {},
         lag=_read_lag(source, entry),
         saturation=_read_saturation(source, entry),
     )
@@ -101,13 +103,6 @@ def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry)
     return grid, False
 
 
-def _read_model(source: Hdf5Source, entry: str) -> str:
-    address = f"{entry}/{schema.EXTRA}/detector_model"
-    if source.optional(address) is None:
-        return "log"
-    return read_word(source, address, DETECTOR_MODELS)
-
-
 def _read_lag(source: Hdf5Source, entry: str) -> float:
     address = f"{entry}/{schema.EXTRA}/lag"
     if source.optional(address) is None:
@@ -124,13 +119,6 @@ def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
     found = Saturation(read_number(source, level), read_number(source, share))
     checks.within(source.name(share), found.share, 0, 1)
     return found
-
-
-def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
-    address = f"{entry}/{schema.EXTRA}/provenance"
-    if source.optional(address) is None:
-        return {}
-    return read_facts(source.name(address), read_word(source, address), {})
 
 
 def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:

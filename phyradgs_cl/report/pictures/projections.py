@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition import PerRow
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.report.run import Run
@@ -58,17 +58,10 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
         computed = computed - operator.intensity_gap(run.stored.volume)
     views = []
     for frame, image in zip(chosen, computed, strict=True):
-        valid = _valid(scan, frame)
+        valid = scan.valid[frame]
         measured = np.where(valid, scan.projections[frame], 0).astype(np.float32)
         views.append(View(frame, measured, np.where(valid, image, 0).astype(np.float32), valid))
     return views
-
-
-def _valid(scan: Scan, frame: int) -> NDArray[np.bool_]:
-    if scan.pixel_mask is None:
-        return np.ones(scan.geometry.detector_shape, bool)
-    mask = np.asarray(scan.pixel_mask)
-    return (mask if mask.ndim == 2 else mask[frame]) == 0
 
 
 def _rms(values: NDArray[np.floating]) -> float:
