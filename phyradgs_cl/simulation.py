@@ -9,7 +9,7 @@ from typing import Protocol as Interface
 import numpy as np
 
 from phyradgs_cl import __version__, checks
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, make_protocol, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
@@ -176,8 +176,10 @@ def simulate(
         report(frame + 1, protocol.views)
     if frames.max() <= 0:
         log.warning("no ray meets anything that attenuates: all %d frames are empty", protocol.views)
+    share = shutter.readout.spread(shutter.lit_share(lines))
+    recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
-        projections=_recorded(frames, options, shutter, rng),
+        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # lines without light are masked
         geometry=geometry,
         trajectory=trajectory,
         shutter=shutter,
@@ -352,19 +354,10 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
-def _recorded(
-    frames: np.ndarray, options: SimulationOptions, shutter: Shutter, rng: np.random.Generator
-) -> np.ndarray:
-    """What the panel shows of frames (F, v, u): light, noise and lag; lines without light are 0 (and masked)."""
-    share = shutter.readout.spread(shutter.lit_share(shutter.lines(frames.shape[1:])))
-    recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
-    return recorded if np.all(share > 0) else recorded * (share > 0)
-
-
 def _with_noise(
     frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """TIGRE's counts are no real intensities, so there the lag comes first; photons are mixed by the panel itself."""
+    """What the panel shows of frames (F, v, u): TIGRE's counts are no real intensities, so there the lag comes first."""
     if options.noise == "beer":
         return beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:

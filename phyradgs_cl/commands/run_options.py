@@ -121,13 +121,9 @@ def _signature(command: Callable[..., None], names: list[str]) -> inspect.Signat
     parameters: list[inspect.Parameter] = []
     for own in inspect.signature(command, eval_str=True).parameters.values():
         if own.name == "request":
-            parameters += [_parameter(name) for name in names]
+            for name in names:
+                default = False if get_args(kind := RUN_OPTIONS[name])[0] is bool else None
+                parameters.append(inspect.Parameter(name, own.KEYWORD_ONLY, default=default, annotation=kind))
         else:
-            parameters.append(own.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            parameters.append(own.replace(kind=own.KEYWORD_ONLY))
     return inspect.Signature(parameters)
-
-
-def _parameter(name: str) -> inspect.Parameter:
-    annotation = RUN_OPTIONS[name]
-    default = False if get_args(annotation)[0] is bool else None
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

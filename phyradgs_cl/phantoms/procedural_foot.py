@@ -61,7 +61,9 @@ def foot(grid_shape: int, seed: int) -> Field:
     `seed` gives the same foot at every resolution; InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
-    bones, toes = _bones(rng), _toes(rng)
+    bones = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
+    bones += [_long_bone(base, head, 0.046 * thickness, rng) for base, head, thickness, _ in _RAYS]
+    toes = [bone for _, head, thickness, z in _RAYS for bone in _toe(head, thickness, z, rng)]
     lattice = Lattice(int(grid_shape))
     ripple = np.float32(0.004) * texture(lattice, (0.15, 0.4), 48, rng)
     grain = texture(lattice, (0.035, 0.09), 160, rng)
@@ -71,15 +73,6 @@ def foot(grid_shape: int, seed: int) -> Field:
     for bone in bones + toes:
         _add_bone(volume, lattice, bone, ripple, grain)
     return volume
-
-
-def _bones(rng: np.random.Generator) -> list[Bone]:
-    tarsals = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
-    return tarsals + [_long_bone(base, head, 0.046 * thickness, rng) for base, head, thickness, _ in _RAYS]
-
-
-def _toes(rng: np.random.Generator) -> list[Bone]:
-    return [bone for _, head, thickness, z in _RAYS for bone in _toe(head, thickness, z, rng)]
 
 
 def _chain(points: list[tuple[Point, float]], rng: np.random.Generator) -> Bone:

@@ -22,7 +22,8 @@ def element(name: str, /, *children: object, **attributes: object) -> Markup:
 
 def joined(*children: object) -> Markup:
     """Children one after the other, escaped where they are no Markup; None and empty ones add nothing."""
-    return Markup("".join(_escaped(child) for child in children if child is not None))
+    shown = (c if isinstance(c, Markup) else html.escape(_plain(c)) for c in children if c is not None)
+    return Markup("".join(shown))
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
@@ -44,10 +45,6 @@ def _attribute(key: str, value: object) -> str:
         return ""
     name = key.rstrip("_").replace("_", "-")
     return f" {name}" if value is True else f' {name}="{html.escape(_plain(value))}"'
-
-
-def _escaped(child: object) -> str:
-    return child if isinstance(child, Markup) else html.escape(_plain(child))
 
 
 def _plain(value: object) -> str:

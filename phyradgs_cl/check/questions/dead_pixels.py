@@ -53,16 +53,11 @@ def _constant(frames: np.ndarray) -> np.ndarray:
     sides = np.zeros_like(constant)
     sides[:, [0, -1]] = constant[:, [0, -1]]
     if sides[:, [0, -1]].mean() > _STILL_SIDES:
-        air = constant & _as_air(frames[0], sides)
+        level = float(np.median(frames[0][sides]))  # and what flats leave of a pattern about it
+        pattern = _NORMAL_MAD * float(np.median(np.abs(frames[0][sides] - level)))
+        air = constant & (np.abs(frames[0] - level) <= _DEVIATIONS * pattern)
         constant = constant & ~scipy.ndimage.binary_propagation(sides, _AROUND, mask=air)
     return constant & (scipy.ndimage.median_filter(swing, size=3) > 0)
-
-
-def _as_air(frame: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Pixels (v, u) of a frame whose value is one of those at the sides, give or take what flats leave of a pattern."""
-    air = float(np.median(frame[sides]))
-    pattern = _NORMAL_MAD * float(np.median(np.abs(frame[sides] - air)))
-    return np.abs(frame - air) <= _DEVIATIONS * pattern
 
 
 def _apart(frames: np.ndarray) -> np.ndarray:

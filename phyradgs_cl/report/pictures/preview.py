@@ -81,7 +81,10 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
     for axis in range(3):
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
-        slices.append(top_row_first(_resampled(image, [max(1, round(side * per_mm)) for side in size_mm])))
+        shape = [max(1, round(side * per_mm)) for side in size_mm]
+        ends = zip(shape, image.shape, strict=True)  # the nearest pixel everywhere: voxels stay visible as such
+        rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
+        slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] for s in slices) + 2 * _GAP
     picture = np.zeros((height, width), np.uint8)
     left = 0
@@ -98,9 +101,3 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
         return 0.0, high
     low, high = float(volume.min()), float(volume.max())
     return low, high if high > low else low + 1.0
-
-
-def _resampled(image: NDArray[np.uint8], shape: list[int]) -> NDArray[np.uint8]:
-    """The nearest pixel's value at every place: voxels stay visible as such."""
-    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(shape, image.shape, strict=True))
-    return image[rows[:, None], columns]

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, partial_path, written_beside
-from phyradgs_cl.io.output import beside, make_folder
+from phyradgs_cl.io.output import beside
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.watch.arrivals import Arrival
 
-_WORK = ".work"
+WORK = ".work"
 
 
 @dataclass(frozen=True)
@@ -19,13 +19,9 @@ class Results:
 
     folder: Path
 
-    def make_folders(self) -> None:
-        """Raises OutputError where the folder cannot be written."""
-        make_folder(self.folder / _WORK, self.folder)
-
     def sweep_up(self) -> None:
         """Removes what a killed run was writing: nobody else is at work here."""
-        for path in (self.folder / _WORK).glob(".*.part"):
+        for path in (self.folder / WORK).glob(".*.part"):
             with suppress(OSError):
                 path.unlink()
 
@@ -33,7 +29,7 @@ class Results:
         return self.folder / f"{scan.stem}.h5"
 
     def work(self, scan: Path) -> Path:
-        return self.folder / _WORK / f"{scan.stem}.h5"
+        return self.folder / WORK / f"{scan.stem}.h5"
 
     def error(self, scan: Path) -> Path:
         return beside(self.folder / scan.stem, ".error.txt")

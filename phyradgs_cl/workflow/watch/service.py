@@ -9,12 +9,13 @@ from pathlib import Path
 from phyradgs_cl import checks, signals
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError, PhyradgsError
 from phyradgs_cl.io import checkpoint_path, only_run
+from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob, go_on, is_whole
 from phyradgs_cl.workflow.watch.arrivals import Arrival, Arrivals
-from phyradgs_cl.workflow.watch.results import Results
+from phyradgs_cl.workflow.watch.results import WORK, Results
 
 _LOCK = "watch"
 log = logging.getLogger(__name__)
@@ -63,7 +64,7 @@ def run_watch(
     """
     _check_folders(job)
     results = Results(job.output)
-    results.make_folders()
+    make_folder(job.output / WORK, job.output)
     with only_run(job.output / _LOCK):
         results.sweep_up()
         _Watch(job, results, make_runtime, tell, report).run()
