@@ -10,14 +10,9 @@ from phyradgs_cl.text import plain_text
 
 
 class PhyradgsError(Exception):
-    """Base of every error that this package raises on purpose; ``exit_code`` is the command line's status.
-
-    Args:
-        culprit: what is wrong: an option, a file with its HDF5 path, a device.
-        found: the value or state met there.
-        expected: what would have been right.
-        remedy: what the user can do about it, as an imperative.
-    """
+    """Base of every error that this package raises on purpose. culprit: what is wrong: an option, a file with its HDF5
+    path, a device; found: the value or state met there; expected: what would have been right; remedy: what to do about it,
+    as an imperative. ``exit_code``: the command line's status."""
 
     exit_code = 2
 

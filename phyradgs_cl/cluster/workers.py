@@ -13,14 +13,9 @@ _MOST_WORKERS = 1024
 
 @dataclass(frozen=True)
 class Workers:
-    """Where runs are made.
-
-    Args:
-        scheduler: ``local``; else the address of a Dask scheduler (``tcp://host:8786``), or the JSON file that one has
-            written (``dask scheduler --scheduler-file``).
-        count: of local workers; None is one per device.
-        device: what local workers' devices are asked for by, several with commas; others have PHYRADGS_DEVICE.
-    """
+    """Where runs are made. ``scheduler``: ``local``, else the address of a Dask scheduler (``tcp://host:8786``) or its JSON
+    file (``dask scheduler --scheduler-file``). ``count``: of local workers; None is one per device. ``device``: what local
+    workers' devices are asked for by, several with commas; others have PHYRADGS_DEVICE."""
 
     scheduler: str = LOCAL
     count: int | None = None

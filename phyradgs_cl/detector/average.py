@@ -16,10 +16,8 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
     """Line integrals (...) float64 of one exposure from those at several times, p (S, ...).
 
     "log" is their mean (PhyRadGS, Eq. 1), "intensity" what a detector does: it adds photons, P = -ln(sum of w · exp(-p)),
-    without overflow at any p. weight (S,): share of the exposure, not negative, sum 1.
-
-    Raises:
-        InputError: unknown model, shapes that do not fit, weights negative or not adding to 1, NaN.
+    without overflow at any p. weight (S,): share of the exposure, not negative, sum 1. InputError: unknown model, shapes
+    that do not fit, weights negative or not adding to 1, NaN.
     """
     one_of("detector model", model, MODELS)
     values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)

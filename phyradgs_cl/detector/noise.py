@@ -54,20 +54,12 @@ def tigre_noise(
     rng: np.random.Generator,
     light: ArrayLike = 1.0,
 ) -> NDArray[np.float32]:
-    """Noisy line integrals -ln(counts/dose) · m after TIGRE's scaling; negatives become 0.
+    """Noisy line integrals -ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling; negatives become 0.
 
-    Args:
-        line_integrals: (F, v, u), all projections of the scan: m is their maximum.
-        dose: counts of an unattenuated pixel; the published scans have 1e4.
-        electronic_noise: standard deviation in counts; the published scans have 10.
-        rng: source of randomness.
-        light: share of the dose of each pixel, above 0, broadcast to (F, v, u): a pulse may miss part of a line's window.
-
-    Returns:
-        (F, v, u) float32, finite at any dose.
-
-    Raises:
-        InputError: dose not positive, electronic noise negative, line integrals not finite.
+    line_integrals (F, v, u): all projections of the scan, m is their maximum. ``dose``: counts of an unattenuated pixel;
+    ``electronic_noise``: standard deviation in counts; the published scans have 1e4 and 10. ``light``: share of the dose of
+    each pixel, above 0, broadcast to (F, v, u): a pulse may miss part of a line's window. InputError: dose not positive,
+    electronic noise negative, line integrals not finite.
     """
     _check(line_integrals, dose, electronic_noise)
     expected, scale = tigre_counts(line_integrals, dose)

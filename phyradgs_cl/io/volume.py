@@ -60,15 +60,9 @@ def write_volume(
     gaussians: Gaussians | None = None,
     metrics: Mapping[str, object] | None = None,
 ) -> None:
-    """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all.
-
-    ``provenance`` and ``metrics`` are stored as JSON, plain values also as attributes; ``gaussians`` as float32
-    datasets.
-
-    Raises:
-        InputError: a volume that is not finite or does not fit its grid.
-        OutputError: the file cannot be written.
-    """
+    """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all: ``provenance`` and
+    ``metrics`` as JSON, plain values also as attributes; ``gaussians`` as float32. InputError: a volume that is not finite
+    or does not fit its grid. OutputError: the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     with written_beside(path) as temporary, new_hdf5(temporary) as file:
@@ -95,13 +89,9 @@ def read_volume(path: str | Path) -> StoredVolume:
 
 
 def load_volume(path: str | Path) -> LoadedVolume:
-    """The voxels of a volume file, or of a bare 3D dataset `/volume` (z, y, x), without a grid, whose integers are
-    divided by their type's maximum. Negative values are allowed: real reconstructions have them.
-
-    Raises:
-        InputError: whatever is no such file or dataset, NaN or infinity, larger than the file can hold, kept in another
-            file, axes that do not fit; names the file and the dataset.
-    """
+    """The voxels of a volume file, or of a bare 3D dataset `/volume` (z, y, x), without a grid, whose integers are divided
+    by their type's maximum. Negative values are allowed. InputError: no such file or dataset, NaN or infinity, larger than
+    the file can hold, kept in another file, axes that do not fit; names the file and the dataset."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_BARE), h5py.Dataset):
             return LoadedVolume(_read_bare(source), None)
@@ -115,12 +105,8 @@ def load_volume(path: str | Path) -> LoadedVolume:
 def load_attenuation(
     path: str | Path, *, warn: bool = True, load: Callable[[str | Path], LoadedVolume] = load_volume
 ) -> LoadedVolume:
-    """What ``load`` reads, for a volume that rays are to be sent through; a tenth as much below 0 as above is a
-    warning.
-
-    Raises:
-        InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units.
-    """
+    """What ``load`` reads, for a volume that rays are to be sent through; a tenth as much below 0 as above is a warning.
+    InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units."""
     loaded = load(path)
     volume = loaded.volume
     positive = float(np.sum(volume, where=volume > 0, dtype=np.float64))

@@ -24,11 +24,8 @@ def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None,
     """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference. z and y point up.
 
     Grey values run over the truth's range, so that a wrong gain shows; the difference has a scale of its own, symmetric
-    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line.
-
-    Raises:
-        InputError: not 3D, shapes that differ, NaN or infinity.
-        OutputError: the file cannot be written.
+    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line. InputError:
+    not 3D, shapes that differ, NaN or infinity. OutputError: the file cannot be written.
     """
     from matplotlib.figure import Figure  # slow to import, and only figures need it
 

@@ -30,16 +30,11 @@ def write_report(
     scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page ``output`` of a volume file, whole or not at all; returns what was found for it.
-
-    ``scan`` None takes the one that the volume's provenance names, if it is there unchanged; ``views`` frames of it are
-    projected from the volume, on the device of ``make_runtime``, which is not asked without any.
-
-    Raises:
-        InputError: files that cannot be read, or are of another kind; an output that is one of them.
-        OutputError: the page cannot be written.
-        DeviceError: no device to project with.
-    """
+    """Writes the page ``output`` of a volume file, whole or not at all; returns what was found for it. ``scan`` None takes
+    the one that the volume's provenance names, if it is there unchanged; ``views`` frames of it are projected from the
+    volume, on the device of ``make_runtime``, which is not asked without any. InputError: files that cannot be read, or are
+    of another kind; an output that is one of them. OutputError: the page cannot be written. DeviceError: none to project
+    with."""
     check_writable(output)
     run = load_run(volume, scan)
     for path in (volume, run.scan_path):

@@ -24,16 +24,10 @@ ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.nda
 def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     """Read a scan file; the frames become line integrals by ``to_attenuation``.
 
-    Everything but the pixels is checked before they are read. Flat, dark and invalid frames are left out; pixels that the
-    file or the conversion calls bad are masked, as those that are not finite must be.
-
-    Args:
-        path: the HDF5 file.
-        to_attenuation: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P projections and
-            a mask (v, u) or (P, v, u) of unusable values, or None.
-
-    Returns:
-        The scan, with projections (P, v, u) float32 and a bool ``pixel_mask`` or None.
+    That takes (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P projections and a mask (v, u)
+    or (P, v, u) of unusable values, or None. Everything but the pixels is checked before they are read; flat, dark and
+    invalid frames are left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None: what the file
+    or the conversion calls bad, as everything that is not finite must be.
 
     Raises:
         InputError: the file is missing, damaged or incomplete; its culprit is "FILE:/hdf5/path".

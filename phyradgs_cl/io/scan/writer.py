@@ -29,14 +29,11 @@ def write_scan(
     image_key: np.ndarray | None = None,
     quantity: str = "attenuation",
 ) -> None:
-    """Write a scan file, whole or not at all.
+    """Write a scan file, whole or not at all; one that exists is replaced.
 
-    Args:
-        path: the HDF5 file; one that exists is replaced.
-        scan: with the line integrals unless ``data`` is given; a trajectory of one's own becomes a table of poses.
-        data: (F, v, u) float32 or uint16 raw frames, flats and darks included, in place of them.
-        image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid; it has as many 0 as ``scan`` has frames.
-        quantity: what ``data`` holds: "attenuation", "transmission" or "counts".
+    ``scan`` has the line integrals unless ``data`` is given, (F, v, u) float32 or uint16 raw frames, flats and darks
+    included, whose ``quantity`` is "attenuation", "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2 dark,
+    3 invalid, as many 0 as ``scan`` has frames. A trajectory of one's own becomes a table of poses.
 
     Raises:
         InputError: arguments that do not fit each other, or a scan that the format cannot express.

@@ -53,13 +53,9 @@ Report = Callable[[SweepProgress], None]
 
 @np.errstate(all="ignore")
 def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[list[Path], int]:
-    """Makes what is missing, then tables; the files written, and how many runs of the grid have failed now, which the
-    next call makes again. An interruption (KeyboardInterrupt) loses nothing that is done.
-
-    Raises:
-        OutputError: the folder cannot be written; BusyError while another sweep is at work on it.
-        InputError: no scheduler, or a package that is not installed.
-    """
+    """Makes what is missing, then tables; the files written, and how many runs of the grid have failed now, which the next
+    call makes again. An interruption (KeyboardInterrupt) loses nothing that is done. OutputError: the folder cannot be
+    written; BusyError while another sweep is at work on it. InputError: no scheduler, or a package that is not installed."""
     results = _results_file(job.folder)
     with only_run(results):
         lines = read_lines(results, is_sound)

@@ -54,14 +54,10 @@ def run_watch(
     tell: Callable[[WatchEvent], None],
     report: Callable[[Path], ProgressReport] = lambda scan: ignore_progress,
 ) -> None:
-    """Looks, reconstructs, looks again; returns only with ``once``. A signal during a run ends it after the iteration
-    under way, as KeyboardInterrupt, with a checkpoint that the next start goes on from.
-
-    Raises:
-        InputError: no such folder, or it is also the output.
-        OutputError: nothing can be written; BusyError while another watch has the output.
-        DeviceError: no device, or none any more.
-    """
+    """Looks, reconstructs, looks again; returns only with ``once``. A signal during a run ends it after the iteration under
+    way, as KeyboardInterrupt, with a checkpoint that the next start goes on from. InputError: no such folder, or it is also
+    the output. OutputError: nothing can be written; BusyError while another watch has the output. DeviceError: no device,
+    or none any more."""
     _check_folders(job)
     results = Results(job.output)
     make_folder(job.output / WORK, job.output)
