@@ -14,7 +14,6 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, triple
-from phyradgs_cl.io.hashing import sha256_of
 from phyradgs_cl.io.hdf5.datasets import in_unit, new_group, read_array, read_values, read_word, write_number
 from phyradgs_cl.io.hdf5.facts import PROVENANCE, Schema, read_facts
 from phyradgs_cl.io.hdf5.grid import read_grid, write_grid
@@ -22,6 +21,7 @@ from phyradgs_cl.io.hdf5.new import new_hdf5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.units import ATTENUATION, LENGTH
 from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.io.sha256 import sha256_of
 from phyradgs_cl.text import plain_text
 
 _DATA = "/entry/reconstruction"
