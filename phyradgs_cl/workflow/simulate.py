@@ -63,15 +63,9 @@ def run_simulation(
         if job.volume is not None:
             with expecting(job.volume, "plain-volume", "volume"):
                 of = load_attenuation(job.volume)
+        name = f"volume {job.volume}"
         scan = simulated_scan(
-            rt,
-            of,
-            scanner,
-            options,
-            size=job.size,
-            pixel_samples=job.pixel_samples,
-            name=f"volume {job.volume}",
-            report=report,
+            rt, of, scanner, options, size=job.size, pixel_samples=job.pixel_samples, name=name, report=report
         )
         with finish_despite_interrupt():
             write_scan(job.output, scan)

@@ -52,14 +52,9 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
         _log.warning(text, path, option_name("row_0"))
     frames = oriented(turn.frames(frames), options, "bottom")
-    integrals = line_integrals(
-        f"{path}:{detector}/data",
-        frames[used],
-        options,
-        flats=frames[key == schema.FLAT],
-        darks=frames[key == schema.DARK],
-        custom=quantity,
-    )
+    flats, darks = (frames[key == kind] for kind in (schema.FLAT, schema.DARK))
+    where = f"{path}:{detector}/data"
+    integrals = line_integrals(where, frames[used], options, flats=flats, darks=darks, custom=quantity)
     if mask is not None:
         mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))

@@ -20,15 +20,10 @@ def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
     if to_detector <= to_axis:
         raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
     rows, columns = scanner.counts("nDetector", 2)
-    pitch = pitches(scanner, "Detector", (rows, columns))
-    offset_u, offset_v = offset(scanner, "offDetector", 2)
-    return ConeGeometry(
-        to_axis * unit_mm,
-        to_detector * unit_mm,
-        (rows, columns),
-        (float(pitch[0] * unit_mm), float(pitch[1] * unit_mm)),
-        (float(offset_v * unit_mm), float(offset_u * unit_mm)),
-    )
+    pitch_v, pitch_u = (float(p * unit_mm) for p in pitches(scanner, "Detector", (rows, columns)))
+    offset_u, offset_v = (float(o * unit_mm) for o in offset(scanner, "offDetector", 2))
+    sides = (rows, columns), (pitch_v, pitch_u), (offset_v, offset_u)
+    return ConeGeometry(to_axis * unit_mm, to_detector * unit_mm, *sides)
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:

@@ -52,16 +52,8 @@ def _slider(name: str, words: str, low: float, high: float, value: float, told: 
 def _figure(plane: Plane) -> Markup:
     middle, name = len(plane.indices) // 2, f"{plane.name.capitalize()} slice"
     slider_id, place_id = f"slider-{plane.name}", f"place-{plane.name}"
-    slider = element(
-        "input",
-        type="range",
-        id=slider_id,
-        min=0,
-        max=len(plane.indices) - 1,
-        step=1,
-        value=middle,
-        aria_describedby=place_id,
-    )
+    places = {"min": 0, "max": len(plane.indices) - 1, "step": 1, "value": middle}
+    slider = element("input", type="range", id=slider_id, **places, aria_describedby=place_id)
     caption = element(
         "figcaption",
         element("label", f"{name} ({plane.axis})", for_=slider_id),
