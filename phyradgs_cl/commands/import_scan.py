@@ -22,7 +22,6 @@ EXAMPLE = (
     "Example: phyradgs import scan.xml -o scan.h5 --exposure-s 0.03 --readout-s 0.02 --frame-time-s 0.05"
 )
 
-
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
 AngleAt = Literal[WORDS["angle_at"]]  # type: ignore[name-defined, valid-type]
 Part = Literal[WORDS["part"]]  # type: ignore[name-defined, valid-type]
@@ -30,7 +29,6 @@ Quantity = Literal[WORDS["quantity"]]  # type: ignore[name-defined, valid-type]
 Rotates = Literal[WORDS["rotates"]]  # type: ignore[name-defined, valid-type]
 Row0 = Literal[WORDS["row_0"]]  # type: ignore[name-defined, valid-type]
 Column0 = Literal[WORDS["column_0"]]  # type: ignore[name-defined, valid-type]
-
 
 _FIELDS = frozenset(f.name for f in fields(ImportOptions))
 _FILE, _FORMAT = "the file's", "the format's"

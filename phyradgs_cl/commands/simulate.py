@@ -15,7 +15,6 @@ from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_opti
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
 
-
 PhantomName = Literal["foot", "jaw", "shepp-logan", "spheres"]
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]

@@ -23,7 +23,6 @@ __all__ = [
     "make_phantom", "rotation_about_z", "shepp_logan", "sphere_phantom"
 ]  # fmt: skip
 
-
 Phantom = EllipsoidPhantom | VoxelPhantom
 # (half_size_mm, resolution, seed) -> phantom; closed forms have no use for the last two.
 Factory = Callable[[float, int, int], Phantom]

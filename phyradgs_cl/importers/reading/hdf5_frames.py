@@ -1,6 +1,5 @@
 """What importers of HDF5 share: numeric frames of any type, optional numbers with units, the sense of angles."""
 
-
 import numpy as np
 
 from phyradgs_cl.errors import InputError

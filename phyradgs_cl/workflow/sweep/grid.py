@@ -101,8 +101,6 @@ def _nested(pairs: Iterator[tuple[str, Any]]) -> dict[str, Any]:
                 raise InputError(name, f"{group}={checks.shown(inside)} too", f"a value or a table {group}")
         inside[last] = value
     return table
-
-
 # --- scans and seeds --------------------------------------------------------------------------------------
 
 
@@ -130,8 +128,6 @@ def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
 
 def _is_list_of(kind: type, values: Any) -> bool:
     return isinstance(values, list) and bool(values) and all(isinstance(value, kind) for value in values)
-
-
 # --- settings ---------------------------------------------------------------------------------------------
 
 
