@@ -254,7 +254,9 @@ def _on_panel(
 ) -> FrameSource:
     """What ``make`` gives for the panel, or for a finer one behind the area of its pixels."""
     checks.within("--pixel-samples", pixel_samples, 1, 32)
-    return make(geometry) if pixel_samples == 1 else PixelAreaSource(make(geometry.finer(pixel_samples)), pixel_samples)
+    if pixel_samples == 1:
+        return make(geometry)
+    return PixelAreaSource(make(geometry.finer(pixel_samples)), pixel_samples)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,8 +59,8 @@ class EncoderTable:
     culprit: str = "encoder table"
 
     def __post_init__(self) -> None:
-        expected = "two equal 1D arrays of at least 2 samples"
-        time_s, table = _checked_table(self.culprit, self.time_s, self.angle_rad_table, (), "angles", expected)
+        wanted = "two equal 1D arrays of at least 2 samples"
+        time_s, table = _checked_table(self.culprit, self.time_s, self.angle_rad_table, (), "angles", wanted)
         object.__setattr__(self, "time_s", time_s)
         object.__setattr__(self, "angle_rad_table", table)
 
