@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -73,6 +73,21 @@ def any_rt(request: pytest.FixtureRequest) -> Runtime:
 def cli() -> ModuleType:
     """The command line in this process: cli.run([...]) gives the exit status."""
     return load_cli()
+
+
+@pytest.fixture
+def refused(cli, capfd) -> Callable[..., str]:
+    """(words of a command, what its line must have..., status) → the one line in which it is refused."""
+
+    def refuse(words: Sequence[object], *parts: str, status: int = 2) -> str:
+        capfd.readouterr()
+        assert cli.run([str(word) for word in words]) == status, words
+        line = capfd.readouterr().err
+        assert line.startswith("phyradgs: ") and line.count("\n") == 1, (words, line)
+        assert all(part in line for part in parts), (words, line)
+        return line
+
+    return refuse
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,18 @@
+"""A scan of some voxels that the commands are tried on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def tiny() -> list[str]:
+    """Words of ``phyradgs simulate``."""
+    return "--phantom jaw --size 8 --detector 12 --views 4 --time-samples 2 --jitter-deg 0.1".split()
+
+
+@pytest.fixture(scope="session")
+def scan(simulated, tiny) -> Path:
+    return simulated(*tiny)
