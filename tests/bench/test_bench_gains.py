@@ -20,11 +20,8 @@ def line(row: Row, volume: str, seed: int, psnr_db: float, **others: Any) -> dic
 
 
 LINES = [
-    line(STATIC, "a", 0, 20.0),
-    line(STATIC, "a", 1, 22.0),
-    line(STATIC, "b", 0, 30.0),
-    line(MOVING, "a", 0, 21.0),
-    line(MOVING, "a", 1, 25.0),
+    *(line(STATIC, *where) for where in (("a", 0, 20.0), ("a", 1, 22.0), ("b", 0, 30.0))),
+    *(line(MOVING, *where) for where in (("a", 0, 21.0), ("a", 1, 25.0))),
     line(MOVING, "b", 0, 30.5, processor_s=8.0),
 ]
 
@@ -39,18 +36,13 @@ def test_a_gain_is_the_mean_over_volumes_of_the_means_over_their_seeds() -> None
     assert (gain.volumes, gain.still) == (2, None)
 
 
-def test_scans_without_a_partner_do_not_count() -> None:
+def test_scans_without_a_partner_and_perfect_volumes_do_not_count() -> None:
+    gain = gain_over_static(LINES, "rapid", MOVING)
     alone = [line(STATIC, "c", 0, 90.0), line(MOVING, "a", 2, 90.0), line(MOVING, "d", 0, 90.0)]
-    assert gain_over_static([*LINES, *alone], "rapid", MOVING) == gain_over_static(LINES, "rapid", MOVING)
-    other_protocol = [line(MOVING, "a", 0, 90.0, protocol="standard")]
-    assert gain_over_static([*LINES, *other_protocol], "rapid", MOVING) == gain_over_static(
-        LINES, "rapid", MOVING
-    )
+    for more in (alone, [line(MOVING, "a", 0, 90.0, protocol="standard")]):
+        assert gain_over_static([*LINES, *more], "rapid", MOVING) == gain
     assert gain_over_static([line(STATIC, "a", 0, 20.0), line(MOVING, "a", 1, 21.0)], "rapid", MOVING) is None
     assert gain_over_static(LINES, "rapid", ROWS["CGLS per-row"]) is None
-
-
-def test_perfect_volumes_have_no_gain() -> None:
     perfect = {**line(MOVING, "b", 0, 0.0), "metrics": {"psnr_db": None, "ssim": 1.0}}
     gain = gain_over_static([*LINES[:5], perfect], "rapid", MOVING)
     assert gain is not None and (gain.volumes, gain.mean_db) == (1, 2.0)

@@ -65,6 +65,7 @@ RECONSTRUCT = {
     "text.h5": ("--config {text}",),
     "--config": ("--config ''",),
     "--device": ("--device ''",),
+    "--detector-model: found no such option of --method fdk": ("--method fdk --detector-model intensity",),
     "--resume": ("--resume",),
     "--iteration-count": ("--iteration-count 5",),
     "--median-filter: found 4": ("--median-filter 4",),

@@ -19,11 +19,7 @@ def asked() -> tuple[typer.Typer, list[object]]:
 
     @app.command()
     @with_run_options("seed", "batch")
-    def command(
-        scan: str,
-        request: RunRequest,
-        often: Annotated[float, typer.Option()] = 2.0,
-    ) -> None:
+    def command(scan: str, request: RunRequest, often: Annotated[float, typer.Option()] = 2.0) -> None:
         """What it does."""
         seen.extend([scan, request, often])
 
@@ -49,17 +45,12 @@ def test_a_command_gets_what_was_given_and_none_for_the_rest(asked, tmp_path: Pa
     assert (settings.changes["iterations"], settings.changes["relaxation"]) == (3, 0.5)
 
 
-def test_nothing_given_is_nothing_given(asked) -> None:
+def test_nothing_given_is_nothing_given_and_what_is_left_out_is_no_option(asked) -> None:
     app, seen = asked
+    for option in ("--seed", "--batch"):
+        assert CliRunner().invoke(app, ["s.h5", option, "1"]).exit_code == 2 and seen == []
     assert CliRunner().invoke(app, ["s.h5"]).exit_code == 0
     assert seen[1] == RunRequest(None, [], dict.fromkeys(seen[1].given))
-
-
-@pytest.mark.parametrize("option", ["--seed", "--batch"])
-def test_what_is_left_out_is_no_option(asked, option: str) -> None:
-    app, seen = asked
-    assert CliRunner().invoke(app, ["s.h5", option, "1"]).exit_code == 2
-    assert seen == []
 
 
 def test_the_help_has_the_options_in_the_place_of_the_request(asked) -> None:

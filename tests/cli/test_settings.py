@@ -51,14 +51,11 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
     [
         ("iterations = 'many'", "iterations: found 'many'; expected a whole number"),
         ("strips = 2.5", "strips: found 2.5"),
-        ("sub_intervals = 0", "sub_intervals: found 0"),
         ("motion = 'wobble'", "motion: found 'wobble'"),
         ("method = 'magic'", "method: found 'magic'"),
-        ("preset = 'best'", "preset: found 'best'"),
         ("seed = 1.5", "seed: found 1.5; expected a whole number"),
         ("device = -1", "device: found -1"),
         ("median_filter = 4", "median_filter: found 4"),
-        ("gaussians = -1", "gaussians: found -1"),
         ("[control]\nthreshold = -1", "control.threshold: found -1.0"),
         ("[control]\nevry = 3", "control.evry: found no such option of --method phyradgs"),
         ("method = 'fdk'\nwindow = 'round'", "window: found 'round'"),
@@ -83,14 +80,12 @@ def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
     config.write_text("method = 'FISTA-TV'\nsize = [8, 9, 10]\n")
     found = run_settings(config, {"size": None, "voxel_mm": (0.5, 0.5, 0.5)})
     assert (found.method, found.before.size, found.before.voxel_mm) == ("fista-tv", (8, 9, 10), (0.5,) * 3)
-    assert run_settings(config, {"size": 7.0, "method": "Sirt"}).before.size == 7
-    assert run_settings(config, {"size": 7.0, "method": "Sirt"}).method == "sirt"
+    found = run_settings(config, {"size": 7.0, "method": "Sirt"})
+    assert (found.method, found.before.size) == ("sirt", 7)
 
 
 def test_a_method_offers_only_what_it_has() -> None:
-    with pytest.raises(InputError) as caught:
-        method_options("fdk", None, {"length": 1})
-    assert caught.value.expected == "window, motion"
-    with pytest.raises(InputError) as caught:
-        method_options("sart", None, {"length": 1})
-    assert caught.value.expected.endswith("motion, strips, sub_intervals")
+    for method, offered in (("fdk", "window, motion"), ("sart", "motion, strips, sub_intervals")):
+        with pytest.raises(InputError) as caught:
+            method_options(method, None, {"length": 1})
+        assert caught.value.expected.endswith(offered)

@@ -13,55 +13,44 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import pocl
 
 COMMAND = [sys.executable, "-m", "phyradgs_cl"]
-TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
+POSIX = pytest.mark.skipif(os.name != "posix", reason="a shell and devices of POSIX")
 
 
-def test_a_home_that_is_no_folder_costs_a_warning(tmp_path: Path) -> None:
-    homeless = {name: value for name, value in os.environ.items() if name != "POCL_CACHE_DIR"}
-    done = subprocess.run(
-        [*COMMAND, "simulate", *TINY, "-o", str(tmp_path / "scan.h5")],
-        env=homeless | {"HOME": "/dev/null", "XDG_CACHE_HOME": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    told = [line for line in done.stderr.splitlines() if not line.startswith("frame ")]
-    assert done.returncode == 0 and len(told) <= 1, done.stderr  # PoCL's users are told of its cache
-    assert all("cannot be written" in line for line in told)
-    assert (tmp_path / "scan.h5").exists()
+def run(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run([*COMMAND, *words], env=environment, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("wish", ["-1", "0", "abc", "1.5", "1e3", "1025", "99999999999999999999"])
-def test_a_number_of_threads_that_pocl_would_crash_on_is_refused(monkeypatch, wish) -> None:
-    monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
-    with pytest.raises(InputError, match=f"POCL_MAX_PTHREAD_COUNT: found '{wish}'; expected a whole number"):
-        pocl.prepare_environment()
+@POSIX
+def test_a_cache_that_cannot_be_written_costs_a_warning(tiny, tmp_path: Path) -> None:
+    """PoCL's users are told of its cache."""
+    usual = {name: value for name, value in os.environ.items() if name not in ("POCL_CACHE_DIR", "XDG_CACHE_HOME")}
+    for where in ({"HOME": "/dev/null"}, {"POCL_CACHE_DIR": "/dev/null/cache"}):
+        output = tmp_path / f"{next(iter(where))}.h5"
+        done = run("simulate", *tiny, "-o", str(output), **usual | {"TMPDIR": str(tmp_path)} | where)
+        told = [line for line in done.stderr.splitlines() if not line.startswith("frame ")]
+        assert done.returncode == 0 and len(told) <= 1 and output.exists(), (where, done.stderr)
+        for line in told:
+            assert "cannot be written: kernels are kept in" in line and "set POCL_CACHE_DIR" in line
 
 
-@pytest.mark.parametrize("wish", ["", "1", "1024"])
-def test_a_number_of_threads_that_there_can_be_is_taken(monkeypatch, wish) -> None:
+def test_a_number_of_threads_that_pocl_would_crash_on_is_refused(monkeypatch) -> None:
     monkeypatch.setenv(pocl.CACHE_VARIABLE, os.environ.get(pocl.CACHE_VARIABLE, ""))
-    monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
-    pocl.prepare_environment()
-    assert os.environ[pocl.THREADS_VARIABLE] == wish
-
-
-def test_a_command_refuses_the_number_before_the_driver_sees_it() -> None:
-    done = subprocess.run(
-        [*COMMAND, "devices"],
-        env=os.environ | {pocl.THREADS_VARIABLE: "-1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    for wish in ("-1", "0", "abc", "1.5", "1e3", "1025", "99999999999999999999"):
+        monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
+        with pytest.raises(InputError, match=f"POCL_MAX_PTHREAD_COUNT: found '{wish}'; expected a whole number"):
+            pocl.prepare_environment()
+    for wish in ("", "1", "1024"):
+        monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
+        pocl.prepare_environment()
+        assert os.environ[pocl.THREADS_VARIABLE] == wish
+    done = run("devices", **os.environ | {pocl.THREADS_VARIABLE: "-1"})  # before the driver sees it
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("phyradgs: POCL_MAX_PTHREAD_COUNT: found '-1'") and done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("words", ["info none.h5", "reconstruct --nonsense", "nonsense"])
-@pytest.mark.skipif(os.name != "posix", reason="closes a descriptor in a shell of POSIX")
-def test_without_standard_error_the_status_is_right(words) -> None:
-    done = subprocess.run(
-        ["sh", "-c", f'"$0" -m phyradgs_cl {words} 2>&-', sys.executable], capture_output=True, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")
+@POSIX
+def test_without_standard_error_the_status_is_right() -> None:
+    for words in ("info none.h5", "reconstruct --nonsense", "nonsense"):
+        shell = ["sh", "-c", f'"$0" -m phyradgs_cl {words} 2>&-', sys.executable]
+        done = subprocess.run(shell, capture_output=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (2, b"", b""), words
