@@ -10,7 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tables import KINDS, RESULTS, BenchJob, BenchSize, Row, listed, listed_seeds, plan_runs, rows_of, run_bench
+from tables import (
+    KINDS,
+    RESULTS,
+    BenchJob,
+    BenchSize,
+    Row,
+    listed,
+    listed_seeds,
+    plan_runs,
+    rows_of,
+    run_bench,
+)
 from tables import rows as bench_rows
 from tables.figures import read_slices, slices_path, write_slices
 from tables.published import TABLE1, TABLE2
@@ -67,10 +78,9 @@ def test_damaged_slices_are_none_at_all(tmp_path: Path) -> None:
     path = slices_path(tmp_path, facts)
 
     def bomb(path: Path) -> None:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            with archive.open("arr_0.npy", "w") as member:
-                for _ in range(300):
-                    member.write(b"\0" * (1 << 20))
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("arr_0.npy", "w") as member:
+            for _ in range(300):
+                member.write(b"\0" * (1 << 20))
 
     for damage in (
         lambda path: path.write_bytes(path.read_bytes()[:200]),

@@ -10,7 +10,7 @@ import pytest
 @pytest.fixture(scope="session")
 def tiny() -> list[str]:
     """Words of ``phyradgs simulate``."""
-    return "--phantom jaw --size 8 --detector 12 --views 4 --time-samples 2 --jitter-deg 0.1".split()
+    return ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2", "--jitter-deg", "0.1"]
 
 
 @pytest.fixture(scope="session")
