@@ -7,6 +7,7 @@ import os
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ from tables import (
     run_bench,
 )
 from tables import rows as bench_rows
+from tables.case import FLY, STILL
 from tables.figures import read_slices, slices_path, write_slices
+from tables.gains import gain_over_static
 from tables.published import TABLE1, TABLE2
 from tables.results import _MEASURED, KEY, Present, append_line, read_lines
 from tables.summary import summarise
@@ -40,7 +43,7 @@ FACTS = {
 }
 
 
-def test_a_damaged_last_line_is_skipped_and_closed_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_last_line_is_closed_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path, notes = tmp_path / "results.jsonl", tmp_path / "notes.jsonl"
     assert read_lines(path) == []
     append_line(path, {**FACTS, "run": "a"})
@@ -78,9 +81,8 @@ def test_damaged_slices_are_none_at_all(tmp_path: Path) -> None:
     path = slices_path(tmp_path, facts)
 
     def bomb(path: Path) -> None:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("arr_0.npy", "w") as member:
-            for _ in range(300):
-                member.write(b"\0" * (1 << 20))
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("arr_0.npy", b"\0" * (300 << 20))
 
     for damage in (
         lambda path: path.write_bytes(path.read_bytes()[:200]),
@@ -128,7 +130,8 @@ def test_rows_are_the_papers_and_more() -> None:
         assert all(row.options(100, 10).motion.name == row.motion for row in rows_of(kind))
     # tables share the run of the default strips
     row = {row.label: row for kind in ("table1", "table2") for row in rows_of(kind)}
-    assert row["PhyRadGS"].run == row["M=8 N=5"].run and row["PhyRadGS"].static().run == row["PhyRadGS w/o ST"].run
+    full = row["PhyRadGS"]
+    assert (full.run, full.static().run) == (row["M=8 N=5"].run, row["PhyRadGS w/o ST"].run)
 
 
 def test_a_row_of_an_unknown_name_or_method_is_named(tmp_path: Path) -> None:
@@ -188,6 +191,7 @@ def test_neural_rows_run_where_their_machine_is(
 
 
 def test_wrong_jobs_are_refused(tmp_path: Path) -> None:
+    job = BenchJob("table1", tmp_path, rows=["FDK"])
     for changes, culprit in (
         ({"kind": "table3"}, "benchmark: found 'table3'"),
         ({"protocols": ["static"]}, "--protocols: found 'static'"),
@@ -200,7 +204,7 @@ def test_wrong_jobs_are_refused(tmp_path: Path) -> None:
         ({"kind": "phantom", "names": ["foot"]}, "given for phantom"),
     ):
         with pytest.raises(InputError, match=culprit):
-            plan_runs(replace(BenchJob("table1", tmp_path, rows=["FDK"]), **changes))  # type: ignore[arg-type]
+            plan_runs(replace(job, **changes))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="voxels of a benchmark size"):
         BenchSize("T", 1, 8, 1)
 
@@ -229,3 +233,52 @@ def test_a_spread_tells_of_seeds_and_not_of_volumes() -> None:
     apart = summarise([lines[1], lines[3]])  # seeds of different volumes: their difference is that of volumes
     assert apart is not None and apart.spread == {}
     assert summarise([]) is None
+
+
+# --- what a model of the motion gives: pairs of the same volume and seed, and nothing else ------------------------------
+
+ROWS = {row.label: row for row in rows_of("table1")}
+MOVING, STATIC = ROWS["SART per-row"], ROWS["SART"]
+
+
+def line(row: Row, volume: str, seed: int, psnr_db: float, **others: Any) -> dict[str, Any]:
+    """A line of a results file as far as a gain looks at it."""
+    facts = {"run": row.run, "protocol": "rapid", "acquisition": FLY, "processor_s": 2.0, **others}
+    return {**facts, "volume": volume, "seed": seed, "metrics": {"psnr_db": psnr_db, "ssim": 0.5}}
+
+
+LINES = [
+    *(line(STATIC, *where) for where in (("a", 0, 20.0), ("a", 1, 22.0), ("b", 0, 30.0))),
+    *(line(MOVING, *where) for where in (("a", 0, 21.0), ("a", 1, 25.0))),
+    line(MOVING, "b", 0, 30.5, processor_s=8.0),
+]
+
+
+def test_a_gain_is_the_mean_over_volumes_of_the_means_over_their_seeds() -> None:
+    gain = gain_over_static(LINES, "rapid", MOVING)
+    assert gain is not None
+    assert (gain.least_db, gain.greatest_db) == (0.5, 2.0)
+    assert gain.mean_db == pytest.approx(1.25)
+    assert gain.mean_db == pytest.approx(gain.moving.mean["psnr_db"] - gain.static.mean["psnr_db"])
+    assert gain.moving.mean["processor_s"] == 5.0
+    assert (gain.volumes, gain.still) == (2, None)
+
+
+def test_scans_without_a_partner_and_perfect_volumes_do_not_count() -> None:
+    gain = gain_over_static(LINES, "rapid", MOVING)
+    alone = [line(STATIC, "c", 0, 90.0), line(MOVING, "a", 2, 90.0), line(MOVING, "d", 0, 90.0)]
+    for more in (alone, [line(MOVING, "a", 0, 90.0, protocol="standard")]):
+        assert gain_over_static([*LINES, *more], "rapid", MOVING) == gain
+    assert gain_over_static([line(STATIC, "a", 0, 20.0), line(MOVING, "a", 1, 21.0)], "rapid", MOVING) is None
+    assert gain_over_static(LINES, "rapid", ROWS["CGLS per-row"]) is None
+    perfect = {**line(MOVING, "b", 0, 0.0), "metrics": {"psnr_db": None, "ssim": 1.0}}
+    gain = gain_over_static([*LINES[:5], perfect], "rapid", MOVING)
+    assert gain is not None and (gain.volumes, gain.mean_db) == (1, 2.0)
+
+
+def test_a_static_row_has_no_gain_and_stop_and_shoot_is_of_the_same_scans() -> None:
+    assert gain_over_static(LINES, "rapid", STATIC) is None
+    still = [line(STATIC, volume, 0, psnr, acquisition=STILL) for volume, psnr in (("a", 40.0), ("c", 90.0))]
+    gain = gain_over_static([*LINES, *still], "rapid", MOVING)
+    assert gain is not None and gain.still is not None
+    assert gain.still.mean["psnr_db"] == 40.0

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 
+WORDS = "--phantom jaw --size 8 --detector 12 --views 4 --time-samples 2 --jitter-deg 0.1"
+
 
 @pytest.fixture(scope="session")
 def tiny() -> list[str]:
     """Words of ``phyradgs simulate``."""
-    return ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2", "--jitter-deg", "0.1"]
+    return WORDS.split()
 
 
 @pytest.fixture(scope="session")

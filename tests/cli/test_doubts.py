@@ -1,7 +1,8 @@
-"""Warnings where they belong and nowhere else, and files that are taken for others."""
+"""Warnings where they belong and nowhere else, files that are taken for others, and what surrounds a command."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Static
-from phyradgs_cl.errors import OutputError
+from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.runtime import device, pocl
 from phyradgs_cl.workflow import evaluate, load_scan, reconstruct
 
@@ -80,7 +81,7 @@ def test_files_of_another_kind_are_called_by_their_kind(refused, scan, volume, t
         (["reconstruct", bare, *output], f"{bare}: found a bare volume (dataset /volume); expected a scan"),
         (["evaluate", scan, "--reference", scan], f"{scan}: found a scan; expected a volume"),
         (["simulate", "--volume", scan, *output], f"{scan}: found a scan; expected a bare volume"),
-        (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a whole one; start without"),
+        (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a whole one"),
     ):
         refused(words, expected)
 
@@ -111,3 +112,49 @@ def test_a_reader_that_goes_away_is_no_error(scan) -> None:
         started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         started.stdout.close()
         assert started.stderr.read() == "" and started.wait(60) == 0
+
+
+# --- homes that cannot be written, variables of drivers, a standard error that is closed ---------------------------------
+
+COMMAND = [sys.executable, "-m", "phyradgs_cl"]
+POSIX = pytest.mark.skipif(os.name != "posix", reason="a shell and devices of POSIX")
+
+
+def run(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run([*COMMAND, *words], env=environment, capture_output=True, text=True, check=False)
+
+
+@POSIX
+def test_a_cache_that_cannot_be_written_costs_a_warning(tiny, tmp_path: Path) -> None:
+    """PoCL's users are told of its cache."""
+    usual = {name: os.environ[name] for name in os.environ.keys() - {"POCL_CACHE_DIR", "XDG_CACHE_HOME"}}
+    for where in ({"HOME": "/dev/null"}, {"POCL_CACHE_DIR": "/dev/null/cache"}):
+        output = tmp_path / f"{next(iter(where))}.h5"
+        done = run("simulate", *tiny, "-o", str(output), **usual | {"TMPDIR": str(tmp_path)} | where)
+        told = [line for line in done.stderr.splitlines() if not line.startswith("frame ")]
+        assert done.returncode == 0 and len(told) <= 1 and output.exists(), (where, done.stderr)
+        for line in told:
+            assert "cannot be written: kernels are kept in" in line and "set POCL_CACHE_DIR" in line
+
+
+def test_a_number_of_threads_that_pocl_would_crash_on_is_refused(monkeypatch) -> None:
+    monkeypatch.setenv(pocl.CACHE_VARIABLE, os.environ.get(pocl.CACHE_VARIABLE, ""))
+    for wish in ("-1", "0", "abc", "1.5", "1e3", "1025", "99999999999999999999"):
+        monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
+        with pytest.raises(InputError, match=f"POCL_MAX_PTHREAD_COUNT: found '{wish}'; expected a whole"):
+            pocl.prepare_environment()
+    for wish in ("", "1", "1024"):
+        monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
+        pocl.prepare_environment()
+        assert os.environ[pocl.THREADS_VARIABLE] == wish
+    done = run("devices", **os.environ | {pocl.THREADS_VARIABLE: "-1"})  # before the driver sees it
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("phyradgs: POCL_MAX_PTHREAD_COUNT: found '-1'") and done.stderr.count("\n") == 1
+
+
+@POSIX
+def test_without_standard_error_the_status_is_right() -> None:
+    for words in ("info none.h5", "reconstruct --nonsense", "nonsense"):
+        shell = ["sh", "-c", f'"$0" -m phyradgs_cl {words} 2>&-', sys.executable]
+        done = subprocess.run(shell, capture_output=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (2, b"", b""), words

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.workflow import load_scan
 
-LATE = (None, 1, 2, 3, 4)
+SLOW = [(method, n, slow) for method, n in (("phyradgs", 3000), ("sirt", 400)) for slow in (None, 1, 2, 3, 4)]
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4"]
 
 
@@ -67,10 +67,7 @@ def estimated(rt, scan):
     return estimate_of
 
 
-@pytest.mark.parametrize(
-    ("method", "iterations", "slow"),
-    [("r2", 7, None), ("sart", 1, None), *((m, n, slow) for m, n in (("phyradgs", 3000), ("sirt", 400)) for slow in LATE)],
-)
+@pytest.mark.parametrize(("method", "iterations", "slow"), [("r2", 7, None), ("sart", 1, None), *SLOW])
 def test_time_is_that_of_a_run_whose_iterations_are_alike(estimated, clock, method, iterations, slow) -> None:
     """Where the machine did something else for a while, the repeated trial tells."""
     clock.slow = slow
@@ -118,7 +115,7 @@ def test_fast_iterations_are_told_from_noise(estimated, clock) -> None:
     assert found.trial_iterations == sum(clock.iterations)
 
 
-def test_what_is_around_the_method_counts_and_what_has_no_iterations_is_run(rt, scan, clock, estimated) -> None:
+def test_what_is_around_the_method_counts_and_fdk_is_run(rt, scan, clock, estimated) -> None:
     options = method_options("phyradgs", None, {"iterations": 300})
     found = estimate(load_scan(scan), "phyradgs", options, rt, around=lambda result: 1.5)
     assert (found.seconds, found.around_s) == (pytest.approx(2.0 + 75 + 1.5), 1.5)
@@ -155,7 +152,8 @@ def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
     for words in (["--strips", "2", "--sub-intervals", "1"], ["--segments", "2", "--time-error", "0.01"]):
         cli.run(["estimate", str(scan), *words, *before])
     for options, before in asked:
-        assert options.detector_model == "intensity" and (before.median_filter, before.ignore_lag) == (3, True)
+        assert options.detector_model == "intensity"
+        assert (before.median_filter, before.ignore_lag) == (3, True)
     micro, exact = (options.motion for options, _ in asked)
     assert (micro.name, micro.strips, micro.sub_intervals) == ("micro-views", 2, 1)
     assert (exact.name, exact.segments, exact.time_error) == ("exact", 2, 0.01)
@@ -168,7 +166,7 @@ def test_durations_for_people() -> None:
 
 
 def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
-    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), "--motion", "static", "--iterations", "5"]
+    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v"), "--motion", "static", "--iterations", "5"]
     assert cli.run([*command, "--profile"]) == 0
     text = capsys.readouterr().out
     assert re.search(r"^splat_forward_rows +5 ", text, re.M) and re.search(r"^splat_backward_rows +5 ", text, re.M)

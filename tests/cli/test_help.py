@@ -52,7 +52,8 @@ def test_the_tab_key_in_bash() -> None:
         "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
         "phyradgs check --fi": {"--fix-offset"},
     }.items():
-        asked = {"_PHYRADGS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
-        command, environment = [sys.executable, "-c", PROGRAM], {**os.environ, **asked}
+        asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+        command = [sys.executable, "-c", PROGRAM]
+        environment = {**os.environ, **asked, "_PHYRADGS_COMPLETE": "complete_bash"}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         assert set(done.stdout.split()) == expected, (words, done.stderr)

@@ -46,7 +46,7 @@ def test_reconstruction_in_bricks(cli, scan, tmp_path, method, monkeypatch) -> N
     assert cli.run(["estimate", str(scan), "--method", *method.split(), "--memory", "100KiB"]) == 0
 
 
-def test_too_little_is_one_line_and_a_wrong_size_is_named_where_it_stands(refused, scan, tmp_path, monkeypatch) -> None:
+def test_too_little_and_a_wrong_size_are_named_where_they_stand(refused, scan, tmp_path, monkeypatch) -> None:
     output, config = tmp_path / "v.h5", tmp_path / "run.toml"
     config.write_text('memory = "much"\n')
     run = ["reconstruct", scan, "-o", output, "--iterations", "2"]

@@ -165,8 +165,9 @@ FIELD: dict[str, Change] = {
     "declared huge": _huge(False),
     "declared huge in chunks": _huge(True),
 }
+_OF_TEXTS = ("removed", "a group", "texts", "null", "an external link", "a loop of links", "virtual")
 TEXT: dict[str, Change] = {
-    **{n: FIELD[n] for n in ("removed", "a group", "texts", "null", "an external link", "a loop of links", "virtual")},
+    **{name: FIELD[name] for name in _OF_TEXTS},
     "a number": lambda f, a: put(f, a, 3.5),
     "another word": lambda f, a: put(f, a, "whatever"),
     "not UTF-8": lambda f, a: put(f, a, np.bytes_(b"\xff\xfe\xfd")),

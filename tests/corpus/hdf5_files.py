@@ -131,7 +131,8 @@ def _whole_files(seed: int) -> Iterator[Case]:
             ("a pickle", b"cos\nsystem\n(S'touch canary'\ntR."),
         ):
             yield Case(f"{of}: {name}", of, filled(data), command)
-    for of, command in (("volume.h5", SCAN), ("bare.h5", SCAN), ("fly.h5", VOLUME), ("scanner.toml", PHANTOM)):
+    wrong = (("volume.h5", SCAN), ("bare.h5", SCAN), ("fly.h5", VOLUME), ("scanner.toml", PHANTOM))
+    for of, command in wrong:
         yield Case(f"{of} as another kind: {command[0]}", of, lambda path: None, command)
 
 

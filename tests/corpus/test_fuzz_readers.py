@@ -32,7 +32,8 @@ CHANGE = st.tuples(
     st.booleans(),
     st.binary(min_size=1, max_size=8),
 )
-NUMBERS = [b"\xff" * 8, b"\0" * 8, b"\xff" * 4, b"\x7f\xff\xff\xff", b"\0\0\0\x80", b"nan", b"1e400", b"-1", b"9" * 30]
+NUMBERS = [b"\xff" * 8, bytes(8), b"\xff" * 4, b"\x7f\xff\xff\xff", b"\0\0\0\x80"]
+NUMBERS += [b"nan", b"1e400", b"-1", b"9" * 30]
 
 SWEEP = """scans = ["*.h5"]
 seeds = [0, 3]

@@ -39,7 +39,7 @@ def test_a_device_that_fails_at_any_launch(run, scan, tmp_path, capfd, launches,
         launches.arm(int(at))
         assert run(*command(scan, output, RUNS[name])) == 5
         line = capfd.readouterr().err.splitlines()[-1]
-        assert line.startswith("phyradgs: device ") and "a launch of" in line and "INVALID_COMMAND_QUEUE" in line
+        assert all(words in line for words in ("phyradgs: device ", "a launch of", "INVALID_COMMAND_QUEUE"))
         assert output.read_bytes() == kit.OLD
         left = kit.names(tmp_path)
         assert left in (["v.h5", "whole.h5"], ["v.h5", "v.h5.checkpoint.npz", "whole.h5"])
@@ -52,7 +52,7 @@ def test_a_device_that_fails_at_any_launch(run, scan, tmp_path, capfd, launches,
     assert kept > 0
 
 
-def test_copies_that_fail_and_memory_that_the_driver_misses(run, scan, tmp_path, capfd, launches, copies) -> None:
+def test_failing_copies_and_memory_that_is_missed(run, scan, tmp_path, capfd, launches, copies) -> None:
     command = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method"]
     for method in ("fdk", "sirt"):
         copies.arm(2)

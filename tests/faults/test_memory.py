@@ -51,7 +51,7 @@ def test_a_machine_without_memory_is_said(scan, tmp_path, source) -> None:
     assert output.read_bytes() == kit.OLD and set(kit.names(tmp_path)) <= {"large.h5", "v.h5"}
 
 
-def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(run, scan, tmp_path, capfd, monkeypatch) -> None:
+def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, monkeypatch) -> None:
     whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
     words = ["--method", "sirt", "--iterations", "6", "--checkpoint-every", "1e-6"]
     assert run("reconstruct", scan, "-o", whole, *words) == 0

@@ -24,7 +24,8 @@ OPTIONS = SplatOptions(
 def small_scan() -> Scan:
     geometry = ConeGeometry(5, 7.5, (24, 24), (3.9 / 24, 3.9 / 24))
     source = AnalyticSource(shepp_logan(1.0), geometry)
-    return simulate(source, geometry, Grid.cube(16, 2.0), SimulationOptions(Protocol(views=6, exposure_deg=20.0)))
+    options = SimulationOptions(Protocol(views=6, exposure_deg=20.0))
+    return simulate(source, geometry, Grid.cube(16, 2.0), options)
 
 
 def started(scan: Scan, options: SplatOptions, rt: Runtime) -> SplatRun:

@@ -15,13 +15,15 @@ from phyradgs_cl.parallel import Launch, launched, span
 from phyradgs_cl.runtime import device as devices
 
 OPEN_MPI = dict(zip(("RANK", "SIZE", "LOCAL_RANK", "LOCAL_SIZE"), "5623", strict=True))
+LOCAL = {"MPI_LOCALRANKID": "1", "MPI_LOCALNRANKS": "2"}
 TASKS = {"SLURM_STEP_TASKS_PER_NODE": "2(x2)"}
+FIRST = {"SLURM_LOCALID": "0", **TASKS}
 # name: (environment, rank, size and the same of the machine)
 LAUNCHERS = {
-    "MPICH": ({"PMI_RANK": "3", "PMI_SIZE": "8", "MPI_LOCALRANKID": "1", "MPI_LOCALNRANKS": "2"}, (3, 8, 1, 2)),
+    "MPICH": ({"PMI_RANK": "3", "PMI_SIZE": "8", **LOCAL}, (3, 8, 1, 2)),
     "Open MPI": ({f"OMPI_COMM_WORLD_{name}": value for name, value in OPEN_MPI.items()}, (5, 6, 2, 3)),
     "srun, PMI-2": ({"PMI_RANK": "3", "PMI_SIZE": "4", "SLURM_LOCALID": "1", **TASKS}, (3, 4, 1, 2)),
-    "srun, PMIx": ({"PMIX_RANK": "2", "SLURM_STEP_NUM_TASKS": "4", "SLURM_LOCALID": "0", **TASKS}, (2, 4, 0, 2)),
+    "srun, PMIx": ({"PMIX_RANK": "2", "SLURM_STEP_NUM_TASKS": "4", **FIRST}, (2, 4, 0, 2)),
     "one rank": ({"PMI_RANK": "0", "PMI_SIZE": "1"}, (0, 1, 0, 1)),
     "a job of four tasks, no step": ({"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}, (0, 1, 0, 1)),
     "nobody": ({}, (0, 1, 0, 1)),

@@ -46,7 +46,8 @@ def made(scan_file: Path) -> Made:
     def on(size: int) -> dict[str, np.ndarray]:
         if size not in kept:
             out = scan_file.with_name(f"on{size}.npz")
-            done = run([MPIEXEC, "-n", str(size), sys.executable, "-m", "mpi4py", str(WORK), str(scan_file), str(out)])
+            work = [sys.executable, "-m", "mpi4py", str(WORK), str(scan_file), str(out)]
+            done = run([MPIEXEC, "-n", str(size), *work])
             assert done.returncode == 0, done.stdout + done.stderr
             with np.load(out) as arrays:
                 kept[size] = dict(arrays)
@@ -186,7 +187,8 @@ def test_what_is_wrong_is_said_once(scan_file, tmp_path) -> None:
         (["--batch", "2"], 2, "--batch: found 2 for 3 ranks"),
         (["--memory", "100K"], 6, "memory of"),
     ):
-        done = run([MPIEXEC, "-n", "3", *PHYRADGS, "reconstruct", str(scan_file), "-o", str(tmp_path / "v.h5"), *more])
+        words = ["reconstruct", str(scan_file), "-o", str(tmp_path / "v.h5"), *more]
+        done = run([MPIEXEC, "-n", "3", *PHYRADGS, *words])
         (found,) = said(done.stderr)
         assert done.returncode == status and found.startswith(f"phyradgs: {line}")
 

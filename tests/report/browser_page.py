@@ -27,7 +27,7 @@ PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     program = os.environ.get("PHYRADGS_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
-    assert program, f"no browser: install one of {', '.join(PROGRAMS)}, or name its program by PHYRADGS_CHROMIUM"
+    assert program, f"no browser: install one of {PROGRAMS}, or name its program by PHYRADGS_CHROMIUM"
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser

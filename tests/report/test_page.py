@@ -87,7 +87,8 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
 def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
     target = tmp_path / "short.h5"
     changes = {"iterations": 12, "gaussians": 50, "tv_weight": 0.0}
-    run_reconstruction(ReconstructionJob(files[0], target, changes=changes), lambda: rt, lambda progress: None)
+    job = ReconstructionJob(files[0], target, changes=changes)
+    run_reconstruction(job, lambda: rt, lambda progress: None)
     record = load_run(target).record
     assert [line["iteration"] for line in record] == list(range(1, 13))
     page = parse(report_page(load_run(target)))
@@ -166,8 +167,9 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     scan_path, volume_path = tmp_path / "s.h5", tmp_path / "<i>v.h5"
     write_scan(scan_path, replace(small_scan, title=HOSTILE))
     record = [{"iteration": 1, HOSTILE: 2.0, "loss": HOSTILE}, {"iteration": 2, HOSTILE: 3.0}, HOSTILE]
-    facts = {"options": {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]}, "input": {"median_filter": HOSTILE}}
-    facts |= {"method": HOSTILE, HOSTILE: HOSTILE, "record": record, "scan": HOSTILE}
+    options = {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]}
+    facts = {"options": options, "input": {"median_filter": HOSTILE}, "record": record}
+    facts |= {"method": HOSTILE, HOSTILE: HOSTILE, "scan": HOSTILE}
     write_volume(volume_path, stored.volume, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
     write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
     text = (tmp_path / "p.html").read_text(encoding="utf-8")

@@ -46,11 +46,11 @@ def test_a_preview_replaces_the_last_one_whole(any_volume, tmp_path) -> None:
     write_preview(volume, grid, tmp_path / "p.png")
     write_preview(volume[::-1], grid, tmp_path / "p.png")
     assert [path.name for path in tmp_path.iterdir()] == ["p.png"]
-    for wrong, path, error in (
-        (np.full(grid.shape, np.nan), "p.png", InputError), (volume[1:], "p.png", InputError), (volume, "none/p.png", OutputError)
-    ):  # fmt: skip
-        with pytest.raises(error):
-            write_preview(wrong, grid, tmp_path / path)
+    for wrong, said in ((np.full(grid.shape, np.nan), "NaN"), (volume[1:], "shape")):
+        with pytest.raises(InputError, match=said):
+            write_preview(wrong, grid, tmp_path / "p.png")
+    with pytest.raises(OutputError):
+        write_preview(volume, grid, tmp_path / "none" / "p.png")
 
 
 class FakeViewer(SimpleNamespace):

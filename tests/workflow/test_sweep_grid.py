@@ -91,16 +91,16 @@ def test_what_is_wrong_is_named_at_once(read) -> None:
         (GRID + '[[grid]]\nmethod = ["sirt", "sitr"]\n', r"\[\[grid\]\] 1 \(method='sitr'\): --method"),
         (GRID + "[[runs]]\ntv_wieght = 0.1\n", r"\[\[runs\]\] 1 .*tv_wieght.*did you mean 'tv_weight'"),
         (GRID + "[[grid]]\ncontrol.evrey = [1]\n", "evrey.*did you mean 'every'"),
-        (GRID + '[[grid]]\nmethod = "fdk"\npreset = ["hann", "ham"]\n', "preset='ham'.*--preset: found 'ham'"),
+        (GRID + '[[grid]]\nmethod = "fdk"\npreset = ["hann", "ham"]\n', "preset='ham'.*found 'ham'"),
         (GRID + "[[grid]]\niterations = [10, -1]\n", "iterations=-1"),
         (GRID + "[[grid]]\niterations = []\n", "iterations: found an empty list"),
         (GRID + "[[grid]]\nmedian_filter = [0, 4]\n", "median_filter=4"),
         (GRID + "[[runs]]\nseed = 1\n", "seed: found 1; expected no option of a run; write seeds"),
         (GRID + '[[runs]]\ndevice = "gpu"\n', "device.*say it as --device"),
         (GRID + "[[runs]]\n[options]\niteratoins = 5\n", "iteratoins.*did you mean 'iterations'"),
-        (GRID + "[options]\nrates = 1\n[[runs]]\nrates.position = [2e-4, 2e-5]\n", "rates.position: found rates=1 too"),
+        (GRID + "[options]\nrates = 1\n[[runs]]\nrates.position = [2e-4, 2e-5]\n", "found rates=1 too"),
         (GRID + f"[[grid]]\nrates{'.a' * 3000} = 1\n", "found tables in tables in tables"),
-        (GRID + f'[[grid]]\nmethod = "sirt"\niterations = {MANY}\nrelaxation = {MANY}\n', "combinations; expected at most"),
+        (GRID + f"[[grid]]\niterations = {MANY}\ngaussians = {MANY}\n", "combinations; expected at most"),
     ):
         with pytest.raises(InputError, match=message):
             read(text)

@@ -178,8 +178,8 @@ def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, job, no_dask
     refused(["sweep", grid.with_name("none.toml"), "-o", job.folder])
     grid.write_text(TEXT.replace("iterations", "iteration"))
     refused(command)
-    bench = ["table1", "--rows", "FDK", "--size", "XS", "-o", str(job.folder / "bench"), "--scheduler", "local"]
-    assert tables_command.run(bench) == 2
+    bench = ["table1", "--rows", "FDK", "--size", "XS", "--scheduler", "local"]
+    assert tables_command.run([*bench, "-o", str(job.folder / "bench")]) == 2
     error = capfd.readouterr().err
     assert error.count("\n") == 1 and install in error
 
