@@ -83,72 +83,51 @@ def test_what_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypat
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def at_a_kernel(kernel: str = "press", before: str = "") -> str:
+    """A program that does what ``kernel`` does where a kernel is built."""
+    return f"{textwrap.dedent(before)}\nimport phyradgs_cl.runtime as r\nr.Runtime.kernel = {kernel}\n"
+
+
 # Each program presses Ctrl-C itself, at a stage of its own, in a process that starts as a user's would.
 PROCESSES = {
     "while libraries load": """
         class Press:
             def find_spec(self, name, path, target=None):
                 if name == "typer":
-                    signal.raise_signal(signal.SIGINT)
+                    press()
         sys.meta_path.insert(0, Press())
     """,
-    "while a kernel is built": """
-        import phyradgs_cl.runtime as r
-        def kernel(*_, **__):
-            signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = kernel
-    """,
-    "as kill asks, while a kernel is built": """
-        import phyradgs_cl.runtime as r
-        def kernel(*_, **__):
-            signal.raise_signal(signal.SIGTERM)
-        r.Runtime.kernel = kernel
-    """,
-    "and again while the line is printed": """
+    "while a kernel is built": at_a_kernel(),
+    "as kill asks": at_a_kernel("lambda *_, **__: signal.raise_signal(signal.SIGTERM)"),
+    "and again while the line is printed": at_a_kernel(
+        before="""
         import typer
-        import phyradgs_cl.runtime as r
-        def press(*_, **__):
-            signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = press
         echo = typer.echo
-        def pressed(*arguments, **options):
-            echo(*arguments, **options)
-            press()
-        typer.echo = pressed
-    """,
-    "in a destructor, which swallows exceptions": """
-        import phyradgs_cl.runtime as r
-        class Thing:
-            def __del__(self):
-                signal.raise_signal(signal.SIGINT)
+        typer.echo = lambda *words, **options: (echo(*words, **options), press())
+        """
+    ),
+    "in a destructor, which swallows exceptions": at_a_kernel(
+        "lambda *_, **__: [Thing()].clear()", "class Thing:\n    __del__ = press\n"
+    ),
+    "in a library that swallows whatever comes": at_a_kernel(
+        "kernel",
+        "def kernel(*_, **__):\n    with contextlib.suppress(BaseException):\n        press()\n",
+    ),
+    "while a folder is half written": at_a_kernel(
+        "kernel",
+        """
         def kernel(*_, **__):
-            Thing()
-        r.Runtime.kernel = kernel
-    """,
-    "in a library that swallows whatever comes": """
-        import phyradgs_cl.runtime as r
-        from contextlib import suppress
-        def kernel(*_, **__):
-            with suppress(BaseException):
-                signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = kernel
-    """,
-    "while a folder is half written": """
-        import os
-        from phyradgs_cl import signals
-        import phyradgs_cl.runtime as r
-        def kernel(*_, **__):
+            from phyradgs_cl import signals
             signals.unfinished.add(os.path.abspath("volume.part"))
             os.mkdir("volume.part")
             open("volume.part/slice", "w").close()
-            signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = kernel
-    """,
+            press()
+        """,
+    ),
     "while the output is half written": """
         import h5py
-        h5py.Group.require_group = h5py.Group.create_group = lambda *_, **__: signal.raise_signal(signal.SIGINT)
+        h5py.Group.require_group = h5py.Group.create_group = press
         import phyradgs_cl.workflow.simulate as w
-        import contextlib
         w.finish_despite_interrupt = contextlib.nullcontext  # as in a command that does not hold signals
     """,
 }
@@ -291,8 +270,9 @@ def test_signals_are_answered_before_anything_heavy_loads():
 def run_process(arguments, body):
     """The command line in a process that runs ``body`` first."""
     program = (
-        "import signal, sys\n"
+        "import contextlib, os, signal, sys\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def press(*_, **__):\n    signal.raise_signal(signal.SIGINT)\n"
         f"sys.argv = {['phyradgs', *arguments]!r}\n"
         f"from phyradgs_cl.__main__ import main\n{textwrap.dedent(body)}\nmain()\n"
     )

@@ -46,53 +46,31 @@ def _first(value: float) -> Change:
     return _changed(change)
 
 
-def removed(file: h5py.File, address: str) -> None:
-    del file[address]
+def _instead(make: Change) -> Change:
+    """Something else at the address, or nothing."""
 
+    def change(file: h5py.File, address: str) -> None:
+        del file[address]
+        make(file, address)
 
-def _misspelt(file: h5py.File, address: str) -> None:
-    file.move(address, f"{address}s")
-
-
-def _group(file: h5py.File, address: str) -> None:
-    del file[address]
-    file.create_group(address)
-
-
-def _dataset(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = 1.0
+    return change
 
 
 def _external_link(file: h5py.File, address: str) -> None:
     """To a good dataset of the same name in a good file beside this one."""
-    outside = Path(file.filename).with_name("outside.h5")
-    with h5py.File(outside, "w") as other:
+    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
         file.copy(address, other, name="there")
     del file[address]
     file[address] = h5py.ExternalLink("outside.h5", "/there")
 
 
-def _soft_loop(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = h5py.SoftLink("/loop")
-    file["/loop"] = h5py.SoftLink(address)
-
-
-def _dangling(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = h5py.SoftLink("/nowhere")
-
-
 def _virtual(file: h5py.File, address: str) -> None:
-    shape, dtype = file[address].shape, file[address].dtype
-    outside = Path(file.filename).with_name("outside.h5")
-    with h5py.File(outside, "w") as other:
-        other["there"] = file[address][()]
-    attributes = dict(file[address].attrs)
-    del file[address]
-    layout = h5py.VirtualLayout(shape, dtype)
+    shape, attributes = file[address].shape, dict(file[address].attrs)
+    layout = h5py.VirtualLayout(shape, file[address].dtype)
     layout[...] = h5py.VirtualSource("outside.h5", "there", shape)
+    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
+        other["there"] = file[address][()]
+    del file[address]
     file.create_virtual_dataset(address, layout).attrs.update(attributes)
 
 
@@ -105,9 +83,8 @@ def _stored_outside(file: h5py.File, address: str) -> None:
 
 
 def _references(file: h5py.File, address: str) -> None:
-    shape = file[address].shape
-    values = np.full(shape, file["/"].ref, h5py.ref_dtype) if shape else file["/"].ref
-    put(file, address, values, dtype=h5py.ref_dtype)
+    shape, root = file[address].shape, file["/"].ref
+    put(file, address, np.full(shape, root, h5py.ref_dtype) if shape else root, dtype=h5py.ref_dtype)
 
 
 def _huge(chunks: bool) -> Change:
@@ -140,10 +117,18 @@ def _many_times_one_text(file: h5py.File, address: str) -> None:
     made.id.write_direct_chunk((0,), one * 100_000)
 
 
+REMOVED = _instead(lambda file, address: None)
+LINKS: dict[str, Change] = {
+    "an external link": _external_link,
+    "a loop of links": _instead(
+        lambda f, a: (f.__setitem__(a, h5py.SoftLink("/loop")), f.__setitem__("/loop", h5py.SoftLink(a)))
+    ),
+    "a dangling link": _instead(lambda f, a: f.__setitem__(a, h5py.SoftLink("/nowhere"))),
+}
 FIELD: dict[str, Change] = {
-    "removed": removed,
-    "misspelt": _misspelt,
-    "a group": _group,
+    "removed": REMOVED,
+    "misspelt": lambda f, a: f.move(a, f"{a}s"),
+    "a group": _instead(lambda f, a: f.create_group(a)),
     "a text": lambda f, a: put(f, a, "text"),
     "texts": lambda f, a: put(f, a, ["a", "b"]),
     "an axis more": _changed(lambda v: np.stack([v, v])),
@@ -157,9 +142,7 @@ FIELD: dict[str, Change] = {
     "minus infinite": _first(-np.inf),
     "extreme": _first(1e300),
     "minus extreme": _first(-1e300),
-    "an external link": _external_link,
-    "a loop of links": _soft_loop,
-    "a dangling link": _dangling,
+    **LINKS,
     "virtual": _virtual,
     "stored outside": _stored_outside,
     "declared huge": _huge(False),
@@ -173,13 +156,8 @@ TEXT: dict[str, Change] = {
     "not UTF-8": lambda f, a: put(f, a, np.bytes_(b"\xff\xfe\xfd")),
     "one text many times": _many_times_one_text,
 }
-GROUP: dict[str, Change] = {
-    "removed": removed,
-    "a dataset": _dataset,
-    "an external link": _external_link,
-    "a loop of links": _soft_loop,
-    "a dangling link": _dangling,
-}
+_dataset = _instead(lambda file, address: file.__setitem__(address, 1.0))
+GROUP: dict[str, Change] = {"removed": REMOVED, "a dataset": _dataset, **LINKS}
 BOMB: Change = _bomb
 
 

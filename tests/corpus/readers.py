@@ -1,4 +1,4 @@
-"""Every reader of the package on one file or folder: what `fuzz_worker` calls, by name."""
+"""Every reader of the package on one file or folder: what `worker` calls, by name."""
 
 from __future__ import annotations
 

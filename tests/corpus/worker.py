@@ -1,8 +1,8 @@
 """Works through questions in a process that may die, and says what each cost: python worker.py commands|readers.
 
-Each line in is a question in JSON: the words of a command, or [reader, path]; each line out is an answer. Standard error
-is caught at its descriptor, so that libraries' own complaints count too. Seconds are the process's own, whatever else the
-machine does.
+Each line in is a question in JSON: the words of a command, or [reader, path]; each line out is an answer. Standard
+error is caught at its descriptor, so that libraries' own complaints count too. Seconds are the process's own, whatever
+else the machine does.
 """
 
 from __future__ import annotations
