@@ -36,6 +36,8 @@ def test_damaged_scans(kept, scan, tmp_path) -> None:
     path = tmp_path / "scan.h5"
     for address, value, culprit in (
         ("instrument/detector/data", None, "detector/data"),
+        ("instrument/detector/distance", np.nan, "detector/distance"),
+        ("phyradgs/reference/volume", np.zeros((2, 2, 2)), "reference"),
         ("phyradgs/reference/volume", np.zeros((8, 8, 8), "f4"), "reference/volume: found no voxel above 0"),
         ("instrument/detector/count_time", 5e-324, "detector/count_time: found 4.94066e-324 s"),
     ):
