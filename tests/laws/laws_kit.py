@@ -14,12 +14,9 @@ from phyradgs_cl.fields import Grid
 
 STRESSED = int(os.environ.get("STRESS", "1")) > 1
 many = settings(
-    max_examples=1000 if STRESSED else 20,
-    deadline=None,
-    derandomize=True,
-    database=None,
+    max_examples=1000 if STRESSED else 20, deadline=None, derandomize=True, database=None,
     suppress_health_check=list(HealthCheck),
-)
+)  # fmt: skip
 """Cases of a law: a thousand in `make stress`."""
 
 
