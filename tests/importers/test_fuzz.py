@@ -6,7 +6,6 @@ import random
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,18 +20,6 @@ OPTIONS = {
 }
 TRIES, SECONDS = 60, 25.0
 TRIES_HDF5 = 12  # each begins with a process of its own
-WRITERS = {
-    "r2": w.write_r2,
-    "phyradgs": w.write_phyradgs,
-    "phyradgs-real": w.write_phyradgs_real,
-    "naf": w.write_naf,
-    "rtk": w.write_rtk,
-    "data-exchange": w.write_data_exchange,
-    "nxtomo": w.write_nxtomo,
-    "tiff": w.write_tiff,
-}
-
-
 def damaged(path: Path, rng: random.Random) -> None:
     """Some bytes of one file changed, taken out, put in, or everything cut off, mostly near its beginning."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
@@ -65,12 +52,8 @@ def tries(good: Path, folder: Path, seed: int, count: int) -> Iterator[Path]:
 @pytest.mark.filterwarnings("ignore")  # NumPy reads old headers with a warning
 @pytest.mark.parametrize("form", FORMATS)
 def test_random_damage(tmp_path, make_truth, form) -> None:
-    truth = make_truth(fly=form.startswith("phyradgs"))
-    if form == "phyradgs-real":
-        geometry = replace(truth.scan.geometry, detector_offset_mm=(4.0, 0.0))
-        truth = make_truth(fly=True, geometry=geometry)
     (tmp_path / "good").mkdir()
-    good = WRITERS[form](tmp_path / "good" / "scan", truth)
+    good = w.write(form, tmp_path / "good", make_truth)
     refused, count = 0, TRIES_HDF5 if form in ("data-exchange", "nxtomo") else TRIES
     for path in tries(good, tmp_path, seed=len(form), count=count):
         before = time.monotonic()
