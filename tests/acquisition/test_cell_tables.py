@@ -207,11 +207,8 @@ def test_a_static_table_is_one_cell_of_all_lines() -> None:
 def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
     assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
     for model, name, lowest, highest in (
-        (MicroViews, "strips", 1, 10_000),
-        (MicroViews, "sub_intervals", 1, 10_000),
-        (PerRow, "sub_intervals", 1, 10_000),
-        (Exact, "segments", 0, 1000),
-        (Exact, "time_error", 1e-6, 1),
+        (MicroViews, "strips", 1, 10_000), (MicroViews, "sub_intervals", 1, 10_000),
+        (PerRow, "sub_intervals", 1, 10_000), (Exact, "segments", 0, 1000), (Exact, "time_error", 1e-6, 1),
     ):
         for inside in (lowest, highest):
             assert getattr(model(**{name: inside}), name) == inside

@@ -24,11 +24,8 @@ START_S = 3.0
 SPEED_RAD_PER_S = 0.25
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, SPEED_RAD_PER_S))
 SHUTTERS = {
-    "rolling": Shutter(0.8, 0.6),
-    "backwards": Shutter(0.8, 0.6, "rows", -1),
-    "slow readout": Shutter(0.2, 1.6),
-    "global": Shutter(0.8, 0.0),
-    "a moment": Shutter(0.0, 0.6),
+    "rolling": Shutter(0.8, 0.6), "backwards": Shutter(0.8, 0.6, "rows", -1),
+    "slow readout": Shutter(0.2, 1.6), "global": Shutter(0.8, 0.0), "a moment": Shutter(0.0, 0.6),
     "pulsed": Shutter(0.8, 0.6, pulse_s=(0.5, 0.4)),
     "pulse that misses lines": Shutter(0.2, 0.6, pulse_s=(0.3, 0.1)),
 }

@@ -27,8 +27,7 @@ def test_a_panel_that_clips_is_found() -> None:
 
 
 GOOD = {
-    "noise": (counts(noisy=True), AIR),
-    "no noise": (counts(noisy=False), AIR),
+    "noise": (counts(noisy=True), AIR), "no noise": (counts(noisy=False), AIR),
     "no noise at the end of 16 bits": (np.round(counts(noisy=False) * 65535 / AIR), 65535.0),
     "noise and a hot pixel": (np.where(np.arange(64) == 9, 65535, counts(noisy=True)) * (np.arange(48) == 9)[:, None], AIR),
     "NaN": (np.where(counts(True) > 50_500, np.nan, counts(True)), AIR),

@@ -47,8 +47,7 @@ def test_clipped_counts_are_masked_in_their_own_frames(caplog) -> None:
     assert same.mask is None and same.saturation == found.saturation and (same.values[frames == 40000] == 0).all()
     text = f"f: {100 * share:.3g} % of the projections' pixels are clipped at 40000 counts: "
     assert caplog.messages == [
-        text + "masked, each in its own frame",
-        text + "taken as air, for the flats are clipped too",
+        text + "masked, each in its own frame", text + "taken as air, for the flats are clipped too",
     ]
 
 
@@ -88,10 +87,8 @@ def test_frames_are_turned_to_row_0_below_and_column_0_left() -> None:
 CONTENT = {
     "rows": np.arange(6.0).reshape(2, 3),
     "columns": np.asfortranarray(np.arange(6, dtype=">i4").reshape(2, 3)),
-    "large": np.arange(300, dtype=np.float32),
-    "scalars": [np.float32(2.5), np.int64(3), np.array(1.5)],
-    "plain": [1, 2.5, "é", b"x", None, True, (4, -5)],
-    7: {},
+    "large": np.arange(300, dtype=np.float32), "scalars": [np.float32(2.5), np.int64(3), np.array(1.5)],
+    "plain": [1, 2.5, "é", b"x", None, True, (4, -5)], 7: {},
 }
 
 
@@ -109,12 +106,9 @@ RAW = np.arange(6, dtype="<i2").tobytes()
 CALLS = {
     "numpy.core.numeric _frombuffer": [
         ((RAW, "TYPE", (7,), "C"), r"shape \(7,\) in 12 bytes"),
-        ((RAW, "TYPE", (-6,), "C"), "impossible shape"),
-        ((RAW, "TYPE", (1,) * 9, "C"), "impossible shape"),
-        ((RAW, "TYPE", [6], "C"), "impossible shape"),
-        ((RAW, "TYPE", (True,), "C"), "impossible shape"),
-        ((RAW, "i2", (6,), "C"), "without numbers"),
-        ((None, "TYPE", (6,), "C"), "without numbers"),
+        ((RAW, "TYPE", (-6,), "C"), "impossible shape"), ((RAW, "TYPE", (1,) * 9, "C"), "impossible shape"),
+        ((RAW, "TYPE", [6], "C"), "impossible shape"), ((RAW, "TYPE", (True,), "C"), "impossible shape"),
+        ((RAW, "i2", (6,), "C"), "without numbers"), ((None, "TYPE", (6,), "C"), "without numbers"),
     ],
     "numpy dtype": [((code,), "plain real numbers") for code in ("O8", "c8", "V9", "i4,i4", "a", "b1\n", 3)],
     "_codecs encode": [(("a", "utf-7"), "not latin1"), ((b"a", "latin1"), "not latin1")],

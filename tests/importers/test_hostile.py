@@ -120,8 +120,7 @@ def test_a_hole_among_the_frames_of_a_json_of_several_scans_is_refused(tmp_path,
 
 
 UNKNOWN = {
-    "nothing": lambda p: None,
-    "an empty folder": lambda p: p.mkdir(),
+    "nothing": lambda p: None, "an empty folder": lambda p: p.mkdir(),
     "some text": lambda p: p.write_text("hello"),
     "a folder of text": lambda p: (p.mkdir(), (p / "a.txt").write_text("hello")),
     "two formats": lambda p: (p.mkdir(), [(p / f"a.{s}").write_text("") for s in ("xml", "mha", "toml")]),

@@ -12,10 +12,8 @@ from phyradgs_cl.importers import ImportOptions, import_scan
 
 CONE = ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0)
 SAID = {
-    "--exposure-s": {"exposure_s": 0.4},
-    "--readout-s": {"readout_s": 0.3},
-    "--angle-at": {"angle_at": "middle"},
-    "--readout": {"readout_axis": "rows"},
+    "--exposure-s": {"exposure_s": 0.4}, "--readout-s": {"readout_s": 0.3},
+    "--angle-at": {"angle_at": "middle"}, "--readout": {"readout_axis": "rows"},
     "--readout-direction": {"readout_direction": -1},
 }
 

@@ -57,8 +57,7 @@ def write_phyradgs(folder: Path, truth: Any) -> Path:
     meta = json.loads((folder / "meta_data.json").read_text())
     meta["simulate_train"] = [
         {
-            **entry, "first_line_start": entry["angle"],
-            "first_line_end": entry["angle"] + a,
+            **entry, "first_line_start": entry["angle"], "first_line_end": entry["angle"] + a,
             "last_line_end": entry["angle"] + a * (1 + shutter.readout_s / shutter.exposure_s),
         }
         for entry, a in zip(meta["proj_train"], arc, strict=True)
@@ -222,8 +221,7 @@ def write_pages(path: Path, stack: np.ndarray, way: str) -> None:
         sitk.WriteImage(sitk.GetImageFromArray(stack), str(path))
         return
     options: dict[str, dict[str, Any]] = {
-        "plain": {},
-        "imagej": {"imagej": True},
+        "plain": {}, "imagej": {"imagej": True},
         "planar": {"photometric": "minisblack", "planarconfig": "separate"},
         "volumetric": {"photometric": "minisblack", "volumetric": True},
         "tiled": {"photometric": "minisblack", "volumetric": True, "tile": (16, 16, 16)},

@@ -250,13 +250,10 @@ def test_masked_pixels_may_be_nan(path, make_scan) -> None:
 
 UNITS = {
     "instrument/detector/x_pixel_size": [("um", 1e3), ("m", 1e-3), ("cm", 0.1), ("millimetre", 1.0)],
-    "instrument/detector/distance": [("m", 1e-3)],
-    "instrument/source/distance": [("m", 1e-3), ("m", -1e-3)],
+    "instrument/detector/distance": [("m", 1e-3)], "instrument/source/distance": [("m", 1e-3), ("m", -1e-3)],
     "instrument/detector/count_time": [("ms", 1e3), ("us", 1e6)],
-    "instrument/detector/frame_start_time": [("ms", 1e3)],
-    "sample/rotation_angle": [("rad", np.pi / 180)],
-    "phyradgs/grid/voxel_size": [("m", 1e-3)],
-    "phyradgs/detector_offset": [("um", 1e3)],
+    "instrument/detector/frame_start_time": [("ms", 1e3)], "sample/rotation_angle": [("rad", np.pi / 180)],
+    "phyradgs/grid/voxel_size": [("m", 1e-3)], "phyradgs/detector_offset": [("um", 1e3)],
     "phyradgs/reference/volume": [("1/cm", 10.0), ("1/m", 1e3)],
 }
 
@@ -360,8 +357,7 @@ def test_summary_tells_shape_timing_and_hash(path, make_scan) -> None:
 def test_arguments_that_do_not_fit_are_refused(path, make_scan) -> None:
     scan, key, data = counts_scan(make_scan)
     for arguments in (
-        {"quantity": "hounsfield"},
-        {"quantity": "counts"},
+        {"quantity": "hounsfield"}, {"quantity": "counts"},
         {"data": data, "image_key": key, "quantity": "attenuation"},
         {"data": data, "image_key": key[:-1], "quantity": "counts"},
         {"data": data, "image_key": np.zeros(9, int), "quantity": "counts"},

@@ -85,18 +85,16 @@ def test_the_mean_over_all_subsets_of_times_is_the_loss_of_all_times(field, bund
     whole.backward()
     assert float(mean.detach()) == pytest.approx(float(whole.detach()), rel=FLOAT64)
     for gradient, parameter in zip(found, field.parameters(), strict=True):
-        assert torch.allclose(
-            gradient, parameter.grad, rtol=1e-8, atol=1e-8 * float(parameter.grad.abs().max())
-        )
+        slack = 1e-8 * float(parameter.grad.abs().max())
+        assert torch.allclose(gradient, parameter.grad, rtol=1e-8, atol=slack)
 
 
 def test_a_plain_subset_would_be_biased(field, bundle) -> None:
     integrals = line_integrals(field, *bundle[:2], torch.ones(3, dtype=torch.float64), SAMPLES, bundle[2])
     integrals = integrals.reshape(RAYS, TIMES).detach()
     measured = torch.zeros(RAYS, dtype=torch.float64)
-    plain = torch.stack(
-        [(integrals[:, list(t)].mean(1) - measured) ** 2 for t in combinations(range(TIMES), 2)]
-    )
+    pairs = combinations(range(TIMES), 2)
+    plain = torch.stack([(integrals[:, list(times)].mean(1) - measured) ** 2 for times in pairs])
     excess = plain.mean(0) - log_squares(integrals, measured, TIMES)
     assert torch.allclose(excess, (1 / 2 - 1 / TIMES) * integrals.var(1))
     assert float(excess.max()) > 1e-6

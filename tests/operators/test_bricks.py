@@ -98,8 +98,7 @@ def test_a_projector_of_frames(any_rt, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "tilt"),
-    [((13, 18), 0.0), ((13, 18), 0.05), ((700, 7), 0.0)],
+    ("pixels", "tilt"), [((13, 18), 0.0), ((13, 18), 0.05), ((700, 7), 0.0)],
     ids=["upright", "tilted", "blocks along z"],
 )
 def test_backprojection_of_frames(any_rt, make_geometry, pixels, tilt) -> None:

@@ -190,8 +190,7 @@ def test_refusals(rt) -> None:
     wrong = {
         "volume": lambda: operator.forward(np.zeros((9, 14, 12), np.float32)),
         "frames": lambda: operator.adjoint(np.zeros((2, *SHAPE), np.float32)),
-        "subset": lambda: operator.subset([]),
-        "tables": lambda: RayOperator(rt, GRID, SHAPE, []),
+        "subset": lambda: operator.subset([]), "tables": lambda: RayOperator(rt, GRID, SHAPE, []),
         "frame 3": lambda: RayOperator(rt, GRID, SHAPE, [*cells, *tables("static", axis="columns")]),
     }
     for culprit, call in wrong.items():

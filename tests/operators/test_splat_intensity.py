@@ -47,8 +47,7 @@ def twin(rows: np.ndarray, table: TimeCells, unit: float = UNIT, affine: bool = 
     merged = [
         average(
             np.stack([unit * image[v] / w[v] for image, w in zip(images, weights, strict=True) if w[v] > 0]),
-            [w[v] for w in weights if w[v] > 0],
-            "intensity",
+            [w[v] for w in weights if w[v] > 0], "intensity",
         )
         for v in range(table.lines)
     ]

@@ -63,10 +63,8 @@ def fast_cloud(seed: int, count: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     quaternion = rng.normal(size=(4, count))
     parts = [
-        rng.uniform(-0.4, 0.4, (2, count)),
-        rng.uniform(-0.15, 0.15, (1, count)),
-        rng.uniform(0.025, 0.08, (3, count)),
-        quaternion / np.linalg.norm(quaternion, axis=0),
+        rng.uniform(-0.4, 0.4, (2, count)), rng.uniform(-0.15, 0.15, (1, count)),
+        rng.uniform(0.025, 0.08, (3, count)), quaternion / np.linalg.norm(quaternion, axis=0),
         rng.uniform(0.5, 2.0, (1, count)),
     ]
     return np.concatenate(parts).astype(np.float32).astype(np.float64)

@@ -15,10 +15,8 @@ from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 # not a cube, no cubes as voxels, not centred, odd counts, one voxel thin, one voxel
 GRIDS = [
-    Grid((9, 14, 21), (0.2, 0.11, 0.09), (0.1, -0.2, 0.05)),
-    Grid((17, 5, 33), (0.1, 0.35, 0.06)),
-    Grid((1, 12, 16), (0.3, 0.15, 0.12), (0.2, 0.0, 0.0)),
-    Grid((8, 16, 1), (0.2, 0.12, 0.3)),
+    Grid((9, 14, 21), (0.2, 0.11, 0.09), (0.1, -0.2, 0.05)), Grid((17, 5, 33), (0.1, 0.35, 0.06)),
+    Grid((1, 12, 16), (0.3, 0.15, 0.12), (0.2, 0.0, 0.0)), Grid((8, 16, 1), (0.2, 0.12, 0.3)),
     Grid((1, 1, 1), (0.4, 0.5, 0.6), (0.1, 0.2, 0.3)),
 ]
 IDS = ["x".join(map(str, grid.shape)) for grid in GRIDS]

@@ -167,8 +167,7 @@ def test_poses_that_are_no_plain_circle(rt) -> None:
     ("arc_deg", "offset_mm", "message"),
     [
         (160.0, 0.0, "the views cover 160.0°, complete data need"),
-        (360.0, 2.5, "does not see the rotation axis"),
-        (240.0, 0.9, "displaced detector needs a full turn"),
+        (360.0, 2.5, "does not see the rotation axis"), (240.0, 0.9, "displaced detector needs a full turn"),
     ],
 )
 def test_incomplete_data_are_named(rt, caplog, arc_deg, offset_mm, message) -> None:

@@ -28,11 +28,8 @@ SPLATS = {
 RUNS = [
     ("phyradgs", {**SPLATS, "motion": "exact"}),
     ("phyradgs", {**SPLATS, "motion": "micro-views", "strips": 3, "sub_intervals": 2}),
-    ("r2", {**SPLATS, "motion": "static"}),
-    ("fdk", {"motion": "static"}),
-    ("fdk", {"motion": "per-row"}),
-    ("sirt", {"iterations": 2, "motion": "per-row"}),
-    ("asd-pocs", {"iterations": 2, "motion": "static"}),
+    ("r2", {**SPLATS, "motion": "static"}), ("fdk", {"motion": "static"}), ("fdk", {"motion": "per-row"}),
+    ("sirt", {"iterations": 2, "motion": "per-row"}), ("asd-pocs", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 2, "motion": "static"}),
 ]
 @pytest.fixture(scope="module")

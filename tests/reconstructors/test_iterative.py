@@ -256,8 +256,7 @@ def algorithms(rt, system: System) -> dict[str, Callable[[], object]]:
     return {
         "sart": lambda: Sart(system, SartOptions(), 0),
         "os-sart": lambda: Sart(system, replace(OS_SART, frames_per_subset=2), 0),
-        "sirt": lambda: Sirt(system, SirtOptions()),
-        "cgls": lambda: Cgls(system),
+        "sirt": lambda: Sirt(system, SirtOptions()), "cgls": lambda: Cgls(system),
         "asd-pocs": lambda: AsdPocs(system, free, 0, TvDescent(rt, VOLUME), 0.0),
         "fista-tv": lambda: without_tv(rt, system),
     }
