@@ -47,7 +47,7 @@ def micro_views(strips: int, sub_intervals: int):
     return micro_view_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, strips, sub_intervals)
 
 
-def test_layers_hold_every_lines_weights_once() -> None:
+def test_layers_hold_every_lines_weights_once_and_no_cell_needs_none() -> None:
     """Cells that only touch share a layer."""
     np.testing.assert_array_equal(micro_views(3, 1).layer_numbers, 0)
     assert sorted(micro_views(2, 3).layer_numbers) == [0, 0, 1, 1, 2, 2]
@@ -61,9 +61,6 @@ def test_layers_hold_every_lines_weights_once() -> None:
             for cell in serving:
                 share = 1.0 if table.line_times is None else table.line_times[cell, 2, line]
                 assert weights[numbers[cell], line] == table.weight[cell] * share
-
-
-def test_no_cell_needs_no_layer() -> None:
     none = np.zeros(0, np.int32)
     one = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
     empty = replace(one, line_start=none, line_stop=none, weight=np.zeros(0))
@@ -177,9 +174,11 @@ def test_a_panel_that_turns_about_itself_needs_segments_too(steps) -> None:
     assert segments_for(Turning(), *where) == segments_for(ORBIT, *where) == count
 
 
-def test_one_segment_of_a_gantry_at_rest() -> None:
+def test_a_gantry_at_rest_is_one_cell_of_all_lines() -> None:
     at_rest = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0))
     assert exact_cells(at_rest, Shutter(0.8, 0.6), 0, 3.0, LINES, 1).end_poses is None
+    table = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
+    assert (table.count, table.line_start[0], table.line_stop[0], table.weight[0]) == (1, 0, LINES, 1.0)
 
 
 def test_geometry_and_timing_are_values() -> None:
@@ -197,11 +196,6 @@ def test_geometry_and_timing_are_values() -> None:
     for value in [*plain, *(make() for make in arrays)]:
         with pytest.raises(FrozenInstanceError):
             setattr(value, fields(value)[0].name, None)
-
-
-def test_a_static_table_is_one_cell_of_all_lines() -> None:
-    table = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
-    assert (table.count, table.line_start[0], table.line_stop[0], table.weight[0]) == (1, 0, LINES, 1.0)
 
 
 def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:

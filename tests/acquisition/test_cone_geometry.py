@@ -28,14 +28,11 @@ def test_source_and_pixel_centres_by_hand(angle_rad) -> None:
         np.testing.assert_allclose(centres[row, column], expected, atol=TOLERANCE_MM)
 
 
-def test_without_offset_the_middle_pixel_meets_the_central_ray() -> None:
+def test_middle_pixels_and_many_angles_at_once() -> None:
     geometry = ConeGeometry(5.0, 7.0, (5, 5), (0.1, 0.2))
     pose = geometry.pose(0.4)
     middle = pixel_centres(pose, (5, 5))[2, 2]
     np.testing.assert_allclose(middle, pose[:3] * (1 - 7 / 5), atol=TOLERANCE_MM)
-
-
-def test_many_angles_at_once() -> None:
     angles = np.array(ANGLES_RAD).reshape(2, 3)
     poses = GEOMETRY.pose(angles)
     assert poses.shape == (2, 3, 12)
@@ -43,12 +40,9 @@ def test_many_angles_at_once() -> None:
     assert pixel_centres(poses, (7, 10)).shape == (2, 3, 7, 10, 3)
 
 
-def test_scaling_lengths_scales_poses() -> None:
+def test_scaled_and_transposed_poses() -> None:
     np.testing.assert_allclose(GEOMETRY.scaled(0.01).pose(0.7), 0.01 * GEOMETRY.pose(0.7), atol=1e-14)
     assert GEOMETRY.scaled(0.01).magnification == pytest.approx(1200 / 785)
-
-
-def test_transposed_poses_see_the_transposed_image() -> None:
     pose = GEOMETRY.pose(0.7)
     turned = pixel_centres(transpose_pose(pose), (10, 7))
     np.testing.assert_allclose(turned, pixel_centres(pose, (7, 10)).swapaxes(0, 1), atol=TOLERANCE_MM)

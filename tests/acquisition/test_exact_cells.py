@@ -74,7 +74,7 @@ def test_what_does_not_move_is_one_static_cell() -> None:
         np.testing.assert_array_equal(table.pose, expected.pose)
 
 
-def test_segments_follow_from_bound_and_turn() -> None:
+def test_segments_follow_from_bound_turn_and_contrast() -> None:
     where = (Shutter(0.8, 0.6), 0, START_S)
     counts = [segments_for(ORBIT, *where, bound) for bound in (1.0, 0.02, 0.005, 0.00125)]
     assert counts[0] == 1 and counts == sorted(counts) and counts[3] == pytest.approx(2 * counts[2], abs=1)
@@ -82,19 +82,18 @@ def test_segments_follow_from_bound_and_turn() -> None:
     assert segments_for(faster, *where, 0.005) == pytest.approx(3 * counts[2], abs=2)
     assert segments_for(CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0)), *where, 0.005) == 1
     assert segments_for(ORBIT, *where, 1e-9) == 1000  # there are never more
+    where = (ORBIT, Shutter(0.8, 0.6), 0, START_S, 0.0005)
+    counts = [segments_for(*where, peak) for peak in (0.0, 4.0, 8.0, 16.0)]
+    assert counts[0] == counts[1] < counts[2] < counts[3] <= 2 * counts[0]
 
 
-def test_the_fastest_part_of_a_frame_counts() -> None:
+def test_the_fastest_of_32_parts_of_a_frame_counts() -> None:
     times_s = np.array([0.0, START_S + 0.7, START_S + 1.4, 10.0])
     angles_rad = np.array([0.0, 0.0, 0.35, 0.35])  # at rest, then twice the mean speed, then at rest
     jerky = CircularOrbit(GEOMETRY, EncoderTable(times_s, angles_rad))
     steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 0.5))
     where = (Shutter(0.8, 0.6), 0, START_S, 0.002)
     assert segments_for(jerky, *where) == segments_for(steady, *where) > 1
-
-
-def test_the_fastest_is_sought_in_32_parts() -> None:
-    """A gantry that speeds up from rest turns by a/2 (1 − (31/32)²) in the last part; 64 parts would give 76 segments."""
     ramp = CircularOrbit(GEOMETRY, SpeedRamp(0.0, 0.0, 3.0))
     fastest_rad = 32 * 1.5 * (1 - (31 / 32) ** 2)
     assert segments_for(ramp, Shutter(0.4, 0.6), 0, 0.0, 0.0005) == 75
@@ -107,9 +106,3 @@ def test_impossible_numbers_are_named() -> None:
             Exact(**{option: -1 if option == "segments" else 0.0})
     with pytest.raises(InputError, match="segments"):
         exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 0)
-
-
-def test_averaged_intensities_take_more_segments_where_contrast_is_high() -> None:
-    where = (ORBIT, Shutter(0.8, 0.6), 0, START_S, 0.0005)
-    counts = [segments_for(*where, peak) for peak in (0.0, 4.0, 8.0, 16.0)]
-    assert counts[0] == counts[1] < counts[2] < counts[3] <= 2 * counts[0]

@@ -22,12 +22,17 @@ RIGID_TOLERANCE_MM = 1e-9  # slerp in float64 at 1.5 m
 TIMES_S = np.array([0.0, 0.4, 1.3, 2.9])
 
 
-def test_constant_speed_and_ramp() -> None:
+def test_constant_speed_ramps_and_sweeps_that_go_on_through_the_readout() -> None:
     np.testing.assert_allclose(ConstantSpeed(0.5, -0.2).angle_rad(3, TIMES_S), [0.5, 0.42, 0.24, -0.08])
     ramp = SpeedRamp(0.5, 0.2, 0.1).angle_rad(0, TIMES_S)
     np.testing.assert_allclose(ramp, [0.5, 0.588, 0.8445, 1.5005])
     steady = SpeedRamp(0.5, 0.2, 0.0), ConstantSpeed(0.5, 0.2)
     np.testing.assert_array_equal(*(kinematics.angle_rad(0, TIMES_S) for kinematics in steady))
+    sweeps = FrameSweeps(np.array([0.0, 10.0]), 2.0, np.array([0.1, 0.5]), np.array([0.3, 0.1]))
+    np.testing.assert_allclose(sweeps.angle_rad(0, np.array([0.0, 1.0, 2.0, 3.0])), [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(sweeps.angle_rad(1, np.array([10.0, 12.0, 13.0])), [0.5, 0.1, -0.1])
+    at_rest = FrameSweeps(np.zeros(1), 0.0, np.array([0.7]), np.array([0.9]))
+    np.testing.assert_array_equal(at_rest.angle_rad(0, np.array([0.0, 5.0])), [0.7, 0.7])
 
 
 def test_tables_are_linear_between_their_samples_and_never_continued() -> None:
@@ -42,15 +47,12 @@ def test_tables_are_linear_between_their_samples_and_never_continued() -> None:
             poses.pose(5, np.array([1.0, time_s]))
 
 
-def test_rounding_of_stored_times_is_forgiven() -> None:
+def test_rounding_of_stored_times_is_forgiven_up_to_a_slack() -> None:
     time_s = np.array([0.1, 3.3])
     encoder, poses = EncoderTable(time_s, [0.0, 1.0]), PoseTable(time_s, GEOMETRY.pose(np.array([0.0, 1.0])))
     asked_s = np.array([0.1 - 1e-10, 3.3 + 1e-10])
     np.testing.assert_allclose(encoder.angle_rad(0, asked_s), [0, 1])
     np.testing.assert_allclose(poses.pose(0, asked_s), poses.table, atol=RIGID_TOLERANCE_MM)
-
-
-def test_the_slack_is_a_billionth_of_the_last_time_and_at_least_a_nanosecond() -> None:
     for times_s, slack_s in [([0.0, 0.25, 0.5], 1e-9), ([0.0, 1.0, 1000.0], 1e-6)]:
         encoder, last_s = EncoderTable(times_s, [0.0, 0.1, 0.2]), times_s[-1]
         for share in (0.9, 1.0):
@@ -59,14 +61,6 @@ def test_the_slack_is_a_billionth_of_the_last_time_and_at_least_a_nanosecond() -
         for beyond_s in (-1.1 * slack_s, last_s + 1.1 * slack_s):
             with pytest.raises(InputError, match="encoder table"):
                 encoder.angle_rad(0, np.array([beyond_s]))
-
-
-def test_frame_sweeps_go_on_through_the_readout() -> None:
-    sweeps = FrameSweeps(np.array([0.0, 10.0]), 2.0, np.array([0.1, 0.5]), np.array([0.3, 0.1]))
-    np.testing.assert_allclose(sweeps.angle_rad(0, np.array([0.0, 1.0, 2.0, 3.0])), [0.1, 0.2, 0.3, 0.4])
-    np.testing.assert_allclose(sweeps.angle_rad(1, np.array([10.0, 12.0, 13.0])), [0.5, 0.1, -0.1])
-    at_rest = FrameSweeps(np.zeros(1), 0.0, np.array([0.7]), np.array([0.9]))
-    np.testing.assert_array_equal(at_rest.angle_rad(0, np.array([0.0, 5.0])), [0.7, 0.7])
 
 
 def test_an_orbit_asks_geometry_and_kinematics() -> None:

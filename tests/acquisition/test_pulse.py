@@ -29,7 +29,7 @@ TIME_TOLERANCE_S = 1e-12
 DARK_FROM = Shutter(0.8, 1.2, pulse_s=(0.1, 0.9))  # the last lines open after 1.0 s
 
 
-def test_a_window_is_cut_by_the_pulse() -> None:
+def test_a_window_is_cut_by_the_pulse_or_missed() -> None:
     shutter = Shutter(0.8, 0.6, pulse_s=(0.3, 0.7))
     expected = [[max(0.1 * r, 0.3), min(0.1 * r + 0.8, 1.0)] for r in range(7)]
     np.testing.assert_allclose(shutter.line_windows_s(7), expected, atol=TIME_TOLERANCE_S)
@@ -37,6 +37,9 @@ def test_a_window_is_cut_by_the_pulse() -> None:
     assert shutter.middle_s == pytest.approx(0.65)
     seen = np.diff(expected)[:, 0]
     np.testing.assert_allclose(shutter.lit_share(7), seen / seen.max(), rtol=1e-12)
+    windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
+    np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
+    np.testing.assert_array_equal(windows_s[5:], 1.0)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -50,12 +53,6 @@ def test_a_pulse_over_the_whole_span_changes_nothing(direction) -> None:
     for build, more in ((micro_view_cells, (4, 3)), (per_line_cells, (3,)), (static_cells, ())):
         ours, theirs = (build(ORBIT, s, *where, *more) for s in (plain, pulsed))
         np.testing.assert_array_equal(ours.time_s, theirs.time_s)
-
-
-def test_lines_that_the_pulse_misses_have_no_share_and_one_moment() -> None:
-    windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
-    np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
-    np.testing.assert_array_equal(windows_s[5:], 1.0)
 
 
 def test_a_billionth_of_a_window_is_rounding() -> None:

@@ -18,19 +18,13 @@ def test_delay_is_the_papers_fraction_of_the_readout(lines) -> None:
     np.testing.assert_array_equal(Shutter(1.0, 0.86, direction=-1).delay_s(lines), forward[::-1])
 
 
-def test_first_and_last_line_bound_the_span() -> None:
+def test_lines_and_the_span_of_their_delays() -> None:
     shutter = Shutter(0.4, 0.3, "columns", -1)
     delay_s = shutter.delay_s(9)
     assert shutter.span_s == pytest.approx(0.7)
     assert delay_s[8] == 0 and delay_s[0] + shutter.exposure_s == pytest.approx(shutter.span_s)
-
-
-def test_global_shutter_and_a_single_line_have_no_delay() -> None:
     np.testing.assert_array_equal(Shutter(1.0).delay_s(5), np.zeros(5))
     np.testing.assert_array_equal(Shutter(1.0, 0.5).delay_s(1), [0.0])
-
-
-def test_lines_run_along_the_readout_axis() -> None:
     assert Shutter(1.0, axis="rows").lines((7, 10)) == 7
     assert Shutter(1.0, axis="columns").lines((7, 10)) == 10
 

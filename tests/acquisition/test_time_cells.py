@@ -79,11 +79,16 @@ def test_per_line_cells_sample_each_lines_own_exposure(axis, direction) -> None:
             np.testing.assert_allclose(found_s, middles_s, atol=TIME_TOLERANCE_S)
 
 
-def test_poses_are_those_of_the_times() -> None:
+def test_poses_and_times_of_micro_views() -> None:
     cells = micro_view_cells(ORBIT, Shutter(0.8, 0.3), 0, START_S, 7, 3, 2)
     angles_rad = 0.1 + SPEED_RAD_PER_S * cells.time_s
     np.testing.assert_allclose(cells.pose[:, 0], 50 * np.cos(angles_rad), atol=1e-12)
     np.testing.assert_allclose(cells.pose[:, 1], 50 * np.sin(angles_rad), atol=1e-12)
+    shutter, lines = Shutter(0.8, 0.3), 200
+    micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
+    exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
+    np.testing.assert_array_equal(micro.line_start, exact.line_start)
+    assert np.abs(micro.time_s - exact.time_s).max() <= 0.3 / lines / 2 * (1 + 1e-9)
 
 
 def test_static_cells_stand_mid_window_and_at_the_start() -> None:
@@ -104,15 +109,6 @@ def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_i
     per_line = per_line_cells(ORBIT, shutter, 0, START_S, 7, sub_intervals)
     for cells in (micro, per_line):
         np.testing.assert_array_equal(cells.pose, np.broadcast_to(static.pose, cells.pose.shape))
-
-
-def test_many_micro_views_meet_the_per_line_times() -> None:
-    """With one strip per line, mean times differ from the exact ones by at most half a strip's readout."""
-    shutter, lines = Shutter(0.8, 0.3), 200
-    micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
-    exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
-    np.testing.assert_array_equal(micro.line_start, exact.line_start)
-    assert np.abs(micro.time_s - exact.time_s).max() <= 0.3 / lines / 2 * (1 + 1e-9)
 
 
 def test_counts_below_one_are_refused() -> None:

@@ -46,9 +46,11 @@ def test_a_clean_scan_has_nothing_suspicious(rt, clean) -> None:
     assert seen == [(n, 11, question) for n, question in enumerate([*verdicts(found), ""])]
 
 
-def test_the_wrong_sign_of_rotation(rt, clean) -> None:
+def test_the_wrong_sign_of_rotation_and_scans_at_rest(rt, clean) -> None:
     found = check(negative(clean), rt)
     assert suspected(found) == ["sign of rotation"]
+    asked = verdicts(check(replace(clean, is_fly=False), rt))
+    assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 10
 
 
 @pytest.mark.parametrize(
@@ -168,11 +170,6 @@ def test_the_wrong_sign_of_readout(rt, scan_of) -> None:
     assert verdicts(check(other, rt))["sign of readout"] == SUSPICIOUS
 
 
-def test_scans_at_rest_are_not_asked_about_lines(rt, clean) -> None:
-    asked = verdicts(check(replace(clean, is_fly=False), rt))
-    assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 10
-
-
 def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     path = tmp_path / "scan.h5"
     write_scan(path, clean)
@@ -228,7 +225,7 @@ def test_options_that_do_not_go_together(cli, clean, tmp_path, monkeypatch, caps
         assert [p.name for p in tmp_path.iterdir()] == ["SCAN"]
 
 
-def test_masked_pixels_hold_anything_but_not_all_may_be_masked(rt, clean) -> None:
+def test_masked_pixels_and_pulsed_beams(rt, clean) -> None:
     p, mask = clean.projections.copy(), np.zeros(clean.geometry.detector_shape, bool)
     mask[5, 7] = True
     p[:, 5, 7] = np.nan
@@ -238,10 +235,6 @@ def test_masked_pixels_hold_anything_but_not_all_may_be_masked(rt, clean) -> Non
         check(replace(clean, projections=p), rt)
     with pytest.raises(InputError, match="every pixel masked"):
         check(replace(clean, pixel_mask=np.ones_like(mask)), rt)
-
-
-def test_of_a_pulsed_beam_the_exposure_tells_nothing(rt, clean) -> None:
-    """Half the exposure would leave other lines in the dark: their residuals cannot be compared."""
     scan = replace(clean, shutter=replace(clean.shutter, pulse_s=(0.5, 0.5)))
     finding = check_exposure(rt, scan)
     assert finding.verdict == CANNOT_TELL and "pulse" in finding.text and "pulse" in finding.advice

@@ -47,14 +47,11 @@ def test_frames_must_follow_each_other(clean) -> None:
     assert check_timing(replace(clean, frame_start_s=start_s)).verdict == SUSPICIOUS
 
 
-def test_speed_within_frames_that_does_not_fit_the_steps_between_them(clean) -> None:
+def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean) -> None:
     sweeps = clean.trajectory.kinematics
     slower = replace(sweeps, angle_end_rad=(sweeps.angle_start_rad + sweeps.angle_end_rad) / 2)
     finding = check_timing(replace(clean, trajectory=CircularOrbit(clean.geometry, slower)))
     assert finding.verdict == SUSPICIOUS and "12° from frame to frame, the angles say 24°" in finding.advice
-
-
-def test_an_encoder_that_wanders_is_no_fault(clean) -> None:
     time_s = np.linspace(0, 30, 301)
     table = EncoderTable(time_s, np.deg2rad(24 * time_s) + 0.02 * np.sin(time_s))
     scan = replace(clean, trajectory=CircularOrbit(clean.geometry, table))
@@ -105,7 +102,7 @@ def test_saturated_areas_but_not_noise_that_is_cut_off(clean) -> None:
     assert finding.verdict == SUSPICIOUS and finding.text.startswith("100 % of the pixels")  # no power of ten
 
 
-def test_counts_at_the_ceiling_are_seen_on_reading(clean) -> None:
+def test_counts_at_the_ceiling_are_seen_on_reading_or_believed_of_an_import(clean) -> None:
     p = clean.projections
     bright, flat = np.minimum(7e4 * np.exp(-p), 65535), np.full((1, *p.shape[1:]), 65535.0)
     data = np.concatenate([flat, bright]).astype(np.uint16)
@@ -118,10 +115,6 @@ def test_counts_at_the_ceiling_are_seen_on_reading(clean) -> None:
     noise = np.random.default_rng(0).poisson(data * 0.1)
     counts(noise.astype(np.uint16), key, "counts")
     assert check_saturation(clean, counts).verdict == OK
-
-
-def test_what_an_import_saw_in_the_counts_is_believed(clean) -> None:
-    """The pixels themselves are masked by then, and line integrals show nothing."""
     finding = check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.25)))
     assert finding.verdict == SUSPICIOUS and "25 % of the pixels lie together at 40000 counts" in finding.text
     assert check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.0))).verdict == OK
@@ -158,14 +151,11 @@ def test_air_without_noise_is_not_dead(clean) -> None:
     assert finding.verdict == SUSPICIOUS and list(zip(*np.nonzero(dead), strict=True)) == [(5, 28), (8, 9)]
 
 
-def test_frames_without_an_object_or_of_another_sign(clean) -> None:
+def test_frames_that_are_no_line_integrals_of_an_object(clean) -> None:
     for factor in (0.0, -1.0):
         finding = check_coverage(replace(clean, projections=factor * clean.projections))
         assert finding.verdict == SUSPICIOUS
         assert "no object" in finding.text and "line integrals" in finding.advice
-
-
-def test_counts_that_are_taken_for_line_integrals(clean) -> None:
     counts = (1000 * np.exp(-clean.projections)).astype(np.float32)
     finding = check_coverage(replace(clean, projections=counts))
     assert finding.verdict == SUSPICIOUS and "--quantity" in finding.advice

@@ -25,17 +25,16 @@ def displaced(scan, u_mm):
     return replace(scan, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics))
 
 
-def test_turning_back_is_the_orbit_of_negative_angles(clean) -> None:
+def test_what_hypotheses_change(clean) -> None:
     scan = displaced(clean, 0.4)
     sweeps = scan.trajectory.kinematics
     negative = replace(sweeps, angle_start_rad=-sweeps.angle_start_rad, angle_end_rad=-sweeps.angle_end_rad)
     expected = replace(scan, trajectory=CircularOrbit(scan.geometry, negative))
     np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(expected), **CLOSE)
-
-
-def test_a_shift_is_an_offset_of_the_panel(clean) -> None:
     moved = displaced(clean, 0.4 + 2.5 * clean.geometry.pixel_size_mm[1])
     np.testing.assert_allclose(poses(shifted(displaced(clean, 0.4), 2.5)), poses(moved), **CLOSE)
+    assert reversed_readout(clean).shutter.direction == -1
+    assert exposed(clean, 0.5).shutter.exposure_s == clean.shutter.exposure_s / 2
 
 
 @pytest.mark.parametrize("block", [2, 3])
@@ -107,21 +106,13 @@ def test_a_table_of_poses_can_be_asked_too(clean) -> None:
     np.testing.assert_allclose(poses(shifted(scan, 2.0)), poses(shifted(clean, 2.0)), atol=1e-6)
 
 
-def test_times_of_hypotheses(clean) -> None:
-    assert reversed_readout(clean).shutter.direction == -1
-    assert exposed(clean, 0.5).shutter.exposure_s == clean.shutter.exposure_s / 2
-
-
-def test_the_vertex_of_a_parabola_and_its_deviation() -> None:
+def test_vertices_of_parabolas_and_the_standing_of_hypotheses() -> None:
     rng = np.random.default_rng(0)
     at, centres = np.array([-1.0, 0.0, 1.0]), rng.normal(0.3, 0.1, 400)
     found, spread = vertex(at, (at[:, None] - centres) ** 2 + 5)
     assert found == pytest.approx(centres.mean())
     assert spread == pytest.approx(0.1 / 20, rel=0.3)
     assert np.isnan(vertex(at, -np.ones((3, 1)) * (at[:, None] - centres) ** 2)[0])
-
-
-def test_the_standing_of_hypotheses_is_antisymmetric() -> None:
     rng = np.random.default_rng(0)
     one = 1 + 0.01 * rng.random(30)
     other = one * (1.05 + 0.01 * rng.random(30))

@@ -36,22 +36,16 @@ def test_flats_and_darks_are_averaged_and_the_inverse_inverts() -> None:
         assert unusable.dtype == bool and not unusable.any()
 
 
-def test_unsigned_counts_below_the_dark_do_not_wrap() -> None:
+def test_counts_below_the_dark_dead_pixels_and_missing_darks() -> None:
     frames = np.array([[[100, 100]], [[1100, 1100]], [[90, 600]]], dtype=np.uint16)
     result, unusable = counts_to_attenuation(frames, [2, 1, 0], "counts")
     assert unusable.tolist() == [[[True, False]]]
     assert result[0, 0, 1] == pytest.approx(np.log(2)) and result[0, 0, 0] == pytest.approx(6 * np.log(10))
-
-
-def test_missing_darks_are_zero() -> None:
-    frames = np.array([[[1000.0]], [[500.0]]])
-    assert counts_to_attenuation(frames, [1, 0], "counts")[0].item() == pytest.approx(np.log(2))
-
-
-def test_dead_pixels_are_masked_and_finite() -> None:
     frames = np.array([[[10.0, 10, 10, 10]], [[10.0, 1e4, 1e4, np.nan]], [[50.0, np.nan, np.inf, 50.0]]])
     result, unusable = counts_to_attenuation(frames, [2, 1, 0], "counts")
     assert unusable.all() and np.isfinite(result).all()
+    frames = np.array([[[1000.0]], [[500.0]]])
+    assert counts_to_attenuation(frames, [1, 0], "counts")[0].item() == pytest.approx(np.log(2))
 
 
 def test_transmission_and_attenuation() -> None:

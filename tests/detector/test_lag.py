@@ -49,7 +49,7 @@ def test_a_scan_gets_its_frames_back() -> None:
             scan(p, lag=lag)
 
 
-def test_masks_follow_the_light() -> None:
+def test_masks_follow_the_light_and_ghosts_are_masked() -> None:
     mask = np.zeros((5, *SHAPE), bool)
     mask[1, 2, 3] = True
     clean = without_lag(scan(lagged(frames(), 0.1), lag=0.1, pixel_mask=mask))
@@ -58,9 +58,6 @@ def test_masks_follow_the_light() -> None:
     np.testing.assert_array_equal(clean.pixel_mask, expected)
     fixed = without_lag(scan(lagged(frames(), 0.1), lag=0.1, pixel_mask=mask[1]))
     np.testing.assert_array_equal(fixed.pixel_mask, mask[1])
-
-
-def test_a_pixel_darker_than_its_own_ghost_is_masked() -> None:
     p = frames(3)
     p[0, 1, 1], p[1, 1, 1] = 0.0, 9.0  # recorded: less than a tenth of the frame before
     clean = without_lag(scan(p, lag=0.1))

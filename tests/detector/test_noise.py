@@ -37,7 +37,7 @@ def test_expected_counts_follow_both_laws() -> None:
     assert np.allclose(expected, 1e4 * np.exp([[[0, -0.25], [-0.5, -1]]]))
 
 
-def test_tigre_spread_is_that_of_error_propagation() -> None:
+def test_spreads_are_those_of_error_propagation() -> None:
     # p' = -m ln(I'/dose): standard deviation m · sqrt(I + 10²) / I for I = dose · exp(-p/m).
     p = np.full((1, 300, 300), 2.0)
     p[0, 0, 0] = 4.0
@@ -45,9 +45,6 @@ def test_tigre_spread_is_that_of_error_propagation() -> None:
     counts = 1e4 * np.exp(-0.5)
     assert noisy.mean() == pytest.approx(2.0, abs=2e-3)
     assert noisy.std() == pytest.approx(4.0 * np.sqrt(counts + 100) / counts, rel=0.02)
-
-
-def test_beer_lambert_spread_is_that_of_error_propagation() -> None:
     noisy = beer_lambert_noise(np.full((1, 300, 300), 2.0), 1e5, 10.0, np.random.default_rng(3))
     counts = 1e5 * np.exp(-2)
     assert noisy.std() == pytest.approx(np.sqrt(counts + 100) / counts, rel=0.02)

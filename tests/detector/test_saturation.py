@@ -34,14 +34,10 @@ GOOD = {
 }
 
 
-def test_what_is_not_clipped_is_not_found() -> None:
+def test_what_is_not_clipped_is_not_found_and_what_is_all_clipped_is(recwarn) -> None:
     for name, (frames, flat) in GOOD.items():
         found = find_saturation(frames, np.full(SHAPE[1:], flat))
         assert found.share == 0 and found.level == np.nanmax(frames), name
-
-
-def test_noise_without_end_is_clipped_even_where_it_is_all(recwarn) -> None:
-    """A panel that shows nothing but its ceiling, or nothing at all."""
     for frames, share in ((np.full(SHAPE, 4095), 1.0), (np.full(SHAPE, np.nan), 0.0)):
         assert find_saturation(frames, np.full(SHAPE[1:], 4095.0)).share == share
     assert not recwarn

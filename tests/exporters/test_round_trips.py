@@ -152,7 +152,7 @@ WRONG = {
 }
 
 
-def test_wrong_wishes_are_one_line(volume_file, tmp_path) -> None:
+def test_wrong_wishes_are_one_line(volume_file, tmp_path, stored) -> None:
     before = sorted(tmp_path.iterdir())
     for wish, word in WRONG.values():
         wish = {**wish, **({"output": tmp_path / wish["output"]} if "output" in wish else {})}
@@ -160,9 +160,6 @@ def test_wrong_wishes_are_one_line(volume_file, tmp_path) -> None:
             export_volume(volume_file, **wish)
         assert word in str(caught.value) and "\n" not in str(caught.value)
         assert sorted(tmp_path.iterdir()) == before
-
-
-def test_no_gaussians_no_cloud(volume_file, stored) -> None:
     write_volume(volume_file, stored.volume, stored.grid, {})
     with pytest.raises(InputError, match="/entry/gaussians"):
         export_volume(volume_file, "ply")

@@ -19,9 +19,6 @@ def test_centres_are_symmetric_about_the_offset() -> None:
     assert GRID.first_centre_mm == (9.5, 18.0, 25.5)
     assert GRID.size_mm == (2.0, 6.0, 12.0)
     assert GRID.half_longest_mm == 6.0
-
-
-def test_a_cube_and_its_scaled_copy() -> None:
     cube = Grid.cube(4, 8.0)
     assert cube == Grid((4, 4, 4), (2.0, 2.0, 2.0))
     scaled = GRID.scaled(0.5)

@@ -62,13 +62,10 @@ def test_the_grid_by_options(run, imported, tmp_path, make_truth) -> None:
     assert "left out" not in run(r2).output and imported().reference is not None
 
 
-def test_timing_by_options(run, imported, tmp_path, make_truth) -> None:
+def test_timing_and_geometry_by_options(run, imported, tmp_path, make_truth) -> None:
     timing = ["--exposure-s", "0.4", "--readout-s", "0.3", "--frame-time-s", "1.25", "--readout", "columns"]
     done = run(w.write_rtk(tmp_path / "rtk", make_truth()), *timing, "--readout-direction", "-1")
     assert "fly-scan" in done.output and imported().shutter == Shutter(0.4, 0.3, "columns", -1)
-
-
-def test_geometry_by_options(run, imported, tmp_path, make_truth) -> None:
     path = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
     cone = ["--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--detector-offset", "4,-6"]
     run(path, *cone, "--pixel-size-mm", "3,2.5", "--rotates", "sample", "--row-0", "top")

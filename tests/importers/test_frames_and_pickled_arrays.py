@@ -18,10 +18,18 @@ from phyradgs_cl.io.scan.reader import united
 FRAMES = np.array([[[100.0, 50.0], [25.0, 10.0]]] * 3, np.float32)
 
 
-def test_one_flat_value_stands_for_flat_frames() -> None:
+def test_flats_one_value_none_or_of_another_panel() -> None:
     found = line_integrals("f", FRAMES, ImportOptions(flat_value=100.0))
     np.testing.assert_allclose(found.values, -np.log(FRAMES / 100), rtol=0, atol=FLOAT32)
     assert found.mask is None and found.saturation == Saturation(100.0, 0.0)
+    with pytest.raises(InputError, match="quantity: found nothing that says it.*--quantity"):
+        line_integrals("f", FRAMES, ImportOptions())
+    with pytest.raises(InputError, match="f flats: found none.*--flat-value"):
+        line_integrals("f", FRAMES, ImportOptions(quantity="counts"))
+    for name in ("flats", "darks"):
+        stacks = {"flats": np.full((1, 2, 2), 100.0, np.float32), name: np.ones((1, 3, 2), np.float32)}
+        with pytest.raises(InputError, match=r"flats or darks of \(3, 2\)"):
+            line_integrals("f", FRAMES, ImportOptions(), **stacks)
 
 
 def test_values_that_no_object_has_are_masked_in_one_line(caplog, recwarn) -> None:
@@ -49,20 +57,6 @@ def test_clipped_counts_are_masked_in_their_own_frames(caplog) -> None:
     assert caplog.messages == [
         text + "masked, each in its own frame", text + "taken as air, for the flats are clipped too",
     ]
-
-
-def test_counts_without_flats_say_what_to_do() -> None:
-    with pytest.raises(InputError, match="quantity: found nothing that says it.*--quantity"):
-        line_integrals("f", FRAMES, ImportOptions())
-    with pytest.raises(InputError, match="f flats: found none.*--flat-value"):
-        line_integrals("f", FRAMES, ImportOptions(quantity="counts"))
-
-
-def test_flats_and_darks_of_another_panel_are_refused() -> None:
-    for name in ("flats", "darks"):
-        stacks = {"flats": np.full((1, 2, 2), 100.0, np.float32), name: np.ones((1, 3, 2), np.float32)}
-        with pytest.raises(InputError, match=r"flats or darks of \(3, 2\)"):
-            line_integrals("f", FRAMES, ImportOptions(), **stacks)
 
 
 def test_masks() -> None:

@@ -111,12 +111,19 @@ def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth, dtype
         import_scan(path)
 
 
-def test_a_hole_among_the_frames_of_a_json_of_several_scans_is_refused(tmp_path, make_truth) -> None:
+def test_frames_by_name(tmp_path, make_truth) -> None:
     """Each frame takes the view of its place from the first one on."""
     path = w.write("phyradgs-real", tmp_path, make_truth)
     (path / "projections" / "2.tif").unlink()
     with pytest.raises(InputError, match=r"3.tif after 1.tif: a hole"):
         import_scan(path, replace(REAL, first_view=0))
+    path = w.write_r2(tmp_path / "r2", make_truth())
+    meta = json.loads((path / "meta_data.json").read_text())
+    for entry in meta["proj_train"]:
+        entry["file_path"] = entry["file_path"].replace(".npy", "_sim1.npy")
+    (path / "meta_data.json").write_text(json.dumps(meta))
+    scan = import_scan(path)
+    np.testing.assert_array_equal(scan.projections, make_truth().scan.projections[:4])
 
 
 UNKNOWN = {
@@ -170,13 +177,3 @@ def test_options_are_checked() -> None:
     ]:  # fmt: skip
         with pytest.raises(InputError, match="^--"):
             ImportOptions(**{name: value})
-
-
-def test_a_second_copy_of_a_simulation_is_found_under_the_first_name(tmp_path, make_truth) -> None:
-    path = w.write_r2(tmp_path / "r2", make_truth())
-    meta = json.loads((path / "meta_data.json").read_text())
-    for entry in meta["proj_train"]:
-        entry["file_path"] = entry["file_path"].replace(".npy", "_sim1.npy")
-    (path / "meta_data.json").write_text(json.dumps(meta))
-    scan = import_scan(path)
-    np.testing.assert_array_equal(scan.projections, make_truth().scan.projections[:4])

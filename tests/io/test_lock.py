@@ -56,6 +56,9 @@ def test_a_run_beside_it_in_the_same_process_is_refused(tmp_path) -> None:
         refused(output, wait_s=0.3)
     with only_run(output):
         pass
+    with pytest.raises(ZeroDivisionError), only_run(tmp_path / "volume.h5"):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_dead_runs_lock_is_taken_over(tmp_path, holder) -> None:
@@ -64,12 +67,6 @@ def test_a_dead_runs_lock_is_taken_over(tmp_path, holder) -> None:
     assert lock_path(tmp_path / "volume.h5").exists()
     with only_run(tmp_path / "volume.h5"):
         assert lock_path(tmp_path / "volume.h5").exists()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_failing_run_leaves_no_lock(tmp_path) -> None:
-    with pytest.raises(ZeroDivisionError), only_run(tmp_path / "volume.h5"):
-        raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
 
 

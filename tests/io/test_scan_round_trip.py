@@ -232,15 +232,12 @@ def test_masks_of_frames_follow_their_frames(path, make_scan) -> None:
     np.testing.assert_array_equal(again.pixel_mask, expected)
 
 
-def test_transmission_is_converted(path, make_scan) -> None:
+def test_transmission_is_converted_and_masked_pixels_may_be_nan(path, make_scan) -> None:
     scan = make_scan()
     data = np.exp(-scan.projections)
     write_scan(path, scan, data=data, image_key=np.zeros(4, int), quantity="transmission")
     again = again_of(path)
     np.testing.assert_allclose(again.projections, scan.projections, atol=1e-5)
-
-
-def test_masked_pixels_may_be_nan(path, make_scan) -> None:
     scan = make_scan(pixel_mask=np.arange(15).reshape(3, 5) == 7)
     scan.projections[1, 1, 2] = np.nan
     again = again_of(path, scan)
@@ -274,7 +271,7 @@ def test_units_are_converted(path, make_scan) -> None:
             same_poses(scan, again)
 
 
-def test_missing_units_are_assumed_and_said(path, make_scan, caplog) -> None:
+def test_what_is_assumed_is_said(path, make_scan, caplog) -> None:
     scan = make_scan()
     write_scan(path, scan)
     with h5py.File(path, "r+") as file:
@@ -282,6 +279,14 @@ def test_missing_units_are_assumed_and_said(path, make_scan, caplog) -> None:
     again = again_of(path)
     assert again.geometry.source_to_detector_mm == pytest.approx(1200)
     assert "/entry/instrument/detector/distance: no units attribute; mm assumed" in caplog.text
+    scan = make_scan()
+    write_scan(path, scan)
+    with h5py.File(path, "r+") as file:
+        del file["entry/phyradgs/grid"]
+    again = again_of(path)
+    assert again.grid == default_grid(scan.geometry)
+    assert "no grid" in caplog.text
+    assert scan_summary(path)["grid_stored"] is False
 
 
 @pytest.mark.parametrize("rotates", ["sample", None])
@@ -307,17 +312,6 @@ def test_an_encoder_that_turns_the_other_way_is_said(path, make_scan, caplog) ->
         file["entry/phyradgs/kinematics/angle_deg"].attrs["rotates"] = "sample"
     again_of(path)
     assert "from rotation_angle" in caplog.text
-
-
-def test_grid_is_derived_and_said(path, make_scan, caplog) -> None:
-    scan = make_scan()
-    write_scan(path, scan)
-    with h5py.File(path, "r+") as file:
-        del file["entry/phyradgs/grid"]
-    again = again_of(path)
-    assert again.grid == default_grid(scan.geometry)
-    assert "no grid" in caplog.text
-    assert scan_summary(path)["grid_stored"] is False
 
 
 def test_default_grid_is_what_the_cone_covers() -> None:

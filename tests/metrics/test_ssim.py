@@ -44,20 +44,17 @@ def test_volume_equals_the_mean_over_slices_that_are_not_empty(data_range: float
     assert ssim(result, truth, data_range) == pytest.approx(np.mean(means), abs=1e-10)
 
 
-def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    result, truth = _pair()
-    whole = ssim(result, truth)
-    module = import_module("phyradgs_cl.metrics.ssim")  # the package's attribute is the function
-    monkeypatch.setattr(module, "_VOXELS_PER_BATCH", 700)
-    assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
-
-
-def test_laws_one_where_equal_symmetric_and_scale_free() -> None:
+def test_laws_and_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     result, truth = _pair()
     assert ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
     full = np.abs(result) + 0.1, np.abs(truth) + 0.1  # no empty slices: then the order does not matter
     assert ssim(*full, 1.0) == pytest.approx(ssim(full[1], full[0], 1.0), rel=1e-12)
     assert ssim(result * 0.01, truth * 0.01) == pytest.approx(ssim(result, truth), rel=1e-9)
+    result, truth = _pair()
+    whole = ssim(result, truth)
+    module = import_module("phyradgs_cl.metrics.ssim")  # the package's attribute is the function
+    monkeypatch.setattr(module, "_VOXELS_PER_BATCH", 700)
+    assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
 
 
 def test_wrong_arguments_are_refused() -> None:

@@ -100,13 +100,7 @@ def test_a_plain_subset_would_be_biased(field, bundle) -> None:
     assert float(excess.max()) > 1e-6
 
 
-def test_intensity_averages_light(bundle) -> None:
-    integrals = torch.tensor([[0.1, 0.9, 2.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
-    expected = [-np.log(np.mean(np.exp(-4 * np.array(row)))) / 4 for row in integrals.tolist()]
-    assert np.allclose(intensity_average(integrals, 4.0).tolist(), expected, rtol=1e-12)
-
-
-def test_how_many_times_a_step_looks_at() -> None:
+def test_how_many_times_a_step_looks_at_and_how_light_is_averaged(bundle) -> None:
     options = NeuralOptions()
     assert [options.times_for(5, model) for model in ("log", "intensity")] == [5, 5]
     assert replace(options, times=2).times_for(5, "log") == 2
@@ -116,3 +110,6 @@ def test_how_many_times_a_step_looks_at() -> None:
         replace(options, times=3).times_for(5, "intensity")
     with pytest.raises(InputError, match="option times: found 1 of 5 times.*biased"):
         replace(options, times=1).times_for(5, "log")
+    integrals = torch.tensor([[0.1, 0.9, 2.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
+    expected = [-np.log(np.mean(np.exp(-4 * np.array(row)))) / 4 for row in integrals.tolist()]
+    assert np.allclose(intensity_average(integrals, 4.0).tolist(), expected, rtol=1e-12)

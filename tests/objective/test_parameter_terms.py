@@ -32,9 +32,6 @@ def test_values_by_hand() -> None:
     assert value == pytest.approx(0.3 * 2 + 0.7 * ((5 - 3) ** 2 + (0.08 - 0.05) ** 2) / 2, rel=FLOAT64)
     value, gradient = parameter_loss(np.zeros((11, 0)), TERMS)
     assert value == 0 and gradient.shape == (11, 0)
-
-
-def test_terms_are_a_value_with_the_papers_defaults() -> None:
     assert ParameterTerms() == ParameterTerms(0.001, 0.0, 10.0, 0.004)
     with pytest.raises(FrozenInstanceError):
         TERMS.shape_weight = 1.0

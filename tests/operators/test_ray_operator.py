@@ -103,11 +103,16 @@ def test_odd_volumes(any_rt, shape) -> None:
     assert mismatch(RayOperator(any_rt, grid, SHAPE, tables("per line"))) <= ADJOINT
 
 
-def test_volume_that_the_detector_does_not_see(rt) -> None:
+def test_volumes_out_of_sight_and_other_arrays_than_float32_in_c_order(rt) -> None:
     far = Grid((4, 5, 6), (0.1, 0.1, 0.1), (3.0, 0.0, 0.0))
     operator = RayOperator(rt, far, SHAPE, tables("micro-views"))
     assert not operator.forward(noise(far.shape, 75)).any()
     assert not operator.adjoint(noise(operator.frames_shape, 76)).any()
+    operator = RayOperator(rt, GRID, SHAPE, tables("static"))
+    x, y = noise(GRID.shape, 87), noise(operator.frames_shape, 88)
+    turned = np.asfortranarray(x.astype(np.float64))
+    np.testing.assert_array_equal(operator.forward(turned), operator.forward(x))
+    np.testing.assert_array_equal(operator.adjoint(np.asfortranarray(y)), operator.adjoint(y))
 
 
 def test_lines_without_cells_are_zero_and_give_nothing(rt) -> None:
@@ -174,14 +179,6 @@ def test_bricks_for_little_local_memory(rt, monkeypatch) -> None:
     usual = operator.adjoint(y)
     monkeypatch.setattr(rays, "_BRICK", (10**6, 1, 1))
     np.testing.assert_allclose(operator.adjoint(y), usual, rtol=FLOAT32, atol=1e-6)
-
-
-def test_other_arrays_than_float32_in_c_order(rt) -> None:
-    operator = RayOperator(rt, GRID, SHAPE, tables("static"))
-    x, y = noise(GRID.shape, 87), noise(operator.frames_shape, 88)
-    turned = np.asfortranarray(x.astype(np.float64))
-    np.testing.assert_array_equal(operator.forward(turned), operator.forward(x))
-    np.testing.assert_array_equal(operator.adjoint(np.asfortranarray(y)), operator.adjoint(y))
 
 
 def test_refusals(rt) -> None:

@@ -42,7 +42,7 @@ def test_cutoff_means_the_same_as_in_the_twin(any_rt, make_cloud, grid) -> None:
     assert (high > 0).mean() < 1
 
 
-def test_bricks_and_parts_of_a_grid_change_nothing(any_rt, make_cloud) -> None:
+def test_bricks_parts_of_a_grid_and_no_gaussian(any_rt, make_cloud) -> None:
     """Slabs of one voxel, some that divide the height badly, and a part in the middle."""
     rows, grid = make_cloud(30, 43), GRIDS[0]
     whole = voxelise(any_rt, rows, grid)
@@ -53,9 +53,6 @@ def test_bricks_and_parts_of_a_grid_change_nothing(any_rt, make_cloud) -> None:
     part = Voxeliser(any_rt, shape).forward(DeviceGaussians.upload(any_rt, rows), grid, start)
     inside = tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))
     np.testing.assert_array_equal(unpad_rows(any_rt.download(part), shape), whole[inside])
-
-
-def test_no_gaussian_gives_an_empty_volume(any_rt) -> None:
     np.testing.assert_array_equal(voxelise(any_rt, np.zeros((11, 0)), GRIDS[0]), 0)
 
 

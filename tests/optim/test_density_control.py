@@ -36,10 +36,16 @@ def run(population, statistic, control=CONTROL, seed: int = 0, box: np.ndarray =
     return control_density(population, np.array(statistic, float), ACTIVATION, control, box, rng)
 
 
-def test_nobody_is_chosen_below_the_threshold(population) -> None:
+def test_below_the_threshold_nothing_changes_but_the_order(population) -> None:
     grown = run(population, [0.99] * 5)
     np.testing.assert_array_equal(grown.raw, population.raw)
     np.testing.assert_array_equal(grown.moments, population.moments)
+    other = Population(population.raw.copy(), population.moments.copy())
+    assert population == population and population != other and len({population, other}) == 2
+    order = np.array([3, 0, 4, 2, 1])
+    pruned = prune(population.take(order), ACTIVATION, CONTROL, BOX)
+    np.testing.assert_array_equal(pruned.raw, population.raw)
+    np.testing.assert_array_equal(pruned.moments, population.moments)
 
 
 def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
@@ -53,11 +59,6 @@ def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
     assert grown.count == 6
     np.testing.assert_allclose(ACTIVATION.apply(grown.raw)[3:6].max(), LARGE, rtol=FLOAT64)  # no child is smaller
     assert np.isclose(ACTIVATION.apply(grown.raw)[3], LARGE).sum() == 3
-
-
-def test_populations_are_compared_by_what_they_are(population) -> None:
-    other = Population(population.raw.copy(), population.moments.copy())
-    assert population == population and population != other and len({population, other}) == 2
 
 
 def test_a_clone_shares_place_shape_and_mass(population) -> None:
@@ -131,13 +132,6 @@ def test_the_faded_and_the_lost_are_pruned(population) -> None:
         pruned = prune(Population(ACTIVATION.invert(rows), population.moments), ACTIVATION, CONTROL, BOX)
         assert pruned.count == 4 + kept, (row, value)
         assert (5.0 in pruned.moments[0, 0]) == kept, (row, value)
-
-
-def test_the_rest_is_sorted_by_height_with_its_moments(population) -> None:
-    order = np.array([3, 0, 4, 2, 1])
-    pruned = prune(population.take(order), ACTIVATION, CONTROL, BOX)
-    np.testing.assert_array_equal(pruned.raw, population.raw)
-    np.testing.assert_array_equal(pruned.moments, population.moments)
 
 
 def test_the_seed_decides_and_the_caller_keeps_his_population(population) -> None:

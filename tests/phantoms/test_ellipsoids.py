@@ -47,16 +47,13 @@ def test_line_integrals_equal_brute_force_sampling_also_from_inside() -> None:
     assert np.allclose(phantom.line_integrals(source, target), expected, atol=5e-4, rtol=0)
 
 
-def test_sphere_chord_in_closed_form_from_a_far_source() -> None:
+def test_sphere_chords_in_closed_form_and_segments_that_stop() -> None:
     ball = EllipsoidPhantom((Ellipsoid((0, 0, 0), (2, 2, 2), 0.5),), "ball")
     height = np.array([0.0, 1.0, 1.9, 1.999999, 2.1])
     source = np.stack([np.full(5, 1e4), np.zeros(5), height], axis=-1)
     target = source * [-1, 1, 1]
     expected = 0.5 * 2 * np.sqrt(np.maximum(4 - height**2, 0))
     assert np.allclose(ball.line_integrals(source, target), expected, atol=1e-9)
-
-
-def test_segments_stop_at_their_ends() -> None:
     ball = EllipsoidPhantom((Ellipsoid((0, 0, 0), (2, 2, 2), 1.0),), "ball")
     target = np.array([[1, 0, 0], [9, 0, 0], [-1, 0, 0], [0, 0, 0]])
     assert np.allclose(ball.line_integrals([0, 0, 0], target), [1, 2, 1, 0])
@@ -97,9 +94,6 @@ def test_voxels_hold_the_volume_and_sit_where_the_density_is() -> None:
     assert np.allclose(phantom.density(x, y, z)[clear], volume[clear], atol=1e-7)
     centre = [float((volume * c).sum() / volume.sum()) for c in (x, y, z)]
     assert np.allclose(centre, (2, -3, 4), atol=0.02)
-
-
-def test_one_sample_a_voxel_is_the_density_at_its_centre() -> None:
     phantom, grid = _random_phantom(6), Grid((11, 13, 9), (5.0, 4.0, 6.0), (1.0, 2.0, 3.0))
     z, y, x = grid.axes_mm()
     expected = phantom.density(x, y[:, None], z[:, None, None])

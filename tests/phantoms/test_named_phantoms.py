@@ -15,7 +15,7 @@ def _blocks(volume: np.ndarray) -> np.ndarray:
     return volume.reshape(n, 2, n, 2, n, 2).mean(axis=(1, 3, 5))
 
 
-def test_shepp_logan_grey_levels() -> None:
+def test_shepp_logan_grey_levels_and_ventricles() -> None:
     for variant, skull, brain, ventricle in [("toft", 1.0, 0.2, 0.0), ("kak-slaney", 2.0, 1.02, 1.0)]:
         phantom = shepp_logan(80.0, variant)
         grey = phantom.density(0, np.array([0.9, -0.3, 0.0]) * 80, 0.0) * 80
@@ -24,9 +24,6 @@ def test_shepp_logan_grey_levels() -> None:
         assert left == pytest.approx(ventricle)
     # of grey level one may be given
     assert shepp_logan(80.0, "toft", 0.02).density(0, 72, 0) == pytest.approx(0.02)
-
-
-def test_shepp_logan_ventricles_lean_outwards_towards_plus_y() -> None:
     # At 108 degrees the left ellipsoid's long axis runs from the middle at -y outwards to +y.
     phantom = shepp_logan(1.0)
     dx, dy = 0.38 * np.cos(np.deg2rad(108)), 0.38 * np.sin(np.deg2rad(108))

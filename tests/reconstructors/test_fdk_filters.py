@@ -31,14 +31,7 @@ def test_ramp_filter_is_a_convolution(width) -> None:
         np.testing.assert_allclose(found, expected, rtol=0, atol=RAMP * np.abs(expected).max())
 
 
-def test_the_ramp_is_half_the_frequency_but_for_its_foot() -> None:
-    """In cycles per sample |f|; at zero the sampled kernel keeps the small constant that a limited row needs."""
-    spectrum = ramp_spectrum(256)
-    np.testing.assert_allclose(spectrum, np.arange(129) / 256, atol=0.01)
-    assert 0 < spectrum[0] < 0.002
-
-
-def test_windows_at_half_and_at_the_whole_nyquist_frequency() -> None:
+def test_spectra_of_the_ramp_and_its_windows() -> None:
     """And a row of odd length, which has no sample at that frequency."""
     sinc = np.sin(np.pi / 4) / (np.pi / 4)
     at = {"ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0), "hamming": (0.54, 0.08)}
@@ -47,6 +40,9 @@ def test_windows_at_half_and_at_the_whole_nyquist_frequency() -> None:
         assert ratio[[0, 64, 128]] == pytest.approx([1, quarter, nyquist], rel=FLOAT64, abs=FLOAT64), window
     ratio = ramp_spectrum(225, "hann") / ramp_spectrum(225)
     np.testing.assert_allclose(ratio, 0.5 + 0.5 * np.cos(2 * np.pi * np.arange(113) / 225), rtol=FLOAT64)
+    spectrum = ramp_spectrum(256)
+    np.testing.assert_allclose(spectrum, np.arange(129) / 256, atol=0.01)
+    assert 0 < spectrum[0] < 0.002
 
 
 def test_noise_falls_from_window_to_window(rt) -> None:

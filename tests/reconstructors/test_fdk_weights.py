@@ -42,13 +42,6 @@ def turn(views: int, arc_deg: float = 360.0) -> np.ndarray:
     return 0.3 + np.deg2rad(arc_deg) / views * np.arange(views)
 
 
-def test_even_full_turns() -> None:
-    for views in (1, 2, 3, 25, 400):
-        arc = view_arc(np.random.default_rng(1).permutation(turn(views)))
-        assert arc.is_full
-        np.testing.assert_allclose(arc.gap_rad, 2 * np.pi / views, rtol=FLOAT64)
-
-
 def test_what_is_a_full_turn() -> None:
     cases = {
         "lost view": (np.delete(np.arange(0, 360, 5.0), 7), True),
@@ -60,9 +53,13 @@ def test_what_is_a_full_turn() -> None:
         arc = view_arc(np.deg2rad(angles_deg))
         assert arc.is_full == is_full, name
         assert arc.gap_rad.sum() == pytest.approx(arc.coverage_rad, rel=FLOAT64), name
+    for views in (1, 2, 3, 25, 400):
+        arc = view_arc(np.random.default_rng(1).permutation(turn(views)))
+        assert arc.is_full
+        np.testing.assert_allclose(arc.gap_rad, 2 * np.pi / views, rtol=FLOAT64)
 
 
-def test_an_arc_reaches_half_a_step_beyond_its_ends() -> None:
+def test_arcs_reach_half_a_step_beyond_their_ends_and_views_at_one_angle_share() -> None:
     """Wherever it starts on the turn and in whatever order its views come."""
     order = np.random.default_rng(2).permutation(50)
     angles = np.deg2rad(4.0 * np.arange(50) + 250.0)
@@ -70,10 +67,6 @@ def test_an_arc_reaches_half_a_step_beyond_its_ends() -> None:
     assert arc.coverage_rad == pytest.approx(np.deg2rad(200.0), rel=FLOAT64)
     np.testing.assert_allclose(arc.gap_rad, np.deg2rad(4.0), rtol=FLOAT64)
     np.testing.assert_allclose(arc.progress_rad, np.deg2rad(4.0 * np.arange(50) + 2.0)[order], rtol=FLOAT64)
-
-
-def test_views_at_one_angle_share_its_cell() -> None:
-    """Two turns and a half over the same angles; the first and the last of a turn coincide."""
     arc = view_arc(np.deg2rad(np.arange(0, 901, 10.0)))
     assert arc.is_full
     assert arc.gap_rad.sum() == pytest.approx(2 * np.pi, rel=FLOAT64)
@@ -81,15 +74,11 @@ def test_views_at_one_angle_share_its_cell() -> None:
     np.testing.assert_allclose(arc.gap_rad, np.deg2rad(10.0) / count, rtol=FLOAT64)
 
 
-def test_the_measure_is_the_cosine_for_a_panel_that_faces_the_source() -> None:
+def test_the_measure_of_panels_that_face_the_source_or_are_turned() -> None:
     pose = cone(offset_u_mm=0.4).pose(0.7)
     rays = weights.pixel_rays(pose, np.arange(44), np.arange(48))
     expected = 6.0 / np.linalg.norm(rays, axis=-1)
     np.testing.assert_allclose(weights.ray_measure(pose, rays), expected, rtol=FLOAT64)
-
-
-def test_the_measure_of_a_turned_panel() -> None:
-    """DSO cos γ over the panel's distance from the source: γ is the ray's own, wherever the panel's normal points."""
     pose = cone().pose(0.0)
     pose[6:9] = 0.075 * np.array([-np.sin(0.3), np.cos(0.3), 0.0])
     pose[3:6] = np.array([-3.0, 0, 0]) - 23.5 * pose[6:9]
@@ -137,14 +126,11 @@ def test_short_scans_and_more_than_a_turn(rt, arc_deg, views) -> None:
     np.testing.assert_allclose(levels(rt, cone().pose(turn(views, arc_deg))), 1.0, atol=FDK_PARTIAL)
 
 
-def test_short_scans_with_uneven_steps(rt) -> None:
+def test_short_scans_with_uneven_steps_and_their_end_views(rt) -> None:
     steps = np.random.default_rng(4).uniform(0.5, 1.5, 110)
     angles = np.cumsum(steps) / steps.sum() * np.deg2rad(225.0)
     found = levels(rt, cone().pose(np.random.default_rng(5).permutation(angles)))
     np.testing.assert_allclose(found, 1.0, atol=FDK_PARTIAL)
-
-
-def test_the_end_views_of_a_short_scan_count(rt) -> None:
     pose, geometry = cone().pose(turn(30, 215.0)), cone()
     frames = np.zeros((30, 44, 48), np.float32)
     for end in (0, -1):

@@ -67,25 +67,15 @@ def test_every_preset_is_taken_as_it_is() -> None:
         assert method_options("phyradgs", preset).motion == MicroViews(8, 5)
 
 
-def test_every_number_has_a_checked_range() -> None:
+def test_every_number_has_a_checked_range_and_can_be_given_as_it_stands() -> None:
     for method, path, current in NUMBERS:
         for name, absurd in ABSURD.items():
             said = refusal(method, nested(path, [absurd] * len(current) if isinstance(current, tuple) else absurd))
             assert path[-1] in said and len(said) < 700, f"{method} {'.'.join(path)}, {name}: {said!r}"
-
-
-def test_every_number_can_be_given_as_it_stands() -> None:
     assert len(NUMBERS) > 100
     for method, path, current in NUMBERS:
         value = list(current) if isinstance(current, tuple) else float(current)
         assert method_options(method, None, nested(path, value)) == method_options(method), (method, path)
-
-
-def test_whole_floats_are_whole_numbers() -> None:
-    options = method_options("phyradgs", None, {"strips": 2.0, "sub_intervals": 3.0, "iterations": 40.0})
-    assert (options.motion.strips, options.motion.sub_intervals, options.iterations) == (2, 3, 40)
-    assert isinstance(options.motion.strips, int)
-    assert not method_options("phyradgs", None, {"control": {"every": 0}}).control.is_due(600, 2000)
 
 
 def test_words_and_counts_of_motion_are_checked() -> None:
@@ -100,6 +90,10 @@ def test_words_and_counts_of_motion_are_checked() -> None:
         ]:
             with pytest.raises(InputError, match=option):
                 call()
+    options = method_options("phyradgs", None, {"strips": 2.0, "sub_intervals": 3.0, "iterations": 40.0})
+    assert (options.motion.strips, options.motion.sub_intervals, options.iterations) == (2, 3, 40)
+    assert isinstance(options.motion.strips, int)
+    assert not method_options("phyradgs", None, {"control": {"every": 0}}).control.is_due(600, 2000)
 
 
 def test_unknown_options_are_told_what_was_meant() -> None:
@@ -156,14 +150,6 @@ def test_a_motion_of_ones_own_has_cells_and_no_counts() -> None:
         SirtOptions(motion=Exact())
 
 
-def test_only_splats_are_exact_in_time_and_fdk_has_no_micro_views() -> None:
-    for method in ("phyradgs", "r2"):
-        assert motions_of(method) == ("static", "static-start", "micro-views", "exact")
-    for method in ("sirt", "fdk"):
-        assert "exact" not in motions_of(method)
-    assert "micro-views" not in motions_of("fdk")
-
-
 def test_errors_about_motion_offer_what_the_method_has() -> None:
     for method in METHODS:
         own = motions_of(method)
@@ -172,6 +158,11 @@ def test_errors_about_motion_offer_what_the_method_has() -> None:
         with pytest.raises(InputError) as refused:
             method_options(method, None, {"motion": "wobble"})
         assert refused.value.expected == f"one of {', '.join(own)} for --method {method}"
+    for method in ("phyradgs", "r2"):
+        assert motions_of(method) == ("static", "static-start", "micro-views", "exact")
+    for method in ("sirt", "fdk"):
+        assert "exact" not in motions_of(method)
+    assert "micro-views" not in motions_of("fdk")
 
 
 def test_counts_belong_to_the_motions_that_have_them() -> None:

@@ -101,9 +101,6 @@ def test_memory_keeps_what_it_is_given(rt) -> None:
         np.testing.assert_array_equal(rt.download(other), values)
         rt.fill(other, 3)
         np.testing.assert_array_equal(rt.download(other), 3)
-
-
-def test_too_much_memory_is_refused_in_words(rt) -> None:
     with pytest.raises(DeviceError, match="MiB"):
         rt.empty(rt.device.largest_allocation_bytes)  # four times that in bytes
 

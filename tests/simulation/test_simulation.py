@@ -187,9 +187,6 @@ def test_line_groups_cover_every_line_once() -> None:
     groups = list(line_groups(tables[0]))
     assert [(start, stop) for start, stop, _ in groups] == [(line, line + 1) for line in range(SHAPE[1])]
     assert sorted(np.concatenate([members for _, _, members in groups])) == list(range(tables[0].count))
-
-
-def test_progress_is_reported_frame_by_frame() -> None:
     seen: list[tuple[int, int]] = []
     run(SimulationOptions(FLY), report=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
