@@ -186,7 +186,8 @@ def test_geometry_and_timing_are_values() -> None:
     times = np.array([0.0, 1.0])
     arrays = [
         lambda: EncoderTable(times, times), lambda: FrameSweeps(times, 1.0, times, times), a_scan,
-        lambda: PoseTable(times, GEOMETRY.pose(times)), lambda: CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0)),
+        lambda: PoseTable(times, GEOMETRY.pose(times)),
+        lambda: CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0)),
         lambda: static_cells(ORBIT, Shutter(0.8), 0, 3.0, LINES),
     ]  # fmt: skip
     for make in arrays:

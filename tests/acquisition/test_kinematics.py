@@ -117,7 +117,8 @@ def test_bad_tables_are_refused() -> None:
         with pytest.raises(InputError, match="pose table"):
             PoseTable(time_s, table)
     for time_s, angle in [
-        ([0.0], [0.0]), ([0.0, 1.0], [0.0]), ([0.0, 0.0], [0.0, 1.0]), ([1.0, 0.0], [0.0, 1.0]), ([0.0, np.nan], [0, 1])
+        ([0.0], [0.0]), ([0.0, 1.0], [0.0]), ([0.0, 0.0], [0.0, 1.0]), ([1.0, 0.0], [0.0, 1.0]),
+        ([0.0, np.nan], [0, 1])
     ]:  # fmt: skip
         with pytest.raises(InputError, match="encoder table"):
             EncoderTable(time_s, angle)

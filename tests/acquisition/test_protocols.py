@@ -36,7 +36,9 @@ def test_fly_protocols_of_the_paper(name, views, arc_deg) -> None:
     for frame in (0, 1, views - 1):
         # exposure arc, then the readout continues it to T_exp + T_ro = 1.86 exposures
         expected = 360 / views * frame + np.array([0, arc_deg, 1.86 * arc_deg])
-        np.testing.assert_allclose(angles_deg(protocol, frame, [0, 1, 1.86]), expected, atol=ANGLE_TOLERANCE_DEG)
+        np.testing.assert_allclose(
+            angles_deg(protocol, frame, [0, 1, 1.86]), expected, atol=ANGLE_TOLERANCE_DEG
+        )
     assert protocol.shutter().span_s == pytest.approx(1.86)
     assert name != "rapid" or 1.86 * arc_deg == pytest.approx(26.8, abs=0.02)  # table 2
 
@@ -69,7 +71,9 @@ def test_jitter_is_seeded_and_recorded() -> None:
     one, again = (protocol.orbit(GEOMETRY, 0.2, np.random.default_rng(5)).kinematics for _ in range(2))
     assert isinstance(one, EncoderTable)
     np.testing.assert_array_equal(one.angle_rad_table, again.angle_rad_table)
-    for orbit, generator in ((protocol.orbit, None), (Protocol(exposure_deg=0.0).orbit, np.random.default_rng(0))):
+    for orbit, generator in (
+        (protocol.orbit, None), (Protocol(exposure_deg=0.0).orbit, np.random.default_rng(0)),
+    ):
         with pytest.raises(InputError, match="jitter"):
             orbit(GEOMETRY, 0.2, generator)
 
@@ -99,7 +103,10 @@ def test_the_gantry_wanders_in_straight_lines_between_one_knot_per_frame() -> No
 
 
 def test_protocols_hold_the_ends_of_their_ranges() -> None:
-    ranges = {"views": (1, 100_000), "start_deg": (-1e6, 1e6), "exposure_deg": (0, 3600), "readout_ratio": (0, 1000)}
+    ranges = {
+        "views": (1, 100_000), "start_deg": (-1e6, 1e6), "exposure_deg": (0, 3600),
+        "readout_ratio": (0, 1000),
+    }
     for name, (lowest, highest) in ranges.items():
         for inside in (lowest, highest):
             assert getattr(Protocol(**{name: inside}), name) == inside
@@ -122,14 +129,16 @@ def scan(**changes) -> Scan:
     protocol = Protocol(views=3)
     fields = {
         "projections": np.zeros((3, 4, 4), np.float32), "geometry": GEOMETRY, "grid": Grid.cube(4, 2.0),
-        "trajectory": protocol.orbit(GEOMETRY), "shutter": protocol.shutter(), "frame_start_s": protocol.frame_start_s(),
+        "trajectory": protocol.orbit(GEOMETRY), "shutter": protocol.shutter(),
+        "frame_start_s": protocol.frame_start_s(),
     }  # fmt: skip
     return Scan(**(fields | changes))
 
 
 def test_scans_check_themselves() -> None:
     for change in (
-        {"projections": np.zeros((3, 4, 5), np.float32)}, {"frame_start_s": np.zeros(2)}, {"detector_model": "linear"},
+        {"projections": np.zeros((3, 4, 5), np.float32)}, {"frame_start_s": np.zeros(2)},
+        {"detector_model": "linear"},
         {"projections": np.zeros((0, 4, 4), np.float32), "frame_start_s": np.zeros(0)},
         {"reference": np.zeros((4, 4, 5), np.float32)},
     ):  # fmt: skip

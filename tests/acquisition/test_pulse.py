@@ -70,7 +70,10 @@ def test_a_billionth_of_a_window_is_rounding() -> None:
 @pytest.mark.parametrize("direction", [1, -1])
 def test_every_time_lies_in_the_pulse_and_weights_stay_whole(direction) -> None:
     where = (ORBIT, replace(DARK_FROM, direction=direction), 0, START_S, 7)
-    tables = micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where), static_start_cells(*where)
+    tables = (
+        micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where),
+        static_start_cells(*where),
+    )
     for cells in tables:
         np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
         assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S
@@ -120,8 +123,8 @@ def test_a_pulsed_scan_knows_when_it_needs_a_pose(is_fly) -> None:
 
 def test_pulses_that_no_frame_sees_are_refused() -> None:
     for pulse in [
-        (0.0, 0.0), (0.2, 0.0), (0.0, -1.0), (0.2, -0.1), (1.5, 1.0), (2.0, 1.0), (-0.5, 0.5), (-3.0, 1.0), (np.nan, 1.0),
-        (0.0, np.inf),
+        (0.0, 0.0), (0.2, 0.0), (0.0, -1.0), (0.2, -0.1), (1.5, 1.0), (2.0, 1.0), (-0.5, 0.5), (-3.0, 1.0),
+        (np.nan, 1.0), (0.0, np.inf),
     ]:  # fmt: skip
         with pytest.raises(InputError, match="pulse"):
             Protocol(readout_ratio=0.5, pulse=pulse)

@@ -128,7 +128,10 @@ def scan(is_fly: bool) -> Scan:
 
 
 def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
-    counts = {Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 30, Exact(segments=5): 5}
+    counts = {
+        Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 30,
+        Exact(segments=5): 5,
+    }
     for motion, count in counts.items():
         moving = motion.cells(scan(True), 1)
         assert moving.count == count and motion.cells(scan(False), 1).count == 1

@@ -15,9 +15,13 @@ from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 def scan_of(rt) -> Callable[..., Scan]:
     """A noisy fly-scan of a phantom with this cone; keywords go to the protocol."""
 
-    def make(geometry: ConeGeometry, phantom: str = "jaw", size: int = 24, axis: str = "rows", **protocol: object) -> Scan:
+    def make(
+        geometry: ConeGeometry, phantom: str = "jaw", size: int = 24, axis: str = "rows", **protocol: object
+    ) -> Scan:
         scene = phantom_scene(rt, phantom, geometry, Grid.cube(size, 2.0), size, axis, 0)
-        options = SimulationOptions(make_protocol("rapid", **protocol), axis, noise="tigre", dose=1e6, time_samples=8)
+        options = SimulationOptions(
+            make_protocol("rapid", **protocol), axis, noise="tigre", dose=1e6, time_samples=8
+        )
         return simulate(scene.source, geometry, scene.grid, options)
 
     return make

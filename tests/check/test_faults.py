@@ -180,7 +180,9 @@ def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
     facts = json.loads(capsys.readouterr().out)
     assert facts["suspicious"] == 1 and len(facts["findings"]) == 11
-    assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(facts["findings"][0])
+    assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(
+        facts["findings"][0]
+    )
 
 
 @pytest.mark.parametrize("kind", ["orbit", "poses"])
@@ -212,7 +214,9 @@ def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
     write_scan(path, clean, data=data, image_key=key, quantity="counts")
     cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)])
     held = []
-    read_scan(fixed, lambda frames, keys, quantity: held.append((frames, quantity)) or (clean.projections, None))
+    read_scan(
+        fixed, lambda frames, keys, quantity: held.append((frames, quantity)) or (clean.projections, None)
+    )
     assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
 
 

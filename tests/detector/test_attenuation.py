@@ -62,7 +62,8 @@ def test_transmission_and_attenuation() -> None:
 def test_wrong_scans_are_refused() -> None:
     two = np.ones((2, 3, 3))
     calls = {
-        "data: found shape": (np.ones((2, 3)), [0, 0], "counts"), "image_key: found shape": (two, [0], "counts"),
+        "data: found shape": (np.ones((2, 3)), [0, 0], "counts"),
+        "image_key: found shape": (two, [0], "counts"),
         r"image_key: found \[7\]": (two, [1, 7], "counts"), "no projection": (two, [1, 2], "counts"),
         "quantity: found 'photons'": (two, [0, 0], "photons"),
         r"found no flat .key 1. among counts": (two, [2, 0], "counts"),

@@ -78,7 +78,9 @@ def test_electronic_noise_grows_and_photon_noise_does_not() -> None:
 
 def test_noise_without_lag_is_the_noise_it_was_and_less_light_is_more() -> None:
     p = frames()
-    plain, zero = (beer_lambert_noise(p, 1e4, 10.0, np.random.default_rng(1), **m) for m in ({}, {"lag": 0.0}))
+    plain, zero = (
+        beer_lambert_noise(p, 1e4, 10.0, np.random.default_rng(1), **m) for m in ({}, {"lag": 0.0})
+    )
     np.testing.assert_array_equal(plain, zero)
     light = np.where(np.arange(200)[:, None] < 100, 1.0, 0.25)
     noisy = beer_lambert_noise(np.zeros((1, 200, 200)), 1e4, 0.0, np.random.default_rng(1), light)[0]

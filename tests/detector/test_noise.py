@@ -21,11 +21,15 @@ BOTH = [tigre_noise, beer_lambert_noise]
 
 def test_counts_have_poisson_mean_and_variance_plus_the_electronic_variance() -> None:
     for expected in (3.0, 400.0, 1e6, 3e9, 1e15):
-        counts, variance = sample_counts(np.full(200_000, expected), 10.0, np.random.default_rng(1)), expected + 100
+        counts, variance = (
+            sample_counts(np.full(200_000, expected), 10.0, np.random.default_rng(1)), expected + 100,
+        )
         # Five standard errors of a mean and of a variance of 200,000 draws.
         assert counts.mean() == pytest.approx(expected, abs=5 * np.sqrt(variance / 2e5))
         assert counts.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / 2e5) + 0.01)
-    whole = sample_counts(np.array([0.0, 2.5, 1e5, 5e9]), 0.0, np.random.default_rng(0))  # without electronics
+    whole = sample_counts(
+        np.array([0.0, 2.5, 1e5, 5e9]), 0.0, np.random.default_rng(0)
+    )  # without electronics
     assert np.array_equal(whole, np.rint(whole)) and whole[0] == 0
 
 

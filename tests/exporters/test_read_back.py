@@ -92,8 +92,12 @@ def field(offset: int, kind: str, value: float):
 WRONG = {
     "a cut file": ("v.mha", lambda data: data[:-1], "DimSize|bytes"),
     "too many voxels": ("v.mha", replaced("DimSize = 7", "DimSize = 70000000"), "bytes of data"),
-    "an oblique image": ("v.mha", replaced("Matrix = 1 0 0 0 1 0", "Matrix = 0.8 0.6 0 -0.6 0.8 0"), "along the world's"),
-    "no length of a voxel": ("v.mha", replaced("ElementSpacing = 1", "ElementSpacing = -1"), "ElementSpacing"),
+    "an oblique image": (
+        "v.mha", replaced("Matrix = 1 0 0 0 1 0", "Matrix = 0.8 0.6 0 -0.6 0.8 0"), "along the world's",
+    ),
+    "no length of a voxel": (
+        "v.mha", replaced("ElementSpacing = 1", "ElementSpacing = -1"), "ElementSpacing",
+    ),
     "a place in another galaxy": ("v.mha", replaced("Offset = -?[0-9.]+", "Offset = 1e11"), "origin"),
     "no NIfTI": ("v.nii", lambda data: b"\0" * 400, "NIfTI-1"),
     "a cut NIfTI": ("v.nii", lambda data: data[:-4], "bytes"),

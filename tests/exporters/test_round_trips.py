@@ -112,7 +112,9 @@ def test_hounsfield_units(volume_file, stored) -> None:
     expected = 1000 * (stored.volume.astype(float) / MU_WATER - 1)
     for to in ("nii", "mha", "nrrd", "tiff", "npy"):
         path = export_volume(volume_file, to, mu_water_per_mm=MU_WATER)
-        read = {"tiff": tifffile.imread, "npy": np.load}.get(to, lambda p: sitk.GetArrayFromImage(sitk.ReadImage(str(p))))
+        read = {"tiff": tifffile.imread, "npy": np.load}.get(
+            to, lambda p: sitk.GetArrayFromImage(sitk.ReadImage(str(p)))
+        )
         np.testing.assert_allclose(read(path), expected, rtol=1e-6, atol=1e-3)
 
 

@@ -15,7 +15,9 @@ ACTIVATION = Activation(0.01, 0.5)
 def test_invert_is_the_inverse(make_cloud) -> None:
     rows = make_cloud(40, 81, scale=(0.02, 0.4))
     rows[10, :5] = [1e-9, 1e-5, 1e-2, 5.0, 80.0]
-    np.testing.assert_allclose(ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=FLOAT32)  # of quaternions
+    np.testing.assert_allclose(
+        ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=FLOAT32
+    )  # of quaternions
     raw = np.random.default_rng(82).normal(size=(11, 40))
     raw[6:10] /= np.linalg.norm(raw[6:10], axis=0)
     again = ACTIVATION.invert(ACTIVATION.apply(raw))
@@ -48,7 +50,10 @@ def test_gaussians_and_rows_are_the_same_cloud(make_cloud) -> None:
 
 
 def test_wrong_shapes_are_named() -> None:
-    good = {"mean": np.zeros((4, 3)), "scale": np.ones((4, 3)), "quaternion": np.ones((4, 4)), "density": np.ones(4)}
+    good = {
+        "mean": np.zeros((4, 3)), "scale": np.ones((4, 3)), "quaternion": np.ones((4, 4)),
+        "density": np.ones(4),
+    }
     for name in good:
         with pytest.raises(InputError, match=name if name != "mean" else "shape"):
             Gaussians(**(good | {name: np.ones((5, 2))}))

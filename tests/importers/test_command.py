@@ -128,7 +128,9 @@ def test_what_is_no_scan_is_told_what_it_is_or_lacks(run, tmp_path) -> None:
             file[member] = np.zeros((2, 2, 2), np.float32)
         done = run(tmp_path / "volume.h5", ok=False)
         assert isinstance(done.exception, InputError)
-        assert all(w in str(done.exception) for w in ("found a volume", f"volume.h5:{member}", "phyradgs export"))
+        assert all(
+            w in str(done.exception) for w in ("found a volume", f"volume.h5:{member}", "phyradgs export")
+        )
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")

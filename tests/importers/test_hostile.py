@@ -66,7 +66,9 @@ def test_refused(tmp_path, make_truth, monkeypatch, form, case) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_good_files_pass_and_what_is_not_there_is_not_looked_for_elsewhere(tmp_path, make_truth, form) -> None:
+def test_good_files_pass_and_what_is_not_there_is_not_looked_for_elsewhere(
+    tmp_path, make_truth, form
+) -> None:
     """The cases above would prove nothing if files were refused before they were damaged; no pipe is ever opened."""
     path, options = w.write(form, tmp_path, make_truth), OPTIONS.get(form)
     assert import_scan(path, options, form).frames > 0
@@ -170,7 +172,8 @@ def test_what_the_user_names_is_the_user_s_business(tmp_path, make_truth) -> Non
 
 def test_options_are_checked() -> None:
     for name, value in [
-        ("exposure_s", -1.0), ("readout_s", float("nan")), ("frame_time_s", 0.0), ("angle_at", "end"), ("part", "half"),
+        ("exposure_s", -1.0), ("readout_s", float("nan")), ("frame_time_s", 0.0), ("angle_at", "end"),
+        ("part", "half"),
         ("readout_axis", "diagonal"), ("readout_direction", 2), ("source_to_axis_mm", -5.0), ("unit_mm", 0.0),
         ("pixel_size_mm", (1.0, 0.0)), ("detector_offset_mm", (float("inf"), 0.0)), ("rotates", "both"),
         ("row_0", "left"), ("quantity", "hounsfield"), ("flat_value", 0.0),

@@ -17,6 +17,7 @@ MOVING = {"fly": True, "axis": "columns", "direction": -1}
 ALL = ImportOptions(part="all")
 CONE = {"source_to_axis_mm": 500.0, "source_to_detector_mm": 800.0, "detector_offset_mm": (4.0, -6.0)}
 TIMED = "[timing]\nexposure_s = 0.4\nreadout_s = 0.3\n{}\n[readout]\naxis = 'columns'\ndirection = -1\n"
+ROWS = ImportOptions(exposure_s=0.4, readout_axis="rows")
 STARTS, STEPS = "start_s = [0, 1.25, 2.5, 3.75, 5, 6.25]", "first_deg = 10.0\nstep_deg = 25.0"
 MIDDLE = "first_deg = 14.0\nlast_deg = 139.0\nat = 'middle'"  # 25 · 0.5 · 0.4 / 1.25 after the opening
 # (format, what its writer is told, how the scan moves, options): grids are stored by some formats only
@@ -25,14 +26,16 @@ SAME = {
     "r2, moving": ("r2", {}, MOVING, replace(FLY, part="all")),
     # the first stored line is read first: the left column, or the top row, which is our last
     "phyradgs by columns": ("phyradgs", {}, MOVING | {"direction": 1}, ImportOptions(exposure_s=0.4)),
-    "phyradgs by rows": ("phyradgs", {}, MOVING | {"axis": "rows"}, ImportOptions(exposure_s=0.4, readout_axis="rows")),
+    "phyradgs by rows": ("phyradgs", {}, MOVING | {"axis": "rows"}, ROWS),
     **{f"naf in {dtype}": ("naf", {"dtype": np.dtype(dtype)}, {}, ALL) for dtype in ("f8", ">f4", ">f8")},
     **{f"naf, protocol {protocol}": ("naf", {"protocol": protocol}, {}, ALL) for protocol in range(6)},
     **{
-        f"rtk {name} {flip} {compressed}": ("rtk", {"flip": flip, "compressed": compressed, "name": name}, {}, None)
-        for name in ("projections.mha", "projections.mhd") for flip in (False, True) for compressed in (False, True)
+        f"rtk {name} {flip} {packed}": ("rtk", {"flip": flip, "compressed": packed, "name": name}, {}, None)
+        for name in ("projections.mha", "projections.mhd") for flip in (False, True) for compressed
+        in (False, True)
     },
-    "rtk, moving": ("rtk", {}, MOVING, FLY), "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
+    "rtk, moving": ("rtk", {}, MOVING, FLY),
+    "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
     "nxtomo, moving": ("nxtomo", {}, MOVING, replace(FLY, exposure_s=None, detector_offset_mm=(4.0, -6.0))),
     "tiff, frame time": ("tiff", {"timing": TIMED.format("frame_time_s = 1.25"), "angles": STEPS}, MOVING, None),
     "tiff, starts": ("tiff", {"timing": TIMED.format(STARTS), "angles": STEPS}, MOVING, None),

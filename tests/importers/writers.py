@@ -26,7 +26,8 @@ def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
         "offOrigin": grid.offset_mm[::-1], "offDetector": g.detector_offset_mm[::-1],
     }  # fmt: skip
     return {
-        "mode": "cone", "accuracy": 0.5, "DSD": g.source_to_detector_mm / unit_mm, "DSO": g.source_to_axis_mm / unit_mm,
+        "mode": "cone", "accuracy": 0.5, "DSD": g.source_to_detector_mm / unit_mm,
+        "DSO": g.source_to_axis_mm / unit_mm,
         "nDetector": list(g.detector_shape), "nVoxel": list(grid.shape[::-1]),
         **{name: [float(one) / unit_mm for one in three] for name, three in lengths_mm.items()},
     }  # fmt: skip
@@ -35,7 +36,9 @@ def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
 def write_r2(folder: Path, truth: Any, unit_mm: float = 1.0, test: int = 2) -> Path:
     """An R2-Gaussian folder: the last ``test`` frames are held out."""
     folder.mkdir()
-    meta: dict[str, Any] = {"scanner": scanner_table(truth, unit_mm), "vol": "vol_gt.npy", "bbox": [[-1] * 3, [1] * 3]}
+    meta: dict[str, Any] = {
+        "scanner": scanner_table(truth, unit_mm), "vol": "vol_gt.npy", "bbox": [[-1] * 3, [1] * 3],
+    }
     np.save(folder / "vol_gt.npy", np.transpose(truth.scan.reference, (2, 1, 0)) * unit_mm)
     count = truth.scan.frames - test
     for part, frames in (("train", range(count)), ("test", range(count, truth.scan.frames))):
@@ -73,9 +76,9 @@ def naf_dict(truth: Any, dtype: type = np.float32) -> dict[str, object]:
     count = len(frames) - 2
     return {
         "numTrain": count, "numVal": 2, "DSD": g.source_to_detector_mm, "DSO": g.source_to_axis_mm,
-        "nDetector": list(g.detector_shape), "dDetector": list(g.pixel_size_mm), "nVoxel": list(grid.shape[::-1]),
-        "dVoxel": list(grid.voxel_size_mm[::-1]), "offOrigin": list(grid.offset_mm[::-1]),
-        "offDetector": list(g.detector_offset_mm[::-1]),
+        "nDetector": list(g.detector_shape), "dDetector": list(g.pixel_size_mm),
+        "nVoxel": list(grid.shape[::-1]), "dVoxel": list(grid.voxel_size_mm[::-1]),
+        "offOrigin": list(grid.offset_mm[::-1]), "offDetector": list(g.detector_offset_mm[::-1]),
         "image": np.transpose(truth.scan.reference, (2, 1, 0)) * 1e3,
         "train": {"angles": truth.angle_rad[:count], "projections": frames[:count]},
         "val": {"angles": truth.angle_rad[count:], "projections": frames[count:]},
@@ -269,8 +272,10 @@ offset_mm = {list(grid.offset_mm)}
 
 # format: (what writes a good one, under which name)
 WRITERS = {
-    "r2": (write_r2, "r2"), "phyradgs": (write_phyradgs, "phyradgs"), "phyradgs-real": (write_phyradgs_real, "real"),
-    "naf": (write_naf, "chest.pickle"), "rtk": (write_rtk, "rtk"), "data-exchange": (write_data_exchange, "dx.h5"),
+    "r2": (write_r2, "r2"), "phyradgs": (write_phyradgs, "phyradgs"),
+    "phyradgs-real": (write_phyradgs_real, "real"),
+    "naf": (write_naf, "chest.pickle"), "rtk": (write_rtk, "rtk"),
+    "data-exchange": (write_data_exchange, "dx.h5"),
     "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
 }  # fmt: skip
 

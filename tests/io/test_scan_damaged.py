@@ -129,18 +129,22 @@ def entry_misnamed(file: h5py.File, address: str) -> None:
 ENCODER_TIME, ENCODER_ANGLE = f"{EXTRA}/kinematics/time_s", f"{EXTRA}/kinematics/angle_deg"
 POSE = f"{EXTRA}/poses/pose"
 NEEDED = (
-    "/entry/instrument", DATA, KEY, PITCH_U, DISTANCE, "/entry/instrument/source", EXPOSURE, READOUT, START, ANGLE, AXIS,
-    GRID_SHAPE, REFERENCE, f"{EXTRA}/poses/time_s",
+    "/entry/instrument", DATA, KEY, PITCH_U, DISTANCE, "/entry/instrument/source", EXPOSURE, READOUT, START,
+    ANGLE, AXIS, GRID_SHAPE, REFERENCE, f"{EXTRA}/poses/time_s",
 )  # fmt: skip
 RENAMED = {
-    DATA: "Dataa", KEY: "imagekey", PITCH_U: "x_pixelsize", MASK: "pixels_mask", ANGLE_END: "rotation_angles_end",
+    DATA: "Dataa", KEY: "imagekey", PITCH_U: "x_pixelsize", MASK: "pixels_mask",
+    ANGLE_END: "rotation_angles_end",
     f"{EXTRA}/grid": "grids", ENCODER_ANGLE: "angle_degs", f"{EXTRA}/kinematics": "kinematic",
 }  # fmt: skip
 HUGE = (4, 100_000, 200_000)
 # name: (the HDF5 path that the message must name, what happens to a good file there, words that the message must hold)
 CASES: dict[str, tuple[Any, ...]] = {
     **{f"no {address}": (address, deleted, "nothing") for address in NEEDED},
-    **{f"{address} misnamed": (address, renamed(name), f"rename '{name}'") for address, name in RENAMED.items()},
+    **{
+        f"{address} misnamed": (address, renamed(name), f"rename '{name}'")
+        for address, name in RENAMED.items()
+    },
     "no entry": ("/entry", deleted, "NXentry"),
     "entry misnamed": ("/entry", entry_misnamed, "rename 'entrys'"),
     "data is a group": (DATA, group_instead, "a group"),
@@ -177,7 +181,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "unknown unit": (f"{DISTANCE} @units", attribute("units", "furlong"), "'furlong'", "cm"),
     "unit of time for a length": (f"{DISTANCE} @units", attribute("units", "s"), "mm"),
     "detector distance negative": (DISTANCE, poked((), -1), "above 0"),
-    "distance without value": (DISTANCE, empty, "empty"), "source at the axis": (SOURCE, poked((), 0), "0"),
+    "distance without value": (DISTANCE, empty, "empty"),
+    "source at the axis": (SOURCE, poked((), 0), "0"),
     "exposure negative": (EXPOSURE, poked((), -1), "-1 s"),
     "exposure varies": (EXPOSURE, replaced([0.8, 0.8, 0.9, 0.8]), "0.8 to 0.9 s", "one time"),
     "exposure in degrees": (f"{EXPOSURE} @units", attribute("units", "deg"), "ms"),
@@ -207,7 +212,9 @@ CASES: dict[str, tuple[Any, ...]] = {
     "reference NaN": (REFERENCE, poked((0, 1, 2), np.nan), "(0, 1, 2)"),
     "reference unit": (f"{REFERENCE} @units", attribute("units", "HU"), "1/cm"),
     "title a number": ("/entry/title", replaced(3), "a string"),
-    "encoder too short": (ENCODER_TIME, all_changed(lambda t: t[:-1]), "frame 3 needs 4.5 to 5.6 s", "extend the table"),
+    "encoder too short": (
+        ENCODER_TIME, all_changed(lambda t: t[:-1]), "frame 3 needs 4.5 to 5.6 s", "extend the table",
+    ),
     "encoder starts late": (ENCODER_TIME, all_changed(lambda t: t[1:]), "frame 0 needs 0.5"),
     "encoder lengths": (ENCODER_ANGLE, changed(lambda t: t[1:]), "(8,)", "(9)"),
     "encoder goes back": (ENCODER_TIME, poked(4, 0.6), "index 4", "increasing"),
@@ -226,7 +233,9 @@ def scan_for(address: str, make_scan: Callable[..., Scan]) -> Scan:
     mask, time_s = np.arange(15).reshape(3, 5) == 10, np.linspace(0.5, 5.6, 9)
     scan = make_scan(pixel_mask=mask, reference=np.ones((2, 3, 4), np.float32))
     if address.startswith(f"{EXTRA}/kinematics"):
-        return replace(scan, trajectory=CircularOrbit(scan.geometry, EncoderTable(time_s, np.linspace(0.1, 1.0, 9))))
+        return replace(
+            scan, trajectory=CircularOrbit(scan.geometry, EncoderTable(time_s, np.linspace(0.1, 1.0, 9)))
+        )
     if address.startswith(f"{EXTRA}/poses"):
         return replace(scan, trajectory=PoseTable(time_s, scan.geometry.pose(time_s)))
     return scan
@@ -299,7 +308,9 @@ def test_every_cut_of_a_file_is_refused_or_read(good, tmp_path) -> None:
 def test_damage_is_found_before_the_pixels_are_read(good) -> None:
     with h5py.File(good, "r+") as file:
         replaced("linear")(file, f"{EXTRA}/detector_model")
-    for read in (lambda: read_scan(good, lambda *_: pytest.fail("pixels of a bad file")), lambda: scan_summary(good)):
+    for read in (
+        lambda: read_scan(good, lambda *_: pytest.fail("pixels of a bad file")), lambda: scan_summary(good),
+    ):
         with pytest.raises(InputError, match="detector_model"):
             read()
 

@@ -84,7 +84,8 @@ def test_fields_come_back(path, make_scan) -> None:
 
 
 KINEMATICS = {
-    "constant": ConstantSpeed(0.3, 0.1), "backwards": ConstantSpeed(0.3, -0.1), "ramp": SpeedRamp(0.3, 0.1, 0.02),
+    "constant": ConstantSpeed(0.3, 0.1), "backwards": ConstantSpeed(0.3, -0.1),
+    "ramp": SpeedRamp(0.3, 0.1, 0.02),
     "encoder": EncoderTable(np.linspace(0.5, 5.6, 60), np.cumsum(np.random.default_rng(1).uniform(0, 0.02, 60))),
 }  # fmt: skip
 
@@ -113,7 +114,9 @@ def test_trajectories_come_back(path, make_scan) -> None:
 
 
 def test_standing_gantry_stays_static_with_the_same_poses(path, make_scan) -> None:
-    for scan in (make_scan(is_fly=False), on("encoder", make_scan(is_fly=False)), on("poses", make_scan(is_fly=False))):
+    for scan in (
+        make_scan(is_fly=False), on("encoder", make_scan(is_fly=False)), on("poses", make_scan(is_fly=False)),
+    ):
         again = again_of(path, scan)
         assert not again.is_fly
         same_cells(MicroViews(), scan, again)
@@ -265,7 +268,9 @@ def test_units_are_converted(path, make_scan) -> None:
                 dataset[...] = dataset[...] * factor
                 dataset.attrs["units"] = unit
             again = again_of(path)
-            np.testing.assert_allclose(again.reference, scan.reference, rtol=1e-6, err_msg=f"{name} in {unit}")
+            np.testing.assert_allclose(
+                again.reference, scan.reference, rtol=1e-6, err_msg=f"{name} in {unit}"
+            )
             np.testing.assert_allclose(again.grid.voxel_size_mm, scan.grid.voxel_size_mm)
             assert again.shutter.exposure_s == pytest.approx(0.8), (name, unit)
             same_poses(scan, again)

@@ -59,7 +59,9 @@ def test_all_fields(write) -> None:
         scanner = load_scanner(write(text), DATA)
         assert scanner.geometry == ConeGeometry(500.0, 1000.0, (40, 60), (2.0, 1.0), (0.0, 3.5))
         assert scanner.grid == Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0))
-        assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("columns", -1, 0.5)
+        assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == (
+            "columns", -1, 0.5,
+        )
     scanner = load_scanner(write(GOOD.split("[volume]")[0]), DATA)
     assert scanner.grid == default_grid(scanner.geometry)
     assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("rows", 1, None)
@@ -89,7 +91,9 @@ WRONG = {
     "boundless": ("rows = 40", "rows = 1" + "0" * 400, "[detector] rows", "finite"),
     "half a row": ("rows = 40", "rows = 40.5", "[detector] rows", "whole"),
     "true": ("rows = 40", "rows = true", "[detector] rows", "True"),
-    "detector before axis": ("to_detector_mm = 1000.0", "to_detector_mm = 400", "[source] to_detector_mm", "500"),
+    "detector before axis": (
+        "to_detector_mm = 1000.0", "to_detector_mm = 400", "[source] to_detector_mm", "500",
+    ),
     "two counts": ("shape = [10, 20, 40]", "shape = [10, 20]", "[volume] shape", "three"),
     "zero voxels": ("shape = [10, 20, 40]", "shape = [10, 0, 40]", "[volume] shape", "at least 1"),
     "flat volume": ("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]", "[volume] size_mm", "above 0"),

@@ -55,13 +55,16 @@ def test_defects_are_named(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("not a volume")
     cut = _write(tmp_path / "cut.h5", np.ones((30, 30, 30)))
     cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
-    files = {"none.h5": "found no such file", "text.h5": "found a file that is not HDF5", "cut.h5": "", "": ""}
+    files = {
+        "none.h5": "found no such file", "text.h5": "found a file that is not HDF5", "cut.h5": "", "": "",
+    }
     for name, words in files.items():
         with pytest.raises(InputError, match=f"{name}: {words}"):
             load_volume(tmp_path / name)
     for data, words in [
-        (np.zeros((3, 4)), r"shape \(3, 4\); expected three axes"), (np.zeros((3, 0, 4)), r"shape \(3, 0, 4\)"),
-        (np.full((2, 2, 2), np.nan), "8 voxels that are NaN"), (np.zeros((2, 2, 2), complex), "type complex128"),
+        (np.zeros((3, 4)), r"shape \(3, 4\); expected three axes"),
+        (np.zeros((3, 0, 4)), r"shape \(3, 0, 4\)"), (np.full((2, 2, 2), np.nan), "8 voxels that are NaN"),
+        (np.zeros((2, 2, 2), complex), "type complex128"),
         (np.full((2, 2, 2), 1e300), "8 voxels that are NaN, infinite or too large"),
         (np.full((2, 2, 2), b"ab"), "type"),
     ]:  # fmt: skip

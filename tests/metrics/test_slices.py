@@ -30,7 +30,9 @@ def test_three_columns_with_a_truth_and_one_without(tmp_path: Path) -> None:
 
 def test_errors(tmp_path: Path) -> None:
     good, png = np.ones((3, 3, 3)), tmp_path / "a.png"
-    assert_refused({"missing": lambda: slices_png(tmp_path / "missing" / "a.png", good, None, "title")}, OutputError)
+    assert_refused(
+        {"missing": lambda: slices_png(tmp_path / "missing" / "a.png", good, None, "title")}, OutputError
+    )
     assert_refused({
         "result: found shape": lambda: slices_png(png, good[0], None, "title"),
         r"found shape \(3, 3, 3\); expected shape \(2, 3, 3\)": lambda: slices_png(png, good, good[1:], "title"),

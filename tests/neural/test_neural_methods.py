@@ -117,8 +117,8 @@ def test_a_damaged_state_is_refused(rt, scan) -> None:
     run_method(scan, "naf", rt, options, report=lambda p: states.append(dict(p.state())))
     wrong = {
         "parameters": np.zeros(3, np.float32), "moments": np.full_like(states[0]["moments"], np.nan),
-        "steps": np.array(10**6), "updates": np.array(-1), "queue": states[0]["queue"] + 100, "losses": np.zeros(3),
-        "rng": np.array("{}"),
+        "steps": np.array(10**6), "updates": np.array(-1), "queue": states[0]["queue"] + 100,
+        "losses": np.zeros(3), "rng": np.array("{}"),
     }  # fmt: skip
     for name, value in wrong.items():
         with pytest.raises(InputError, match=f"checkpoint, array {name}"):
@@ -182,7 +182,9 @@ def test_from_file_to_file(rt, scan, method, tmp_path, capsys) -> None:
     assert METHODS[method].is_resumable and list(METHODS[method].presets) == ["default", "published"]
     save_scan(tmp_path / "scan.h5", scan)
     settings = [f"--set={name}={value}" for name, value in SHORT[method].items() if name != "iterations"]
-    command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5"), "--method", method]
+    command = [
+        "reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5"), "--method", method,
+    ]
     assert load_cli().run([*command, *settings, "--iterations", "2", "--motion", "per-row"]) == 0
     assert "PSNR" in capsys.readouterr().out
     stored = read_volume(tmp_path / "volume.h5")

@@ -93,7 +93,9 @@ def test_smooth_fields_and_their_means_over_an_exposure(rays) -> None:
     ]:  # fmt: skip
         assert expected.max() > 0.2
         assert np.abs(integrals(field, rays, jitter) - expected).max() <= RAY_SAMPLES * expected.max()
-        mean, found = expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1)
+        mean, found = (
+            expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1),
+        )
         assert np.abs(found - mean).max() <= RAY_SAMPLES * mean.max()
 
 

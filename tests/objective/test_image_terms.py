@@ -15,7 +15,8 @@ from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 SHAPES = [(24, 31), (17, 5), (1, 1), (1, 40), (33, 1), (12, 16)]
 # how SSIM, L1 and squares are weighed; the latter by the light behind each pixel
 TERMS = [
-    (0.0, {}), (0.2, {}), (1.0, {}), (0.2, {"poisson_weight": 1.0}), (0.2, {"l1_weight": 0.0, "poisson_weight": 10.0})
+    (0.0, {}), (0.2, {}), (1.0, {}), (0.2, {"poisson_weight": 1.0}),
+    (0.2, {"l1_weight": 0.0, "poisson_weight": 10.0})
 ]  # fmt: skip
 
 

@@ -50,7 +50,9 @@ def test_bricks_are_the_volume_once(shape) -> None:
             count[brick.box] += 1
         assert (count == 1).all(), (steps, floats)
         assert (len(bricks) == 1) == (4 * np.prod(shape) <= 4 * floats), (steps, floats)
-    assert len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2  # the largest buffer counts too
+    assert (
+        len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2
+    )  # the largest buffer counts too
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])

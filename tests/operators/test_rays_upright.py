@@ -39,7 +39,9 @@ def general(rt: Runtime, grid: Grid, shape: tuple[int, int], cells: list[TimeCel
     return RayOperator(rt, grid, shape, cells, memory=RayMemory(rt, layout, len(cells)))
 
 
-def assert_same_bits(rt: Runtime, grid: Grid, cells: list[TimeCells], x: np.ndarray, shape=TALL_PANEL) -> np.ndarray:
+def assert_same_bits(
+    rt: Runtime, grid: Grid, cells: list[TimeCells], x: np.ndarray, shape=TALL_PANEL
+) -> np.ndarray:
     frames = RayOperator(rt, grid, shape, cells).forward(x)
     np.testing.assert_array_equal(frames, general(rt, grid, shape, cells).forward(x))
     return frames

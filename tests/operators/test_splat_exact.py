@@ -109,7 +109,9 @@ def test_clouds_on_odd_detectors(any_rt, one_cell, make_cloud, make_geometry, af
     for shape in [(61, 77), (17, 5), (1, 1), (1, 33), (40, 1)]:
         rows, pose = make_cloud(7, 1), make_geometry(*shape, offset=(0.1, -0.2)).pose(0.4)
         image = render(any_rt, rows, one_cell(pose, shape[0]), shape, affine=affine, cutoff_sigma=0.0)
-        assert_near(image, splat_image(rows, pose, shape, affine=affine), SPLAT_AFFINE if affine else SPLAT_CLOUD)
+        assert_near(
+            image, splat_image(rows, pose, shape, affine=affine), SPLAT_AFFINE if affine else SPLAT_CLOUD
+        )
     one, pose = make_cloud(1, 4, spread=0.1, scale=(0.1, 0.2)), make_geometry(23, 19).pose(2.0)
     for cutoff_sigma in (0.0, DEFAULT_CUTOFF_SIGMA):
         image = render(any_rt, one, one_cell(pose, 23), (23, 19), affine=affine, cutoff_sigma=cutoff_sigma)
@@ -168,7 +170,9 @@ def test_behind_the_source_nothing_is_seen(any_rt, one_cell, make_cloud, make_ge
         assert both.max() > 0
 
 
-def test_an_ellipsoid_across_the_source_plane_stays_finite(any_rt, one_cell, make_cloud, make_geometry) -> None:
+def test_an_ellipsoid_across_the_source_plane_stays_finite(
+    any_rt, one_cell, make_cloud, make_geometry
+) -> None:
     """At 3.7 σ those nearer than 1.85 contain a point at the source's own depth: they are not drawn."""
     rows, pose = make_cloud(1, 7, scale=(0.5, 0.5)), make_geometry(20, 20).pose(0.0)
     for x in (4.8, 5.0, 5.2, 4.0, 3.0):

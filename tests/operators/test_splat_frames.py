@@ -76,7 +76,8 @@ def test_no_exposure_and_no_readout_is_static(rt, make_cloud, orbit, axis) -> No
     rows, shutter = make_cloud(4, 33), Shutter(0.0, 0.0, axis)
     where = (orbit, shutter, 0, START_S, shutter.lines(SHAPE))
     assert_near(
-        render(rt, rows, micro_view_cells(*where, 5, 3)), render(rt, rows, static_cells(*where)), STANDING_PICTURE
+        render(rt, rows, micro_view_cells(*where, 5, 3)), render(rt, rows, static_cells(*where)),
+        STANDING_PICTURE,
     )
 
 

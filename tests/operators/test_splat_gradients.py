@@ -47,7 +47,9 @@ def device_gradients(rt, rows: np.ndarray, table: TimeCells, h: np.ndarray, **op
 
 
 def expected_gradients(finite_differences, rows, table, h, affine: bool = False) -> np.ndarray:
-    return by_gaussian(finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows)
+    return by_gaussian(
+        finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows
+    )
 
 
 @MODELS
@@ -59,7 +61,9 @@ def test_every_class_of_parameters(rt, make_cloud, make_table, finite_difference
 
 
 @MODELS
-def test_every_way_to_build_the_kernels(any_rt, make_cloud, make_geometry, finite_differences, affine) -> None:
+def test_every_way_to_build_the_kernels(
+    any_rt, make_cloud, make_geometry, finite_differences, affine
+) -> None:
     rows, h = make_cloud(3, 22, scale=(0.05, 0.3)), random_weights(SHAPE)
     for motion in ("static", "micro-views"):
         table = frame_cells(motion, make_geometry(*SHAPE))

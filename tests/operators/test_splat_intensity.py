@@ -29,7 +29,9 @@ MakeTable = Callable[..., TimeCells]
 @pytest.fixture
 def make_table(make_geometry) -> MakeTable:
     geometry = make_geometry(*SHAPE, offset=(0.15, -0.25))
-    return lambda motion, *readout: frame_cells(motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9)
+    return lambda motion, *readout: frame_cells(
+        motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9
+    )
 
 
 @remembered
@@ -64,7 +66,9 @@ def projector(rt: Runtime, table: TimeCells, **options: object) -> SplatProjecto
 def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, axis, direction) -> None:
     rows, table = make_cloud(5, 61, scale=(0.05, 0.2)), make_table(motion, axis, direction)
     found, mean = (
-        table.readout.frames(projector(any_rt, table, **unit).project(rows, DeviceCells.upload(any_rt, table)))
+        table.readout.frames(
+            projector(any_rt, table, **unit).project(rows, DeviceCells.upload(any_rt, table))
+        )
         for unit in ({}, {"intensity_unit": None})
     )
     expected = twin(rows, table)

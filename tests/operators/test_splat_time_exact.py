@@ -160,7 +160,9 @@ def test_gradients_are_those_of_the_rule_in_use(rt, finite_differences, time_err
 
 @pytest.mark.parametrize("pulse_s", [None, (0.5, 0.4)])
 def test_more_segments_come_to_every_row_at_hundreds_of_times(rt, make_cloud, make_geometry, pulse_s) -> None:
-    rows, orbit = make_cloud(6, 49, scale=(0.03, 0.2)), CircularOrbit(make_geometry(40, 44), ConstantSpeed(0.3, 0.5))
+    rows, orbit = (
+        make_cloud(6, 49, scale=(0.03, 0.2)), CircularOrbit(make_geometry(40, 44), ConstantSpeed(0.3, 0.5)),
+    )
     where = (orbit, Shutter(0.8, 0.6, pulse_s=pulse_s), 0, 0.2, 40)
     reference = render(rt, rows, per_line_cells(*where, 300), (40, 44))
     two, eight = (

@@ -57,7 +57,9 @@ def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
     assert pruned.count == 5
     grown = run(population, [0, 0, 0, 1.0, 0], control, box=10 * BOX)
     assert grown.count == 6
-    np.testing.assert_allclose(ACTIVATION.apply(grown.raw)[3:6].max(), LARGE, rtol=FLOAT64)  # no child is smaller
+    np.testing.assert_allclose(
+        ACTIVATION.apply(grown.raw)[3:6].max(), LARGE, rtol=FLOAT64
+    )  # no child is smaller
     assert np.isclose(ACTIVATION.apply(grown.raw)[3], LARGE).sum() == 3
 
 
@@ -120,12 +122,15 @@ def test_never_more_than_allowed_and_the_strongest_first(population) -> None:
         halved = [np.isclose(densities, d / 2).sum() == 2 for d in (2.0, 3.6, 1.1)]  # statistic 5, 4, 3
         assert halved == [room > 0, room > 1, room > 2]
     assert run(population, [1.0] * 5, replace(CONTROL, max_gaussians=7)).count == 7  # equals at the threshold
-    assert run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5  # a full one is left in peace
+    assert (
+        run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5
+    )  # a full one is left in peace
 
 
 def test_the_faded_and_the_lost_are_pruned(population) -> None:
     for row, value, kept in [
-        (10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False), (2, 1.2, False)
+        (10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False),
+        (2, 1.2, False)
     ]:  # fmt: skip
         rows = ACTIVATION.apply(population.raw)
         rows[row, 4] = value

@@ -13,7 +13,8 @@ from phyradgs_cl.optim.schedules import PUBLISHED_RATES
 
 # what the command line accepts (docs/reference/cli.md says the defaults)
 RANGES = {
-    "every": (0, 1_000_000_000), "start_iteration": (0, 1_000_000_000), "stop_fraction": (0, 1), "threshold": (0, 1e6),
+    "every": (0, 1_000_000_000), "start_iteration": (0, 1_000_000_000), "stop_fraction": (0, 1),
+    "threshold": (0, 1e6),
     "split_scale": (0, 1e3), "split_factor": (1, 1e3), "prune_density": (0, 1e6), "prune_aspect": (0, 1e9),
     "max_gaussians": (1, 100_000_000),
 }  # fmt: skip

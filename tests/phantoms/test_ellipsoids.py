@@ -110,7 +110,8 @@ def test_the_long_axis_turns_counter_clockwise_and_the_box_touches_the_surface()
 def test_impossible_ellipsoids_and_rays_are_refused() -> None:
     origin, phantom = (0, 0, 0), _random_phantom(0)
     assert_refused({
-        "semi-axis": lambda: Ellipsoid(origin, (1, 0, 1), 1.0), "centre": lambda: Ellipsoid((0, np.nan, 0), (1, 1, 1), 1.0),
+        "semi-axis": lambda: Ellipsoid(origin, (1, 0, 1), 1.0),
+        "centre": lambda: Ellipsoid((0, np.nan, 0), (1, 1, 1), 1.0),
         "rotation": lambda: Ellipsoid(origin, (1, 1, 1), 1.0, ((1, 0, 0), (0, 2, 0), (0, 0, 1))),
         "semi_axes_mm: found shape": lambda: Ellipsoid(origin, (1, 1), 1.0),  # type: ignore[arg-type]
         "supersampling": lambda: phantom.voxelise(Grid.cube(4, 1.0), 0),

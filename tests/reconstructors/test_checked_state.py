@@ -35,7 +35,9 @@ def test_what_a_run_has_written_is_taken() -> None:
 
 
 def test_what_no_run_has_written_is_refused_by_name() -> None:
-    shape, kind, number = r"shape \(3,\) of float32; expected shape \(2,\)", "shape .* of float32", "NaN or infinity"
+    shape, kind, number = (
+        r"shape \(3,\) of float32; expected shape \(2,\)", "shape .* of float32", "NaN or infinity",
+    )
     arrays = [(np.zeros(3, np.float32), shape), (np.zeros(2), rf"shape \(2,\) of float64; expected {kind}")]
     cases = [
         (partial(check_array, "raw", found, (2,), np.float32), f"raw: found {words}")

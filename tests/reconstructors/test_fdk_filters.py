@@ -34,7 +34,10 @@ def test_ramp_filter_is_a_convolution(width) -> None:
 def test_spectra_of_the_ramp_and_its_windows() -> None:
     """And a row of odd length, which has no sample at that frequency."""
     sinc = np.sin(np.pi / 4) / (np.pi / 4)
-    at = {"ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0), "hamming": (0.54, 0.08)}
+    at = {
+        "ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0),
+        "hamming": (0.54, 0.08),
+    }
     for window, (quarter, nyquist) in {**at, "hann": (0.5, 0)}.items():
         ratio = ramp_spectrum(256, window) / ramp_spectrum(256)
         assert ratio[[0, 64, 128]] == pytest.approx([1, quarter, nyquist], rel=FLOAT64, abs=FLOAT64), window

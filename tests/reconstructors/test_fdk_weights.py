@@ -47,7 +47,8 @@ def test_what_is_a_full_turn() -> None:
         "lost view": (np.delete(np.arange(0, 360, 5.0), 7), True),
         "uneven": (np.concatenate([np.arange(0, 180, 1.0), np.arange(180, 360, 4.0)]), True),
         "nearly a turn": (np.arange(0, 345, 5.0), False), "short": (np.arange(0, 200, 1.0), False),
-        "short and coarse": (np.arange(0, 201, 40.0), False), "more than a turn": (np.arange(0, 400, 7.3), True),
+        "short and coarse": (np.arange(0, 201, 40.0), False),
+        "more than a turn": (np.arange(0, 400, 7.3), True),
     }  # fmt: skip
     for name, (angles_deg, is_full) in cases.items():
         arc = view_arc(np.deg2rad(angles_deg))

@@ -37,7 +37,9 @@ def run(rt, scan: Scan, method: str, model: str | None = None, **more):
     """A method on voxels, or the splats with their motion in the name."""
     name, _, motion = method.partition(" ")
     changes = {"motion": motion, "gaussians": 400} if motion else {"motion": "per-row", "sub_intervals": 3}
-    changes |= {"iterations": ITERATIONS[method], **({} if model is None else {"detector_model": model}), **more}
+    changes |= {
+        "iterations": ITERATIONS[method], **({} if model is None else {"detector_model": model}), **more,
+    }
     return reconstruct(scan, name, rt, method_options(name, None, changes))
 
 
@@ -92,7 +94,8 @@ def test_masked_pixels_do_not_count(rt, scan, masked) -> None:
 
 def test_splats_on_a_gantry_at_rest_have_one_value_to_average(rt, scan) -> None:
     by_log, by_intensity = (
-        run(rt, scan, "phyradgs exact", model, motion="static", iterations=3) for model in ("log", "intensity")
+        run(rt, scan, "phyradgs exact", model, motion="static", iterations=3)
+        for model in ("log", "intensity")
     )
     np.testing.assert_array_equal(by_log.volume, by_intensity.volume)
     assert by_intensity.facts["detector_model"] == "log"

@@ -30,8 +30,8 @@ UNIT = Scale(length_mm=20.0, density_per_mm=0.05)
 GRID = Grid((7, 9, 10), (4.0, 4.2, 4.0), (1.0, 0.0, -1.0))  # half the longest side is 20 mm
 OPTIONS = SplatOptions(
     motion=MicroViews(3, 2), iterations=1, ssim_weight=0.25, l1_weight=0.7, poisson_weight=1.5, tv_weight=0.3,
-    tv_edge=6, density_weight=0.02, shape_weight=0.01, shape_ratio=2.0, shape_floor=0.1, parameter_terms_from=0,
-    cutoff_sigma=0.0, scale_max=0.6, control=DensityControl(every=0),
+    tv_edge=6, density_weight=0.02, shape_weight=0.01, shape_ratio=2.0, shape_floor=0.1,
+    parameter_terms_from=0, cutoff_sigma=0.0, scale_max=0.6, control=DensityControl(every=0),
 )  # fmt: skip
 TERMS = ParameterTerms(OPTIONS.density_weight, OPTIONS.shape_weight, OPTIONS.shape_ratio, OPTIONS.shape_floor)
 

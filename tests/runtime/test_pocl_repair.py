@@ -38,7 +38,8 @@ def test_a_known_processor_is_left_alone(record, monkeypatch) -> None:
     """A Zen 3's name says all that it has."""
     memory, put = record
     for target, *names in [
-        ("haswell", b"skylake-avx512", b"znver3", b"generic-like", b""), ("skylake-avx512", b"sapphirerapids", b"znver30")
+        ("haswell", b"skylake-avx512", b"znver3", b"generic-like", b""),
+        ("skylake-avx512", b"sapphirerapids", b"znver30")
     ]:  # fmt: skip
         monkeypatch.setattr(pocl, "equivalent_target", lambda target=target: target)
         for name in names:
@@ -89,8 +90,10 @@ AVX2 = {"avx", "avx2", "fma", "bmi1", "bmi2"}
 def test_the_equivalent_has_no_instruction_that_is_missing(monkeypatch) -> None:
     monkeypatch.undo()  # the real function
     for machine, flags, target in [
-        ("x86_64", AVX512 | AVX2, "skylake-avx512"), ("AMD64", AVX2, "haswell"), ("x86_64", {"avx"}, "sandybridge"),
-        ("x86_64", AVX512 - {"avx512vl"} | AVX2, "haswell"), ("x86_64", set(), "x86-64"), ("aarch64", AVX2, None),
+        ("x86_64", AVX512 | AVX2, "skylake-avx512"), ("AMD64", AVX2, "haswell"),
+        ("x86_64", {"avx"}, "sandybridge"),
+        ("x86_64", AVX512 - {"avx512vl"} | AVX2, "haswell"), ("x86_64", set(), "x86-64"),
+        ("aarch64", AVX2, None),
     ]:  # fmt: skip
         monkeypatch.setattr(pocl.platform, "machine", lambda machine=machine: machine)
         monkeypatch.setattr(pocl, "_cpu_flags", lambda flags=flags: flags)
