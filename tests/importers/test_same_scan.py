@@ -17,6 +17,7 @@ MOVING = {"fly": True, "axis": "columns", "direction": -1}
 ALL = ImportOptions(part="all")
 CONE = {"source_to_axis_mm": 500.0, "source_to_detector_mm": 800.0, "detector_offset_mm": (4.0, -6.0)}
 TIMED = "[timing]\nexposure_s = 0.4\nreadout_s = 0.3\n{}\n[readout]\naxis = 'columns'\ndirection = -1\n"
+EVERY = TIMED.format("frame_time_s = 1.25")
 ROWS = ImportOptions(exposure_s=0.4, readout_axis="rows")
 STARTS, STEPS = "start_s = [0, 1.25, 2.5, 3.75, 5, 6.25]", "first_deg = 10.0\nstep_deg = 25.0"
 MIDDLE = "first_deg = 14.0\nlast_deg = 139.0\nat = 'middle'"  # 25 · 0.5 · 0.4 / 1.25 after the opening
@@ -37,9 +38,9 @@ SAME = {
     "rtk, moving": ("rtk", {}, MOVING, FLY),
     "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
     "nxtomo, moving": ("nxtomo", {}, MOVING, replace(FLY, exposure_s=None, detector_offset_mm=(4.0, -6.0))),
-    "tiff, frame time": ("tiff", {"timing": TIMED.format("frame_time_s = 1.25"), "angles": STEPS}, MOVING, None),
+    "tiff, frame time": ("tiff", {"timing": EVERY, "angles": STEPS}, MOVING, None),
     "tiff, starts": ("tiff", {"timing": TIMED.format(STARTS), "angles": STEPS}, MOVING, None),
-    "tiff, middles": ("tiff", {"timing": TIMED.format("frame_time_s = 1.25"), "angles": MIDDLE}, MOVING, None),
+    "tiff, middles": ("tiff", {"timing": EVERY, "angles": MIDDLE}, MOVING, None),
 }  # fmt: skip
 
 

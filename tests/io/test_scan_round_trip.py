@@ -83,10 +83,11 @@ def test_fields_come_back(path, make_scan) -> None:
     same_poses(scan, again)
 
 
+WANDER = np.cumsum(np.random.default_rng(1).uniform(0, 0.02, 60))
 KINEMATICS = {
     "constant": ConstantSpeed(0.3, 0.1), "backwards": ConstantSpeed(0.3, -0.1),
     "ramp": SpeedRamp(0.3, 0.1, 0.02),
-    "encoder": EncoderTable(np.linspace(0.5, 5.6, 60), np.cumsum(np.random.default_rng(1).uniform(0, 0.02, 60))),
+    "encoder": EncoderTable(np.linspace(0.5, 5.6, 60), WANDER),
 }  # fmt: skip
 
 
