@@ -32,8 +32,8 @@ SAME = {
     **{f"naf, protocol {protocol}": ("naf", {"protocol": protocol}, {}, ALL) for protocol in range(6)},
     **{
         f"rtk {name} {flip} {packed}": ("rtk", {"flip": flip, "compressed": packed, "name": name}, {}, None)
-        for name in ("projections.mha", "projections.mhd") for flip in (False, True) for compressed
-        in (False, True)
+        for name in ("projections.mha", "projections.mhd") for flip in (False, True)
+        for packed in (False, True)
     },
     "rtk, moving": ("rtk", {}, MOVING, FLY),
     "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
