@@ -1,7 +1,5 @@
 """How far a command is, on stderr: one line rewritten on a terminal, a line every ten seconds elsewhere."""
 
-from __future__ import annotations
-
 import sys
 import time
 from contextlib import suppress
@@ -24,7 +22,7 @@ class Ticker:
         self.first: int | None = None
         self.is_open = self.is_counting = False
 
-    def __enter__(self) -> Ticker:
+    def __enter__(self) -> "Ticker":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -38,7 +36,6 @@ class Ticker:
             self.is_open, self.is_counting = True, False
 
     def progress(self, p: Progress) -> None:
-        """The report of a reconstruction."""
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 

@@ -1,10 +1,8 @@
 """Cone-beam geometry: where source and detector stand at a gantry angle.
 
-A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from one
-column to the next (û·du) and from one row to the next (v̂·dv). Operators take poses, never angles.
+A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
+and from row to row (v̂·dv). Operators take poses, never angles.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
@@ -17,11 +15,8 @@ POSE_LENGTH = 12
 
 @dataclass(frozen=True)
 class ConeGeometry:
-    """A circular cone-beam orbit about +z with a flat panel.
-
-    ``detector_shape`` counts (rows, columns), ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm``
-    (along v, along u) shifts the panel's centre away from the central ray.
-    """
+    """A circular cone-beam orbit about +z with a flat panel: ``detector_shape`` counts (rows, columns),
+    ``pixel_size_mm`` is (dv, du), ``detector_offset_mm`` (v, u) shifts the panel's centre from the central ray."""
 
     source_to_axis_mm: float
     source_to_detector_mm: float
@@ -30,21 +25,17 @@ class ConeGeometry:
     detector_offset_mm: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        dso, dsd = float(self.source_to_axis_mm), float(self.source_to_detector_mm)
-        if not (np.isfinite(dso) and dso > 0):
-            raise InputError("source_to_axis_mm", str(dso), "a positive length in mm")
-        if not (np.isfinite(dsd) and dsd > 0):
-            raise InputError("source_to_detector_mm", str(dsd), "a positive length in mm")
+        for name in ("source_to_axis_mm", "source_to_detector_mm"):
+            if not (np.isfinite(length := float(getattr(self, name))) and length > 0):
+                raise InputError(name, str(length), "a positive length in mm")
         if len(self.detector_shape) != 2 or min(self.detector_shape) < 1:
-            raise InputError(
-                "detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1"
-            )
+            expected = "two counts (rows, columns) of at least 1"
+            raise InputError("detector_shape", str(self.detector_shape), expected)
         if len(self.pixel_size_mm) != 2 or not all(np.isfinite(d) and d > 0 for d in self.pixel_size_mm):
             raise InputError("pixel_size_mm", str(self.pixel_size_mm), "two positive lengths in mm (v, u)")
         if len(self.detector_offset_mm) != 2 or not np.all(np.isfinite(self.detector_offset_mm)):
-            raise InputError(
-                "detector_offset_mm", str(self.detector_offset_mm), "two finite lengths in mm (v, u)"
-            )
+            expected = "two finite lengths in mm (v, u)"
+            raise InputError("detector_offset_mm", str(self.detector_offset_mm), expected)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
         """Poses (..., 12) float64 at gantry angles (...) (design: source at (DSO cos θ, DSO sin θ, 0))."""
@@ -62,7 +53,7 @@ class ConeGeometry:
         )
         return np.concatenate([self.source_to_axis_mm * radial, first_pixel, du * u_hat, dv * v_hat], -1)
 
-    def scaled(self, factor: float) -> ConeGeometry:
+    def scaled(self, factor: float) -> "ConeGeometry":
         """The same geometry with every length multiplied by ``factor``."""
         dv, du = self.pixel_size_mm
         off_v, off_u = self.detector_offset_mm
@@ -74,7 +65,7 @@ class ConeGeometry:
             detector_offset_mm=(off_v * factor, off_u * factor),
         )
 
-    def finer(self, factor: int) -> ConeGeometry:
+    def finer(self, factor: int) -> "ConeGeometry":
         """The same panel with every pixel cut into ``factor`` by ``factor``."""
         rows, columns = self.detector_shape
         dv, du = self.pixel_size_mm

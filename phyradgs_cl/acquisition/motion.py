@@ -1,10 +1,8 @@
 """Motion models: how a reconstruction turns a frame of a scan into time cells.
 
-A model is a small frozen class with ``cells(scan, frame)``; a class of your own works in every method (docs/methods.md). A
-scan that is not a fly-scan has one pose per frame in every model here.
+A model is a frozen class with ``cells(scan, frame)``; one of your own works in every method (docs/methods.md). A scan
+that is not a fly-scan has one pose per frame in all of these.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
@@ -29,7 +27,6 @@ class Motion(Interface):
 
 
 def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int]:
-    """What the builders of cells begin with."""
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 
@@ -99,11 +96,8 @@ class LineMiddles:
 
 @dataclass(frozen=True)
 class Exact:
-    """``segments`` of a frame, in which splats move while every line integrates over its own window.
-
-    0 segments chooses the number so that the error stays below ``time_error`` (relative), which also bounds the rules that
-    average over time.
-    """
+    """``segments`` of a frame, in which splats move while every line integrates over its own window; 0 chooses them by
+    ``time_error`` (relative), which also bounds the rules that average over time."""
 
     name: str = field(default="exact", init=False, repr=False)
     segments: int = 0
@@ -146,10 +140,8 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """The inverse of ``motion_facts``; None for a model that is not ours. Fields of other models are passed over.
-
-    Raises InputError and TypeError for values that a model does not take.
-    """
+    """The inverse of ``motion_facts``; None for a model that is not ours, whose fields are passed over. InputError and
+    TypeError for values that a model does not take."""
     name = facts.get("name")
     for model in MODELS:
         own = [f.name for f in fields(model) if f.init]

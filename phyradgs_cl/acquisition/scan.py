@@ -1,7 +1,5 @@
 """A scan: what was measured, where the gantry was, and the grid that is asked for."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,11 +27,10 @@ class Saturation:
 class Scan:
     """One cone-beam scan in line integrals.
 
-    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read
-    line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
-    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
-    projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
-    ``saturation`` is None where nobody looked at raw counts.
+    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read line;
+    pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
+    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the projections.
+    Lines that a pulsed beam misses are added to the mask. ``saturation`` is None where nobody looked at raw counts.
     ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
     """
 
@@ -56,9 +53,8 @@ class Scan:
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
         if self.projections.shape != expected:
-            raise InputError(
-                "projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}"
-            )
+            found = f"shape {self.projections.shape}"
+            raise InputError("projections", found, f"(frames, rows, columns) = {expected}")
         if frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
         if np.shape(self.frame_start_s) != (frames,):
@@ -84,21 +80,27 @@ class Scan:
         return len(self.projections)
 
     @property
+    def valid(self) -> np.ndarray:
+        """Which pixels may be used, bool (F, nv, nu): a view."""
+        unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
+        return np.broadcast_to(unmasked, self.projections.shape)
+
+    @property
     def lines(self) -> int:
-        """Lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
 
-    def on_grid(self, grid: Grid) -> Scan:
+    def on_grid(self, grid: Grid) -> "Scan":
         """The same scan with another grid; a reference stays where the grid is a part of its own, else it is left out."""
         if grid == self.grid:
             return self
         reference = self.reference
         if reference is not None:
             first = grid.start_in(self.grid)
-            reference = None if first is None else _part(reference, first, grid.shape)
+            parts = None if first is None else [slice(s, s + n) for s, n in zip(first, grid.shape, strict=True)]
+            reference = None if parts is None else reference[tuple(parts)]
         return replace(self, grid=grid, reference=reference)
 
-    def with_grid(self, choice: GridChoice) -> Scan:
+    def with_grid(self, choice: GridChoice) -> "Scan":
         """The same scan with the grid that is chosen. Raises InputError for one that no ray of an orbit meets."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):
@@ -108,16 +110,8 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
-
-        Raises InputError for that, and for an exposure too short for the scan's times.
-        """
+        """InputError for a trajectory that ends before the last frame's window, an exposure too short for its times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
-
-
-def _part(volume: np.ndarray, first: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    z, y, x = (slice(start, start + count) for start, count in zip(first, shape, strict=True))
-    return volume[z, y, x]

@@ -1,7 +1,5 @@
 """Kinematics: the gantry angle θ(t), or whole poses, at any time of a frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -61,15 +59,8 @@ class EncoderTable:
     culprit: str = "encoder table"
 
     def __post_init__(self) -> None:
-        time_s = np.asarray(self.time_s, np.float64)
-        table = np.asarray(self.angle_rad_table, np.float64)
-        if time_s.ndim != 1 or time_s.size < 2 or table.shape != time_s.shape:
-            found = f"shapes {time_s.shape} and {table.shape}"
-            raise InputError(self.culprit, found, "two equal 1D arrays of at least 2 samples")
-        if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
-            raise InputError(self.culprit, "NaN or infinity", "finite times and angles")
-        if np.any(np.diff(time_s) <= 0):
-            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        wanted = "two equal 1D arrays of at least 2 samples"
+        time_s, table = _checked_table(self.culprit, self.time_s, self.angle_rad_table, (), "angles", wanted)
         object.__setattr__(self, "time_s", time_s)
         object.__setattr__(self, "angle_rad_table", table)
 
@@ -81,11 +72,8 @@ class EncoderTable:
 
 @dataclass(frozen=True, eq=False)
 class FrameSweeps:
-    """Each frame's own constant speed, from its angle when the exposure starts to that when it ends.
-
-    Continued past the exposure through the readout; equal angles are a gantry at rest (stop-and-shoot).
-    All arrays are (F,).
-    """
+    """Each frame's own constant speed (all (F,)), from its angle when the exposure starts to that when it ends,
+    continued through the readout; equal angles are a gantry at rest (stop-and-shoot)."""
 
     start_s: np.ndarray
     exposure_s: float
@@ -116,11 +104,8 @@ class CircularOrbit:
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them.
-
-    Rotations go by slerp and everything else is linear in the body's own frame: interpolating the 12
-    numbers in the world would shrink an orbit (by 1 mm at 1 m over 5°).
-    """
+    """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them. Rotations go by slerp, all
+    else is linear in the body's frame: interpolating in the world would shrink an orbit (by 1 mm at 1 m over 5°)."""
 
     time_s: np.ndarray
     table: np.ndarray
@@ -128,15 +113,8 @@ class PoseTable:
     _frames: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        time_s = np.asarray(self.time_s, np.float64)
-        table = np.asarray(self.table, np.float64)
-        if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, POSE_LENGTH):
-            found = f"shapes {time_s.shape} and {table.shape}"
-            raise InputError(self.culprit, found, "times (T,) and poses (T, 12), T at least 2")
-        if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
-            raise InputError(self.culprit, "NaN or infinity", "finite times and poses")
-        if np.any(np.diff(time_s) <= 0):
-            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        expected, row = "times (T,) and poses (T, 12), T at least 2", (POSE_LENGTH,)
+        time_s, table = _checked_table(self.culprit, self.time_s, self.table, row, "poses", expected)
         normal = np.cross(table[:, 6:9], table[:, 9:12])
         if np.any(np.linalg.norm(normal, axis=1) <= 0):
             raise InputError(self.culprit, "parallel pixel steps", "û·du and v̂·dv that span a plane")
@@ -157,11 +135,8 @@ class PoseTable:
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) + ``span_s``.
-
-    Raises InputError where a fine table still does not follow it, as where frames that overlap in time are elsewhere at the
-    same moment.
-    """
+    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) +
+    ``span_s``; InputError where a fine table does not, as where frames overlap in time and are elsewhere."""
     apart = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)
@@ -180,6 +155,20 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         apart = 2 * apart - 1
 
 
+def _checked_table(
+    culprit: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rising times (T,) and finite rows (T, *row), float64."""
+    time_s, table = np.asarray(times, np.float64), np.asarray(rows, np.float64)
+    if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
+        raise InputError(culprit, f"shapes {time_s.shape} and {table.shape}", expected)
+    if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
+        raise InputError(culprit, "NaN or infinity", f"finite times and {what}")
+    if np.any(np.diff(time_s) <= 0):
+        raise InputError(culprit, "times that do not increase", "strictly increasing times in s")
+    return time_s, table
+
+
 def _body_frames(table: np.ndarray) -> np.ndarray:
     """Right-handed orthonormal frames (T, 3, 3), columns û, v̂ and normal, of poses (T, 12)."""
     u_hat = table[:, 6:9] / np.linalg.norm(table[:, 6:9], axis=1, keepdims=True)
@@ -192,9 +181,6 @@ def _check_covered(culprit: str, frame: int, t: np.ndarray, table_s: np.ndarray)
     """A measured table is never extrapolated; a nanosecond of slack absorbs rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
-        raise InputError(
-            culprit,
-            f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s",
-            f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)",
-            "extend the table or drop the frame",
-        )
+        found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"
+        expected = f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)"
+        raise InputError(culprit, found, expected, "extend the table or drop the frame")

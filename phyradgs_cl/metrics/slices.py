@@ -1,7 +1,5 @@
 """A figure of the three middle slices beside the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,21 +21,11 @@ _INCH, _DPI = 3.2, 110
 
 
 def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str) -> None:
-    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference.
+    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference. z and y point up.
 
-    Grey values run over the truth's range in both columns, so that a wrong gain shows; the difference has
-    a scale of its own, symmetric about 0. Titles carry the slice's number and root mean square error, the
-    heading PSNR and SSIM. z and y point up in the pictures.
-
-    Args:
-        path: file to write.
-        result: (z, y, x).
-        reference: (z, y, x), the truth, or None where there is none: then there is one column.
-        title: the heading's first line.
-
-    Raises:
-        InputError: not 3D, shapes that differ, NaN or infinity.
-        OutputError: the file cannot be written.
+    Grey values run over the truth's range, so that a wrong gain shows; the difference has a scale of its own, symmetric
+    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line. InputError:
+    not 3D, shapes that differ, NaN or infinity. OutputError: the file cannot be written.
     """
     from matplotlib.figure import Figure  # slow to import, and only figures need it
 
@@ -45,9 +33,8 @@ def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None,
     shape("result", volume, (None, None, None))
     finite("result", volume)
     truth = None if reference is None else np.asarray(reference)
-    figure = Figure(
-        figsize=((1 if truth is None else 3) * _INCH * 1.25, 3 * _INCH + 0.6), layout="constrained"
-    )
+    width = (1 if truth is None else 3) * _INCH * 1.25
+    figure = Figure(figsize=(width, 3 * _INCH + 0.6), layout="constrained")
     heading = plain_text(title if truth is None else f"{title}\n{_numbers(volume, truth)}")
     figure.suptitle(heading, parse_math=False)  # a dollar in a file's name is one
     _fill(figure, volume, truth)
@@ -63,7 +50,7 @@ def _numbers(result: Image, reference: Image) -> str:
     return f"PSNR {psnr(result, reference):.2f} dB, SSIM {ssim(result, reference):.4f}"
 
 
-def _fill(figure: Figure, volume: Image, truth: Image | None) -> None:
+def _fill(figure: "Figure", volume: Image, truth: Image | None) -> None:
     if truth is not None:
         shape("reference", truth, volume.shape)
         finite("reference", truth)
@@ -85,7 +72,7 @@ def _fill(figure: Figure, volume: Image, truth: Image | None) -> None:
 
 
 def _panel(
-    figure: Figure, axes: Axes, image: Image, title: str, colours: str, low: float, high: float
+    figure: "Figure", axes: "Axes", image: Image, title: str, colours: str, low: float, high: float
 ) -> None:
     drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, origin="lower")
     axes.set_title(title, fontsize=9)

@@ -1,6 +1,6 @@
+from .method import Method as Method
 from .preprocess import InputOptions as InputOptions
 from .registry import METHODS as METHODS
-from .registry import Method as Method
 from .registry import input_options as input_options
 from .registry import method_name as method_name
 from .registry import method_options as method_options

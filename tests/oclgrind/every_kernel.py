@@ -39,8 +39,7 @@ NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
 VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing")
 BUILDS = {
-    "lanes 1": {"lanes": 1},
-    "a GPU's": {"lanes": 1, "pixel_items": True},
+    "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
 }
 
@@ -54,10 +53,8 @@ def cloud(count: int) -> np.ndarray:
     rng = np.random.default_rng(count)
     quaternion = rng.normal(size=(4, count))
     parts = [
-        rng.uniform(-0.6, 0.6, (3, count)),
-        rng.uniform(0.05, 0.3, (3, count)),
-        quaternion / np.linalg.norm(quaternion, axis=0),
-        rng.uniform(0.5, 1.0, (1, count)),
+        rng.uniform(-0.6, 0.6, (3, count)), rng.uniform(0.05, 0.3, (3, count)),
+        quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.5, 1.0, (1, count)),
     ]
     rows = np.concatenate(parts)
     rows[:3, :1] = [[40.0], [0.0], [0.0]]  # one behind the source
@@ -65,13 +62,11 @@ def cloud(count: int) -> np.ndarray:
 
 
 OPTIONS = {
-    "exact": {},
-    "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
+    "exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
     "intensity, pixels": {"intensity_unit": 2.0, "pixel_footprint": True},
 }
 MODELS: dict[str, Callable[..., TimeCells]] = {
-    "still": static_cells,
-    "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
+    "still": static_cells, "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
     "moving": lambda *where: exact_cells(*where, 2),
 }
 
@@ -150,11 +145,8 @@ def checked(build: str, case: str, log: Path) -> tuple[set[str], str]:
     unwritten = build not in FREEZES and not case.startswith(VECTORS_OR_FREEZES)
     checks = {"OCLGRIND_DATA_RACES": "1", **({"OCLGRIND_UNINITIALIZED": "1"} if unwritten else {})}
     done = subprocess.run(
-        [sys.executable, __file__, build, case],
-        env={**os.environ, **checks, "OCLGRIND_LOG": str(log)},
-        capture_output=True,
-        text=True,
-        timeout=600,
+        [sys.executable, __file__, build, case], env={**os.environ, **checks, "OCLGRIND_LOG": str(log)},
+        capture_output=True, text=True, timeout=600,
     )
     reports = log.read_text(encoding="utf-8") if log.exists() else ""
     if done.returncode:

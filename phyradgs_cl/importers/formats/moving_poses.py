@@ -1,7 +1,5 @@
 """Poses that no circle describes: tables of them over time, row 0 the lowest, with a plain geometry to go by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -45,10 +43,8 @@ def turn_of(pose: np.ndarray) -> Turned:
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
-    """The circular geometry nearest to poses (F, 12), by mean distances and offsets; sizes are taken from it.
-
-    The detector's distance is that of its plane, its offset that of its middle from the source's foot on the plane.
-    """
+    """The circular geometry nearest to poses (F, 12), by mean distances and offsets; sizes are taken from it. The
+    detector's distance is its plane's, its offset that of its middle from the source's foot on the plane."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
@@ -62,11 +58,8 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
 
 
 def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, culprit: str) -> PoseTable:
-    """A pose table that covers every frame's window.
-
-    ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to frame 3, and beyond the
-    ends it goes on as it went. A gantry at rest gets a table whose value at each frame's middle is that frame's pose.
-    """
+    """A pose table that covers every frame's window. ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is
+    halfway from frame 2 to 3; a gantry at rest has each frame's pose at its middle."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         return _standing(pose_at, timing, at_s, culprit)

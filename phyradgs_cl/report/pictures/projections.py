@@ -1,13 +1,11 @@
 """Frames of a scan against the same frames computed from the volume, each line at its own times."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition import PerRow
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.report.run import Run
@@ -28,7 +26,6 @@ class View:
 
     @property
     def residual(self) -> Image:
-        """Measured less computed."""
         return self.measured - self.computed
 
     @property
@@ -48,11 +45,8 @@ def chosen_frames(frames: int, count: int) -> list[int]:
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
-    """``count`` frames of the run's scan beside those of its volume, under the scan's true motion.
-
-    The measurement is what the run's method saw: lag undone and filtered if the run did so. A panel that averages
-    intensity is compared with intensities that are averaged.
-    """
+    """``count`` frames of the run's scan, as its method saw them (lag undone, filtered), beside those of its volume
+    under the scan's true motion; intensities where the panel averages them."""
     if run.scan is None or count < 1:
         return []
     scan, chosen = prepared(run.scan, run.before), chosen_frames(run.scan.frames, count)
@@ -64,17 +58,10 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
         computed = computed - operator.intensity_gap(run.stored.volume)
     views = []
     for frame, image in zip(chosen, computed, strict=True):
-        valid = _valid(scan, frame)
+        valid = scan.valid[frame]
         measured = np.where(valid, scan.projections[frame], 0).astype(np.float32)
         views.append(View(frame, measured, np.where(valid, image, 0).astype(np.float32), valid))
     return views
-
-
-def _valid(scan: Scan, frame: int) -> NDArray[np.bool_]:
-    if scan.pixel_mask is None:
-        return np.ones(scan.geometry.detector_shape, bool)
-    mask = np.asarray(scan.pixel_mask)
-    return (mask if mask.ndim == 2 else mask[frame]) == 0
 
 
 def _rms(values: NDArray[np.floating]) -> float:
