@@ -27,8 +27,8 @@ _HOST = HostSpace()
 class IntensityOperator:
     """I(x), and J and Jᵀ at the volume for which I was asked last (A and Aᵀ before that).
 
-    Arguments as for ``RayOperator``, whose rule for NumPy's and device arrays holds here too; one operator is used with one
-    kind. It holds frames (F, rows, columns) once for every cell of a line, which is what the softmax weights need.
+    Arguments as for ``RayOperator``, whose rule for NumPy's and device arrays holds here too. It holds frames (F, rows,
+    columns) once for every cell of a line, which is what the softmax weights need.
     """
 
     def __init__(
@@ -122,7 +122,11 @@ class IntensityOperator:
         return out
 
     def _shares_for(self, like: Array) -> list[Any]:
-        if not self._shares and isinstance(like, DeviceArray):
+        is_there = isinstance(like, DeviceArray)
+        if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:  # ``expected`` had the other kind
+            brought = self._device.array if is_there else self._device.numpy
+            self._shares = [brought(share) for share in self._shares]
+        if not self._shares and is_there:
             spread = [self._device.empty(self.frames_shape) for _ in self._operators]
             for weights, share in zip(self._uploaded(), spread, strict=True):
                 self._launch("layer_weights", weights, share)
