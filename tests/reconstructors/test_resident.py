@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, pitch_of
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")
-MOST_BYTES = 1024  # over the bus in an iteration
+MOST_BYTES, MOST_WAITS = 1024, 8  # over the bus in an iteration, however many subsets it has
 MODELS = ("log", "intensity")
 GRID = Grid.cube(20, 2.0)
 
@@ -54,7 +54,7 @@ def test_an_iteration_moves_numbers_alone(scan, method, model) -> None:
     moved = np.diff([(t.bytes_up, t.bytes_down, t.blocking) for t in seen], axis=0)
     assert len(moved) == 3
     assert moved[:, 1].min() > 0, "the record has numbers, which somebody has to have asked for"
-    assert moved[:, :2].sum(axis=1).max() <= MOST_BYTES
+    assert moved[:, :2].sum(axis=1).max() <= MOST_BYTES and moved[:, 2].max() <= MOST_WAITS
     assert rt.traffic.bytes_down - seen[-1].bytes_down == result.volume.nbytes
     again = reconstruct(scan, method, Runtime(), options_of(method, model))
     np.testing.assert_array_equal(again.volume, result.volume)
