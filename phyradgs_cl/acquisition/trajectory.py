@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.text import short_repr
 
 _LEAST_SPAN_S = 1e-6  # of a frame that takes no time
 _MOST_SAMPLES = 1024  # per frame
+_SAME_PLACE = 1e-9  # of the longest distance: what float64 leaves of an orbit
 
 
 class Trajectory(Protocol):
@@ -52,13 +54,15 @@ class SpeedRamp:
         return self.angle_start_rad + self.speed_rad_per_s * t + 0.5 * self.acceleration_rad_per_s2 * t * t
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
     """Measured θ(t): linear between samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
 
     time_s: np.ndarray
     angle_rad_table: NDArray[np.float64]
     culprit: str = "encoder table"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         time_s = np.asarray(self.time_s, np.float64)
@@ -79,7 +83,7 @@ class EncoderTable:
         return np.interp(t, self.time_s, self.angle_rad_table)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FrameSweeps:
     """Each frame's own constant speed, from its angle when the exposure starts to that when it ends.
 
@@ -91,6 +95,8 @@ class FrameSweeps:
     exposure_s: float
     angle_start_rad: np.ndarray
     angle_end_rad: np.ndarray
+
+    __repr__ = short_repr
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         t = np.asarray(time_s, np.float64)
@@ -114,7 +120,7 @@ class CircularOrbit:
         return self.kinematics.angle_rad(frame, time_s)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PoseTable:
     """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them.
 
@@ -126,6 +132,8 @@ class PoseTable:
     table: np.ndarray
     culprit: str = "pose table"
     _frames: np.ndarray = field(init=False, repr=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         time_s = np.asarray(self.time_s, np.float64)
@@ -154,6 +162,21 @@ class PoseTable:
         turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
         turned: np.ndarray = np.einsum("tij,tkj->tki", turn, body)
         return turned.reshape(*t.shape, POSE_LENGTH)
+
+
+def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, culprit: str = "poses") -> PoseTable:
+    """A gantry that stops for every frame, as a table: poses (F, 12), each held for a span about its frame's middle (F,) in s."""
+    half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
+    time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
+    return PoseTable(time_s, np.repeat(poses, 2, axis=0), culprit)
+
+
+def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
+    """A gantry that stops for every frame: a circular orbit where its poses (F, 12) are those of ``geometry``, else a table."""
+    angle_rad = np.arctan2(poses[:, 1], poses[:, 0])
+    if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * geometry.source_to_detector_mm):
+        return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
+    return resting_poses(poses, middle_s, 0.0)
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
