@@ -101,4 +101,4 @@ def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.nd
 
 def _refuse(culprit: str, values: np.ndarray, expected: str) -> None:
     if np.any(values):
-        raise InputError(culprit, checks.shown(values[np.nonzero(values)[0][0]].tolist()), expected)
+        raise InputError(culprit, checks.shown(float(values[np.nonzero(values)][0])), expected)

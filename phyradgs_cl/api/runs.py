@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl import __version__
+import numpy as np
+
+from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import read_scan, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
+from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
     InputOptions,
+    Interrupted,
     ProgressReport,
     Reconstruction,
+    State,
     ignore_progress,
     input_options,
+    method_name,
+    method_of,
     method_options,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
+from phyradgs_cl.reconstructors.interrupt import keep_finished_work
+from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 
@@ -81,28 +92,86 @@ def simulate(
 
 def reconstruct(
     scan: Scan,
-    method: str = "phyradgs",
+    method: str | Callable[..., Reconstruction | np.ndarray] = "phyradgs",
     *,
     preset: str | None = None,
     grid: Grid | None = None,
     seed: int = 0,
-    report: ProgressReport = ignore_progress,
+    report: ProgressReport | bool = True,
+    resume: Reconstruction | None = None,
+    on_interrupt: str = "raise",
     device: Device = None,
     **options: Any,
 ) -> Reconstruction:
-    """The volume of a scan, by any method of docs/methods.md; ``options`` are the method's own, by name.
+    """The volume (nz, ny, nx) of a scan in 1/mm, by any method of docs/methods.md, and of splats the Gaussians in mm.
 
-    ``grid``: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
+    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md).
+    options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested ones
+    are dicts (``control={"every": 50}``). preset: where they start from.
+    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
     (docs/methods.md#the-grid).
+    seed: of what is drawn at random; the same seed on the same device gives the same bits.
+    report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
+    notebook; False: nothing. One that raises KeyboardInterrupt ends the run as Ctrl-C does.
+    resume: the partial result of an interrupted run of the same scan and options, to go on from.
+    on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" ``Interrupted``, a
+    KeyboardInterrupt whose ``partial`` is the result so far; "return" that result.
 
-    ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model; nested options are dicts
-    (``control={"every": 50}``). The result has the volume (nz, ny, nx) in 1/mm and, of splats, the Gaussians in mm.
-
-    Raises InputError for options that the method does not have, NumericalError where numbers overflow.
+    Raises:
+        InputError: options that the method does not have, or what is no scan, method, grid or partial result.
+        NumericalError: numbers overflow.
+        Interrupted: see ``on_interrupt``.
     """
+    _check_reconstruct(scan, grid, report, on_interrupt)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
     given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)
-    return run_method(scan, method, runtime_of(device), chosen, seed=seed, report=report, before=before)
+    more = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
+    result: Reconstruction | None = None
+    try:
+        with _reporting(report) as tell, keep_finished_work():
+            result = run_method(scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more)
+    except KeyboardInterrupt as error:
+        if result is None or on_interrupt == "raise":
+            raise Interrupted(result) from error
+    if on_interrupt == "raise" and result.facts.get("interrupted_at") is not None:
+        raise Interrupted(result)
+    return result
+
+
+def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object) -> None:
+    if not isinstance(scan, Scan):
+        raise InputError("scan", checks.shown(scan), "a Scan", "read a file with load_scan, or make one with fly_scan")
+    if not (grid is None or isinstance(grid, Grid)):
+        raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
+    if not (isinstance(report, bool) or callable(report)):
+        raise InputError("report", checks.shown(report), "a function, True or False")
+    checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
+
+
+@contextmanager
+def _reporting(report: ProgressReport | bool) -> Iterator[ProgressReport]:
+    """The report that is meant; the line is ended with the body."""
+    if not isinstance(report, bool):
+        yield report
+    elif not (report and has_reader()):
+        yield ignore_progress
+    else:
+        with Ticker("iteration") as ticker:
+            ticker.stage("building kernels")
+            yield ticker.progress
+
+
+def _state_of(partial: object, method: object, options: Any) -> State:
+    """How to go on from a result that was interrupted, of the same method and options."""
+    if not isinstance(partial, Reconstruction) or partial.state is None:
+        found = checks.shown(partial) if not isinstance(partial, Reconstruction) else "a result that is complete, or from a file"
+        raise InputError("resume", found, "the partial result of an interrupted run")
+    if not method_of(method).is_resumable:
+        raise InputError("resume", f"method {method_name(method)}", "a method that can go on", "leave resume out")
+    found_facts = partial.facts.get("method"), partial.facts.get("options")
+    if found_facts != (method_name(method), option_facts(options)):
+        raise InputError("resume", "another method, or other options", "those of the run that was interrupted")
+    return partial.state
