@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 from typing import Protocol as Interface
 
+import numpy as np
+
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
 from phyradgs_cl.acquisition.cells import TimeCells
@@ -18,6 +20,8 @@ from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
+
+_WHOLE = 1e-3  # how far a line's weights may be from 1, where they are somebody else's
 
 
 class Motion(Interface):
@@ -164,3 +168,21 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
         raise InputError("--motion", checks.shown(motion), "a model with cells(scan, frame)")
     if isinstance(motion, MODELS) and type(motion) not in {type(own) for own in taken}:
         raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")
+
+
+def check_own_motion(motion: object, scan: Scan) -> None:
+    """InputError where a model of somebody's own gives no cells for a scan's first frame, or cells that do not fit its
+    lines.
+    """
+    if motion is None or isinstance(motion, MODELS):
+        return
+    culprit, made = f"motion {type(motion).__name__}", motion.cells(scan, 0)  # type: ignore[attr-defined]
+    if not isinstance(made, TimeCells):
+        raise InputError(culprit, f"a {type(made).__name__} from cells(scan, frame)", "TimeCells")
+    if (made.lines, made.axis) != (scan.lines, scan.shutter.axis):
+        found, expected = f"cells for {made.lines} {made.axis}", f"{scan.lines} {scan.shutter.axis}"
+        raise InputError(culprit, found, expected)
+    weights = made.line_weights()
+    worst = float(weights[np.argmax(np.abs(weights - 1))])
+    if abs(worst - 1) > _WHOLE:
+        raise InputError(culprit, f"line weights that sum to {worst:.6g}", "1 for every line", "divide them by their sum")

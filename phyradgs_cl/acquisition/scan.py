@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.field_of_view import default_grid, field_of_view_mm
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, resting_trajectory
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 
@@ -90,8 +90,9 @@ class Scan:
     def __repr__(self) -> str:
         rows, columns = self.geometry.detector_shape
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
-        kind = f"fly-scan, exposure {self.shutter.exposure_s:g} s, readout {self.shutter.readout_s:g} s along {self.shutter.axis}"
-        taken = kind if self.is_fly else "stop-and-shoot"
+        shutter = self.shutter
+        times = f"exposure {shutter.exposure_s:g} s, readout {shutter.readout_s:g} s along {shutter.axis}"
+        taken = f"fly-scan, {times}" if self.is_fly else "stop-and-shoot"
         return f"Scan({self.title!r}, {self.frames} frames of {rows} × {columns}, {taken}, grid {voxels} in {sides} mm)"
 
     @classmethod
@@ -134,9 +135,9 @@ class Scan:
     def from_tigre(cls, geo: Any, angles: ArrayLike, frames: ArrayLike, **others: Any) -> Scan:
         """A stop-and-shoot scan with a TIGRE geometry; TIGRE itself is not needed.
 
-        geo: anything with TIGRE's attributes in mm: DSD, DSO, nDetector, dDetector (v, u), nVoxel, dVoxel (z, y, x), and where
-        there are any offDetector (v, u), offOrigin (z, y, x), COR, each for all frames or one for every frame. angles (F,) in
-        radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
+        geo: anything with TIGRE's attributes in mm: DSD, DSO, nDetector, dDetector (v, u), nVoxel, dVoxel (z, y, x), and
+        where there are any offDetector (v, u), offOrigin (z, y, x), COR, each for all frames or one for every frame.
+        angles (F,) in radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
 
         Raises InputError for parallel beams, a turned panel, and attributes that are missing or do not fit.
         """
@@ -201,12 +202,12 @@ class Scan:
     def check_timing(self) -> None:
         """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
 
-        Raises InputError for that, and for an exposure too short for the scan's times.
+        Raises InputError for that, for poses that are none, and for an exposure too short for the scan's times.
         """
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
-            self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
+            checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
 
 def _line_integrals(frames: ArrayLike) -> np.ndarray:

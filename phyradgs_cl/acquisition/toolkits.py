@@ -1,8 +1,8 @@
 """Geometries of ASTRA and TIGRE to poses, and back. Neither package is needed: both are numbers and names of attributes.
 
 ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, step from row to row, x y z each.
-TIGRE's cone is ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest; its pairs run (v, u), its
-triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
+TIGRE's cone is ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest; its pairs run (v, u),
+its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from phyradgs_cl.fields import Grid, triple
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
     """Poses (F, 12) of ``cone_vec`` rows (F, 12) in mm, for a panel of (rows, columns)."""
     table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
-    pose = table.copy()
+    pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)
     return pose
 
@@ -43,11 +43,13 @@ def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
 def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
     """Poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry and its angles (F,), or (F, 3) Euler angles.
 
-    Raises InputError for what has no place in a scan: parallel beams, a turned panel, a second or third Euler angle, a volume
-    that moves from frame to frame, and attributes that are missing or no numbers.
+    Raises InputError for what has no place in a scan: parallel beams, a turned panel, a second or third Euler angle, a
+    volume that moves from frame to frame, and attributes that are missing or no numbers.
     """
     if getattr(geo, "mode", None) not in (None, "cone"):
-        raise InputError("geo.mode", checks.shown(geo.mode), "'cone'", "parallel beams have no source distance")
+        raise InputError(
+            "geo.mode", checks.shown(geo.mode), "'cone'", "parallel beams have no source distance"
+        )
     angles = np.asarray(angles_rad)
     angles = checks.numbers("angles", angles_rad, (None, 3) if angles.ndim == 2 else (None,))
     if angles.ndim == 2:
@@ -66,7 +68,9 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     poses = np.empty((frames, POSE_LENGTH))
     for i, angle in enumerate(angles):
         offset = float(offset_v[i]), float(offset_u[i])
-        cone = ConeGeometry(float(to_axis[i]), float(to_panel[i]), (rows, columns), (pitch_v, pitch_u), offset)
+        cone = ConeGeometry(
+            float(to_axis[i]), float(to_panel[i]), (rows, columns), (pitch_v, pitch_u), offset
+        )
         poses[i] = cone.pose(angle)
         poses[i, :6] += np.tile(shift[i] * poses[i, 6:9] / pitch_u, 2)
     return poses, (rows, columns), grid
@@ -82,7 +86,9 @@ def _of(geo: Any, name: str) -> Any:
 def _counts(geo: Any, name: str, length: int) -> np.ndarray:
     counts = checks.numbers(f"geo.{name}", _of(geo, name), (length,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
-        raise InputError(f"geo.{name}", checks.shown(counts.tolist()), f"{length} whole numbers of at least 1")
+        raise InputError(
+            f"geo.{name}", checks.shown(counts.tolist()), f"{length} whole numbers of at least 1"
+        )
     return counts
 
 
@@ -95,7 +101,9 @@ def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.nd
     if table.shape in ((), (1,), (length,)):
         return np.broadcast_to(table, (frames, length))
     if table.shape not in (per_frame, (frames, length)):
-        raise InputError(f"geo.{name}", f"shape {table.shape}", f"{length} for all frames, or shape {per_frame}")
+        raise InputError(
+            f"geo.{name}", f"shape {table.shape}", f"{length} for all frames, or shape {per_frame}"
+        )
     return table.reshape(frames, length)
 
 

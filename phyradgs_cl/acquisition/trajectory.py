@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import short_repr
@@ -165,14 +166,18 @@ class PoseTable:
 
 
 def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, culprit: str = "poses") -> PoseTable:
-    """A gantry that stops for every frame, as a table: poses (F, 12), each held for a span about its frame's middle (F,) in s."""
+    """A gantry that stops for every frame, as a table: poses (F, 12), each held for a span about its frame's middle (F,)
+    in s.
+    """
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), culprit)
 
 
 def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
-    """A gantry that stops for every frame: a circular orbit where its poses (F, 12) are those of ``geometry``, else a table."""
+    """A gantry that stops for every frame: a circular orbit where its poses (F, 12) are those of ``geometry``, else a
+    table.
+    """
     angle_rad = np.arctan2(poses[:, 1], poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * geometry.source_to_detector_mm):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
@@ -189,7 +194,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
-        poses = np.concatenate([trajectory.pose(f, t) for f, t in enumerate(times)])
+        poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
         made = PoseTable(time_s, poses[at], "trajectory")
         between = (times[:, :-1] + times[:, 1:]) / 2
@@ -201,6 +206,12 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             found = f"poses that {apart} samples per frame miss by {worst_mm:.3g} mm"
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", "give it as a PoseTable")
         apart = 2 * apart - 1
+
+
+def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
+    """Poses (T, 12) of a trajectory at times (T,) s; InputError for one of somebody's own that gives no such numbers."""
+    culprit = f"trajectory {type(trajectory).__name__}"
+    return checks.numbers(culprit, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
 
 def _body_frames(table: np.ndarray) -> np.ndarray:

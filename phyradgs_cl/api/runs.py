@@ -105,17 +105,15 @@ def reconstruct(
 ) -> Reconstruction:
     """The volume (nz, ny, nx) of a scan in 1/mm, by any method of docs/methods.md, and of splats the Gaussians in mm.
 
-    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md).
-    options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested ones
-    are dicts (``control={"every": 50}``). preset: where they start from.
-    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
-    (docs/methods.md#the-grid).
-    seed: of what is drawn at random; the same seed on the same device gives the same bits.
-    report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
-    notebook; False: nothing. One that raises KeyboardInterrupt ends the run as Ctrl-C does.
-    resume: the partial result of an interrupted run of the same scan and options, to go on from.
-    on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" ``Interrupted``, a
-    KeyboardInterrupt whose ``partial`` is the result so far; "return" that result.
+    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md). options:
+    the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested ones are
+    dicts (``control={"every": 50}``). preset: where they start from. grid: its voxels, in place of the scan's; or
+    ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different (docs/methods.md#the-grid). seed: of what is drawn
+    at random; the same seed on the same device gives the same bits. report: a function that is called with every
+    ``Progress``; True: a line with rate and time left, on a terminal or in a notebook; False: nothing. One that raises
+    KeyboardInterrupt ends the run as Ctrl-C does. resume: the partial result of an interrupted run of the same scan and
+    options, to go on from. on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is
+    done: "raise" ``Interrupted``, a KeyboardInterrupt whose ``partial`` is the result so far; "return" that result.
 
     Raises:
         InputError: options that the method does not have, or what is no scan, method, grid or partial result.
@@ -132,7 +130,9 @@ def reconstruct(
     result: Reconstruction | None = None
     try:
         with _reporting(report) as tell, keep_finished_work():
-            result = run_method(scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more)
+            result = run_method(
+                scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more
+            )
     except KeyboardInterrupt as error:
         if result is None or on_interrupt == "raise":
             raise Interrupted(result) from error
@@ -143,7 +143,9 @@ def reconstruct(
 
 def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object) -> None:
     if not isinstance(scan, Scan):
-        raise InputError("scan", checks.shown(scan), "a Scan", "read a file with load_scan, or make one with fly_scan")
+        raise InputError(
+            "scan", checks.shown(scan), "a Scan", "read a file with load_scan, or make one with fly_scan"
+        )
     if not (grid is None or isinstance(grid, Grid)):
         raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
     if not (isinstance(report, bool) or callable(report)):
@@ -167,11 +169,19 @@ def _reporting(report: ProgressReport | bool) -> Iterator[ProgressReport]:
 def _state_of(partial: object, method: object, options: Any) -> State:
     """How to go on from a result that was interrupted, of the same method and options."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
-        found = checks.shown(partial) if not isinstance(partial, Reconstruction) else "a result that is complete, or from a file"
+        found = (
+            checks.shown(partial)
+            if not isinstance(partial, Reconstruction)
+            else "a result that is complete, or from a file"
+        )
         raise InputError("resume", found, "the partial result of an interrupted run")
     if not method_of(method).is_resumable:
-        raise InputError("resume", f"method {method_name(method)}", "a method that can go on", "leave resume out")
+        raise InputError(
+            "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
+        )
     found_facts = partial.facts.get("method"), partial.facts.get("options")
     if found_facts != (method_name(method), option_facts(options)):
-        raise InputError("resume", "another method, or other options", "those of the run that was interrupted")
+        raise InputError(
+            "resume", "another method, or other options", "those of the run that was interrupted"
+        )
     return partial.state

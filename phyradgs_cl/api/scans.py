@@ -41,17 +41,16 @@ def fly_scan(
 ) -> Scan:
     """A scan whose gantry never stops, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given.
-    geometry: distances and pixels in mm. angles_deg: (F,) the gantry's, as each frame's first line opens, counterclockwise
-    seen from above. exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise.
-    readout_ratio: readout over exposure time, from the first line's opening to the last's; 0 is a global shutter.
-    readout: what is read out at one time, "rows" or "columns"; readout_direction: 1 index 0 first, −1 last.
-    exposure_s: of one line, s; only files and times in plots show it.
-    flats, darks: (n, rows, columns) counts without an object, and without a beam (0 when None). mask: (rows, columns) or
-    (F, rows, columns), non-zero where a pixel must not be used. quantity: what ``frames`` hold, "attenuation", "transmission"
-    or "counts", where that does not follow from ``flats``.
-    grid: the cube that a full turn sees, in voxels of one pixel at the axis, when None.
-    others: ``detector_model`` ("log" or "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``: fields of ``Scan``.
+    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given. geometry:
+    distances and pixels in mm. angles_deg: (F,) the gantry's, as each frame's first line opens, counterclockwise seen
+    from above. exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise. readout_ratio:
+    readout over exposure time, from the first line's opening to the last's; 0 is a global shutter. readout: what is read
+    out at one time, "rows" or "columns"; readout_direction: 1 index 0 first, −1 last. exposure_s: of one line, s; only
+    files and times in plots show it. flats, darks: (n, rows, columns) counts without an object, and without a beam (0
+    when None). mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used. quantity: what
+    ``frames`` hold, "attenuation", "transmission" or "counts", where that does not follow from ``flats``. grid: the cube
+    that a full turn sees, in voxels of one pixel at the axis, when None. others: ``detector_model`` ("log" or
+    "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``: fields of ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range, and angles that turn against the exposure.
     """
@@ -60,7 +59,9 @@ def fly_scan(
     checks.within("exposure_deg", exposure_deg, -3600, 3600)
     checks.positive("exposure_s", exposure_s)
     if exposure_deg == 0:
-        raise InputError("exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops")
+        raise InputError(
+            "exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops"
+        )
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     turned_deg = np.unwrap(start_deg, period=360.0)
@@ -71,7 +72,11 @@ def fly_scan(
         raise InputError("exposure_deg", found, "the sign of the angles' steps", remedy)
     shutter = Shutter(exposure_s, readout_ratio * exposure_s, readout, readout_direction)
     in_turn = np.all(steps > 0)
-    exposures = (turned_deg - turned_deg[:1]) / exposure_deg if in_turn else np.arange(len(start_deg)) * (1 + readout_ratio)
+    exposures = (
+        (turned_deg - turned_deg[:1]) / exposure_deg
+        if in_turn
+        else np.arange(len(start_deg)) * (1 + readout_ratio)
+    )
     start_s, first = exposures * exposure_s, np.deg2rad(start_deg)
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first, first + np.deg2rad(exposure_deg)))
     return _scan(pixels, orbit, shutter, start_s, grid, True, others)
@@ -91,8 +96,8 @@ def static_scan(
 ) -> Scan:
     """A scan whose gantry stops for every frame, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest; angles_deg: (F,) the gantry's, counterclockwise seen from above; geometry in
-    mm; the others as of ``fly_scan``.
+    frames: (F, rows, columns), row 0 the lowest; angles_deg: (F,) the gantry's, counterclockwise seen from above;
+    geometry in mm; the others as of ``fly_scan``.
 
     Raises InputError for shapes that do not fit and numbers out of range.
     """
@@ -116,14 +121,18 @@ def _pixels(
         raise InputError("geometry", checks.shown(geometry), "a ConeGeometry")
     panel = geometry.detector_shape
     values = _stack("frames", frames, panel)
-    flat, dark = (None if s is None else _stack(name, s, panel) for name, s in (("flats", flats), ("darks", darks)))
+    flat, dark = (
+        None if s is None else _stack(name, s, panel) for name, s in (("flats", flats), ("darks", darks))
+    )
     if quantity is not None:
         checks.one_of("quantity", quantity, QUANTITIES)
     held = quantity or ("attenuation" if flat is None else "counts")
     if held == "counts" and flat is None:
         raise InputError("flats", "None beside counts", "(n, rows, columns) counts without an object")
     if held != "counts" and not (flat is None and dark is None):
-        raise InputError("flats, darks", f"some beside {held}", "both, or flats alone, beside counts", "leave them out")
+        raise InputError(
+            "flats, darks", f"some beside {held}", "both, or flats alone, beside counts", "leave them out"
+        )
     if quantity is None and flat is None and values.dtype.kind != "f":
         remedy = 'give flats=, or quantity="attenuation"'
         raise InputError("frames", f"whole numbers ({values.dtype}) without flats", "line integrals", remedy)
@@ -142,7 +151,9 @@ def _scan(
 ) -> Scan:  # fmt: skip
     for name in others:
         if name not in _OTHERS:
-            raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
+            raise InputError(
+                name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out")
+            )
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly
     return Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
 

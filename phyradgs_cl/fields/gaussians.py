@@ -21,9 +21,8 @@ _DENSITY_FLOOR = 1e-12
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z;
-    quaternion (G, 4) w x y z, unit; density (G,) attenuation per that length. Raises InputError for other shapes, and for what
-    is no finite number.
+    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; quaternion (G, 4) w x y z,
+    unit; density (G,) attenuation per that length. Raises InputError for other shapes, and for what is no finite number.
     """
 
     mean: np.ndarray

@@ -1,7 +1,8 @@
 """A method: a function ``(scan, options, rt, *, seed, report, resume)``, of the package's or of somebody's own.
 
-One's own needs no more than ``(scan, options, rt)``, of which ``options`` may be annotated with a dataclass: its fields are then
-what ``--set`` and ``reconstruct`` take. It gives a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the scan's grid.
+One's own needs no more than ``(scan, options, rt)``, of which ``options`` may be annotated with a dataclass: its fields
+are then what ``--set`` and ``reconstruct`` take. It gives a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the
+scan's grid.
 """
 
 from __future__ import annotations
@@ -66,11 +67,17 @@ def own_method(name: str, function: Any) -> Method:
     def run(scan: Scan, options: Any, rt: Runtime, **given: Any) -> Reconstruction:
         started = time.perf_counter()
         made = function(scan, options, rt, **{key: value for key, value in given.items() if key in takes})
-        facts = {"method": name, "options": plain(option_facts(options)), "seconds": time.perf_counter() - started}
+        facts = {
+            "method": name,
+            "options": plain(option_facts(options)),
+            "seconds": time.perf_counter() - started,
+        }
         result = _result(culprit, made, scan)
         return replace(result, facts={**facts, **result.facts})
 
-    return Method(run, {"default": _default_options(culprit, function, by_place[1])}, is_resumable="resume" in takes)
+    return Method(
+        run, {"default": _default_options(culprit, function, by_place[1])}, is_resumable="resume" in takes
+    )
 
 
 def imported(text: str) -> Any:
@@ -88,14 +95,20 @@ def imported(text: str) -> Any:
         remedy = "start in its folder, or add that to PYTHONPATH"
         raise InputError("--method", f"{text}: {error}", "package.module:function", remedy) from error
     except Exception as error:  # whatever a module does as it is imported
-        raise InputError("--method", f"{text}: {type(error).__name__}: {error}", "a module that can be imported") from error
+        raise InputError(
+            "--method", f"{text}: {type(error).__name__}: {error}", "a module that can be imported"
+        ) from error
     return found
 
 
 def plain(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Facts as files keep them: what JSON has no word for as Python prints it."""
     return {
-        key: plain(value) if isinstance(value, Mapping) else value if isinstance(value, int | float | str | None) else repr(value)
+        key: plain(value)
+        if isinstance(value, Mapping)
+        else value
+        if isinstance(value, int | float | str | None)
+        else repr(value)
         for key, value in facts.items()
     }
 
@@ -118,8 +131,14 @@ def _result(culprit: str, made: object, scan: Scan) -> Reconstruction:
     """What a function of somebody's own has given, checked."""
     if not isinstance(made, Reconstruction):
         if not isinstance(made, np.ndarray) or made.shape != scan.grid.shape:
-            found = f"an array of shape {made.shape}" if isinstance(made, np.ndarray) else f"a {type(made).__name__}"
-            raise InputError(culprit, f"{found} as its result", f"a Reconstruction, or a volume of shape {scan.grid.shape}")
+            found = (
+                f"an array of shape {made.shape}"
+                if isinstance(made, np.ndarray)
+                else f"a {type(made).__name__}"
+            )
+            raise InputError(
+                culprit, f"{found} as its result", f"a Reconstruction, or a volume of shape {scan.grid.shape}"
+            )
         made = Reconstruction(made.astype(np.float32), scan.grid)
     if not np.isfinite(made.volume).all():
         raise NumericalError(culprit, "a volume with NaN or infinity", "finite numbers")

@@ -9,7 +9,7 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, Motion, Scan
-from phyradgs_cl.acquisition.motion import MODELS, STILL
+from phyradgs_cl.acquisition.motion import MODELS, STILL, check_own_motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, fdk
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
@@ -120,6 +120,7 @@ def reconstruct(
     if rt.ranks.size > 1:
         _check_ranks(method_name(method), rt)
     ready = prepared(scan, InputOptions() if before is None else before)
+    check_own_motion(getattr(chosen, "motion", None), ready)
     return method_of(method).run(ready, chosen, rt, seed=seed, report=report, **extra)
 
 

@@ -17,6 +17,9 @@ from phyradgs_cl.fields import Gaussians, Grid
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from phyradgs_cl.acquisition import Scan
+    from phyradgs_cl.runtime import Runtime
+
 State = Mapping[str, np.ndarray]
 """What an interrupted run needs to go on, as named arrays: each method knows its own names."""
 
@@ -49,14 +52,17 @@ class Reconstruction:
         way = f", interrupted at iteration {at}" if at is not None else ""
         return f"Reconstruction({self.facts.get('method', 'a volume')}{of}, {voxels} voxels in {sides} mm{way})"
 
-    def plot(self, reference: np.ndarray | None = None) -> Figure:
-        """A figure of the three middle slices in 1/mm, with a scale bar in mm, and of the convergence where there is a record.
+    def plot(self, scan: Scan | None = None, *, frame: int = 0, device: str | Runtime | None = None) -> Figure:
+        """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.
 
-        reference (nz, ny, nx): the truth in 1/mm, for slices of it and of the difference. Raises InputError for another shape.
+        scan: the result's; then also a frame, its residual and, where the scan has a reference (nz, ny, nx) in 1/mm, the
+        truth and the difference. device: what projects the volume for the residual.
+
+        Raises InputError for what is no scan, or a frame that it does not have.
         """
         from phyradgs_cl.reconstructors.plot import plot_result
 
-        return plot_result(self, reference)
+        return plot_result(self, scan, frame, device)
 
 
 class Interrupted(KeyboardInterrupt):

@@ -55,7 +55,10 @@ def drawn_pixels(scan: Scan, rt) -> np.ndarray:
     [
         {},
         {"COR": 3.0},
-        {"DSO": np.array([400.0, 410.0, 395.0, 402.0]), "offDetector": np.array([[5.0, -4.0], [2, 1], [0, 3], [-1, 6]])},
+        {
+            "DSO": np.array([400.0, 410.0, 395.0, 402.0]),
+            "offDetector": np.array([[5.0, -4.0], [2, 1], [0, 3], [-1, 6]]),
+        },
     ],
     ids=["circular", "centre of rotation", "of every frame its own"],
 )
@@ -65,7 +68,11 @@ def test_points_fall_where_tigre_puts_them(rt, changes) -> None:
     expected = np.stack([tigre_pixels(geo, i) for i in range(4)])
     assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
     assert isinstance(scan.trajectory, CircularOrbit if len(changes) == 0 else (PoseTable, CircularOrbit))
-    assert scan.grid.shape == (8, 10, 12) and scan.grid.voxel_size_mm == (5.0, 4.5, 4.0) and scan.grid.offset_mm == (1, -2, 3)
+    assert (
+        scan.grid.shape == (8, 10, 12)
+        and scan.grid.voxel_size_mm == (5.0, 4.5, 4.0)
+        and scan.grid.offset_mm == (1, -2, 3)
+    )
 
 
 def astra_vectors() -> np.ndarray:
@@ -111,8 +118,14 @@ def test_rows_may_run_down(rt, scan) -> None:
     [
         (lambda: Scan.from_tigre(tigre(mode="parallel"), ANGLES, FRAMES), "geo.mode: found 'parallel'"),
         (lambda: Scan.from_tigre(tigre(DSD=None), ANGLES, FRAMES), "geo.DSD: found nothing"),
-        (lambda: Scan.from_tigre(tigre(rotDetector=np.array([0.1, 0, 0])), ANGLES, FRAMES), "geo.rotDetector: found 0.1"),
-        (lambda: Scan.from_tigre(tigre(), np.ones((4, 3)), FRAMES), "angles: found 1.0; expected turns about z"),
+        (
+            lambda: Scan.from_tigre(tigre(rotDetector=np.array([0.1, 0, 0])), ANGLES, FRAMES),
+            "geo.rotDetector: found 0.1",
+        ),
+        (
+            lambda: Scan.from_tigre(tigre(), np.ones((4, 3)), FRAMES),
+            "angles: found 1.0; expected turns about z",
+        ),
         (lambda: Scan.from_tigre(tigre(DSO=np.ones(3)), ANGLES, FRAMES), r"geo.DSO: found shape \(3,\)"),
         (lambda: Scan.from_tigre(tigre(nVoxel=[8, 8.5, 8]), ANGLES, FRAMES), "geo.nVoxel.*whole numbers"),
         (lambda: Scan.from_tigre(tigre(), ANGLES, FRAMES[:3]), r"frames: found shape \(3, 23, 29\)"),

@@ -53,7 +53,8 @@ def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing,
     """
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
-        return resting_poses(pose_at(np.arange(len(at_s), dtype=np.float64)), at_s, timing.shutter.span_s, f"{culprit} poses")
+        poses = pose_at(np.arange(len(at_s), dtype=np.float64))
+        return resting_poses(poses, at_s, timing.shutter.span_s, f"{culprit} poses")
     at_s = timing.angle_time_s
     span_s = timing.shutter.span_s
     before, after = at_s[0] - timing.start_s[0] + _SLACK * span_s, timing.start_s[-1] + span_s - at_s[-1]
