@@ -68,16 +68,22 @@ def shape(culprit: str, array: ArrayLike, expected: Sequence[int | None]) -> Non
 
 def numbers(culprit: str, value: ArrayLike, expected: Sequence[int | None] | None = None) -> NDArray[np.float64]:
     """``value`` as float64; InputError unless it is real, finite and, where ``expected`` is given, of that shape."""
-    try:
-        array = np.asarray(value)
-    except ValueError as error:  # lists of unequal length
-        raise InputError(culprit, "lists of unequal length", "an array of numbers") from error
-    if array.dtype.kind not in "iuf":
-        raise InputError(culprit, shown(value), "numbers")
+    array = real_array(culprit, value)
     if expected is not None:
         shape(culprit, array, expected)
     finite(culprit, array)
     return array.astype(np.float64)
+
+
+def real_array(culprit: str, value: ArrayLike) -> np.ndarray:
+    """``value`` as an array of its own real type; InputError for what holds anything else than real numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # NumPy's words for it are long
+        raise InputError(culprit, "lists of unequal length", "an array of numbers") from error
+    if array.dtype.kind not in "iuf":
+        raise InputError(culprit, shown(value), "numbers")
+    return array
 
 
 def whole(culprit: str, value: float, lowest: int, highest: int) -> None:

@@ -18,10 +18,11 @@ POSE_LENGTH = 12
 
 @dataclass(frozen=True)
 class ConeGeometry:
-    """A circular cone-beam orbit about +z with a flat panel.
+    """A circular cone-beam orbit about +z with a flat panel, in mm.
 
-    ``detector_shape`` counts (rows, columns), ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm``
-    (along v, along u) shifts the panel's centre away from the central ray.
+    ``source_to_axis_mm`` and ``source_to_detector_mm`` are along the central ray, ``detector_shape`` counts (rows, columns),
+    ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm`` (along v, along u) shifts the panel's centre away from that ray.
+    Raises InputError for lengths and counts that are not above 0.
     """
 
     source_to_axis_mm: float

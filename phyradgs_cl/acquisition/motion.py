@@ -44,6 +44,7 @@ class Static:
     name: str = field(default="static", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: one, at mid-window."""
         return cells.static_cells(*_place(scan, frame))
 
 
@@ -54,22 +55,24 @@ class StaticStart:
     name: str = field(default="static-start", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: one, at the frame's opening."""
         return cells.static_start_cells(*_place(scan, frame))
 
 
 @dataclass(frozen=True)
 class MicroViews:
-    """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper."""
+    """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper. Raises InputError for counts below 1."""
 
     name: str = field(default="micro-views", init=False, repr=False)
     strips: int = 8
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
-        checks.within("strips", self.strips, 1, 10_000)
-        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("strips", self.strips, 1, 10_000)
+        checks.whole("sub-intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: strips × sub-intervals of them."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.micro_view_cells(*_place(scan, frame), self.strips, self.sub_intervals)
@@ -77,15 +80,16 @@ class MicroViews:
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line at its own ``sub_intervals`` exact times; what the simulator uses."""
+    """Every line at its own ``sub_intervals`` exact times, as the simulator has it. Raises InputError for a count below 1."""
 
     name: str = field(default="per-row", init=False, repr=False)
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
-        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("sub-intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: sub-intervals for every line."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.per_line_cells(*_place(scan, frame), self.sub_intervals)
@@ -98,6 +102,7 @@ class LineMiddles:
     name: str = field(default="per-row", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: one for every line."""
         return PerRow(1).cells(scan, frame)
 
 
@@ -105,8 +110,8 @@ class LineMiddles:
 class Exact:
     """``segments`` of a frame, in which splats move while every line integrates over its own window.
 
-    0 segments chooses the number so that the error stays below ``time_error`` (relative), which also bounds the rules that
-    average over time.
+    0 segments chooses the number so that the error stays below ``time_error`` (dimensionless: a share of a frame's RMS),
+    which also bounds the rules that average over time. Raises InputError for numbers out of range.
     """
 
     name: str = field(default="exact", init=False, repr=False)
@@ -114,11 +119,11 @@ class Exact:
     time_error: float = 0.005
 
     def __post_init__(self) -> None:
-        checks.within("--segments (0 chooses from the time error)", self.segments, 0, 1000)
+        checks.whole("--segments (0 chooses from the time error)", self.segments, 0, 1000)
         checks.within("--time-error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """intensity_peak: as for ``segments_for``."""
+        """The ``TimeCells`` of one frame of a scan: its segments. intensity_peak: a line integral, as for ``segments_for``."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -164,6 +169,8 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
     """InputError unless a model is of a class in ``taken``, or somebody's own."""
+    if isinstance(motion, type) and hasattr(motion, "cells"):
+        raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):
         raise InputError("--motion", checks.shown(motion), "a model with cells(scan, frame)")
     if isinstance(motion, MODELS) and type(motion) not in {type(own) for own in taken}:

@@ -36,13 +36,14 @@ class Saturation:
 class Scan:
     """One cone-beam scan in line integrals.
 
-    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read
-    line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
-    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
-    projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
-    ``saturation`` is None where nobody looked at raw counts.
-    ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
-    ``trajectory``: anything with ``pose(frame, time_s)``, a class of your own too. Row 0 is the lowest.
+    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read line;
+    pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``. lag: share λ of
+    the recorded intensity that comes from the frames before (detector/lag.py), still in the projections. Lines that a
+    pulsed beam misses are added to the mask, so that no method has to look for them. ``saturation`` is None where nobody
+    looked at raw counts. ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says. ``geometry`` and
+    ``grid`` are in mm, ``shutter`` in s; ``trajectory``: anything with ``pose(frame, time_s)``, a class of your own too.
+    Row 0 is the lowest. detector_model: what an exposure averages, "log" (line integrals) or "intensity". title and
+    provenance go into files.
 
     Raises InputError for shapes that do not fit each other, and for line integrals that are no finite numbers.
     """
@@ -173,6 +174,7 @@ class Scan:
 
     @property
     def frames(self) -> int:
+        """How many frames F there are."""
         return len(self.projections)
 
     @property
@@ -212,9 +214,7 @@ class Scan:
 
 def _line_integrals(frames: ArrayLike) -> np.ndarray:
     """Frames as float32; InputError for what is no finite number."""
-    values = np.asarray(frames)
-    if values.dtype.kind not in "iuf":
-        raise InputError("projections", f"an array of {values.dtype}", "line integrals as numbers")
+    values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)
     if not all(np.isfinite(frame).all() for frame in values):  # by frame, which needs little memory

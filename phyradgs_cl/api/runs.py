@@ -39,18 +39,29 @@ from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 
 def load_scan(path: str | Path) -> Scan:
-    """A scan file as line integrals; InputError names what is wrong by its HDF5 path."""
-    return read_scan(path, counts_to_attenuation)
+    """A scan file (docs/formats.md) as a ``Scan``: line integrals (F, rows, columns), lengths in mm, times in s.
+
+    path: the HDF5 file. Raises InputError, which names what is wrong by its HDF5 path.
+    """
+    return read_scan(_checked_path(path), counts_to_attenuation)
 
 
 def save_scan(path: str | Path, scan: Scan) -> None:
-    """Writes a scan file, whole or not at all."""
-    write_scan(path, scan)
+    """Writes a scan file, whole or not at all: line integrals (F, rows, columns), lengths in mm, times in s.
+
+    path: the HDF5 file; one that exists is replaced. scan: a trajectory of your own is sampled into a table of poses.
+    Raises InputError for what is no scan, or one that the format cannot express, OutputError where nothing can be written.
+    """
+    _check_scan(scan)
+    write_scan(_checked_path(path), scan)
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record and facts."""
-    stored = read_volume(path)
+    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record and facts.
+
+    path: the HDF5 file. Raises InputError, which names what is wrong by its HDF5 path.
+    """
+    stored = read_volume(_checked_path(path))
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
     return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts)
@@ -59,9 +70,16 @@ def load_volume(path: str | Path) -> Reconstruction:
 def save_volume(
     path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None
 ) -> None:
-    """Writes a volume file, whole or not at all; ``metrics`` as from ``compare`` are kept with it."""
+    """Writes a volume file, whole or not at all: volume (nz, ny, nx) in 1/mm, lengths in mm.
+
+    path: the HDF5 file; one that exists is replaced. result: what to write. metrics: as from ``compare``, kept with it.
+    Raises InputError for what is no result, OutputError where nothing can be written.
+    """
+    if not isinstance(result, Reconstruction):
+        remedy = "for an array, Reconstruction(volume, grid)"
+        raise InputError("result", checks.shown(result), "a Reconstruction", remedy)
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    write_volume(path, result.volume, result.grid, facts, result.gaussians, metrics)
+    write_volume(_checked_path(path), result.volume, result.grid, facts, result.gaussians, metrics)
 
 
 def simulate(
@@ -76,10 +94,11 @@ def simulate(
 ) -> Scan:
     """A fly-scan (or, with ``protocol="static"``, a stop-and-shoot scan) of a phantom, with its truth as reference.
 
-    phantom: a name, or the path of a volume file (docs/formats.md). size: voxels along the longest side of grid and
-    reference.
-    detector: columns, rows in proportion. options: those of ``phyradgs simulate`` with underscores (views,
-    exposure_deg, readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
+    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm. scanner: a name or a TOML
+    file. protocol: "rapid", "standard" or "static". size: voxels along the longest side of grid and reference. detector:
+    columns, rows in proportion. device: what ``--device`` takes, or a Runtime. options: those of ``phyradgs simulate``
+    with underscores (views, exposure_deg, readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model,
+    peak, lag, jitter_deg, seed …).
 
     Raises InputError for what there is not, or what is out of range.
     """
@@ -120,7 +139,7 @@ def reconstruct(
         NumericalError: numbers overflow.
         Interrupted: see ``on_interrupt``.
     """
-    _check_reconstruct(scan, grid, report, on_interrupt)
+    _check_reconstruct(scan, grid, report, on_interrupt, seed)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
     given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options}
@@ -141,16 +160,26 @@ def reconstruct(
     return result
 
 
-def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object) -> None:
+def _checked_path(path: object) -> Path:
+    if not isinstance(path, str | Path) or not str(path):
+        raise InputError("path", checks.shown(path), "the name of a file")
+    return Path(path)
+
+
+def _check_scan(scan: object) -> None:
     if not isinstance(scan, Scan):
-        raise InputError(
-            "scan", checks.shown(scan), "a Scan", "read a file with load_scan, or make one with fly_scan"
-        )
+        remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
+        raise InputError("scan", checks.shown(scan), "a Scan", remedy)
+
+
+def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object, seed: int) -> None:
+    _check_scan(scan)
     if not (grid is None or isinstance(grid, Grid)):
         raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
     if not (isinstance(report, bool) or callable(report)):
         raise InputError("report", checks.shown(report), "a function, True or False")
     checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
+    checks.whole("seed", seed, 0, 2**63)
 
 
 @contextmanager

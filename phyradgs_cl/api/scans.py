@@ -96,8 +96,8 @@ def static_scan(
 ) -> Scan:
     """A scan whose gantry stops for every frame, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest; angles_deg: (F,) the gantry's, counterclockwise seen from above;
-    geometry in mm; the others as of ``fly_scan``.
+    frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's,
+    counterclockwise seen from above. flats, darks, mask, quantity, grid, others: as of ``fly_scan``.
 
     Raises InputError for shapes that do not fit and numbers out of range.
     """
@@ -160,9 +160,7 @@ def _scan(
 
 def _stack(name: str, frames: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
     """Frames (n, rows, columns) of real numbers."""
-    stack = np.asarray(frames)
-    if stack.dtype.kind not in "iuf":
-        raise InputError(name, f"an array of {stack.dtype}", "(n, rows, columns) numbers")
+    stack = checks.real_array(name, frames)
     checks.shape(name, stack, (None, *panel))
     if len(stack) == 0:
         raise InputError(name, "no frame", "at least one")

@@ -42,6 +42,7 @@ class Gaussians:
 
     @property
     def count(self) -> int:
+        """How many Gaussians G there are."""
         return len(self.mean)
 
     def rows(self) -> np.ndarray:

@@ -26,7 +26,9 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 
 @dataclass(frozen=True)
 class Grid:
-    """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays: counts, then lengths in mm.
+    """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays.
+
+    shape: counts. voxel_size_mm: sides of a voxel in mm.
 
     Raises InputError for counts below 1 and lengths that are not finite, or not above 0.
     """

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.drawing import CURVE, draw_image, new_figure
@@ -43,7 +41,8 @@ def plot_result(
     if not side:
         draw_slices(figure, result.volume, truth, result.grid)
         return figure
-    slices, beside = np.ravel(figure.subfigures(1, 2, width_ratios=(columns * _SLICE_INCH, side)))
+    parts = figure.add_gridspec(1, 2, width_ratios=(columns * _SLICE_INCH, side))
+    slices, beside = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
     draw_slices(slices, result.volume, truth, result.grid)
     curves, measured, residual = beside.subplots(3, 1)
     _convergence(curves, result.record)

@@ -82,10 +82,13 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of a running method: ``loss`` is what ``quantity`` names; 0 Gaussians where there are none.
+    """One report of a running method: ``iteration`` of ``iterations`` done, after so many ``seconds`` in s.
+
+    ``loss`` is what ``quantity`` names, dimensionless; ``gaussians``: how many, 0 where there are none.
 
     ``state`` makes what a run needs to go on from here, ``volume`` the present volume (nz, ny, nx) in 1/mm with its grid;
-    both are for the time of the report only.
+    both are for the time of the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does, with
+    ``Interrupted``.
     """
 
     iteration: int
