@@ -52,7 +52,7 @@ def fly_scan(
     mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used.
     quantity: what ``frames`` hold, "attenuation", "transmission" or "counts", where ``flats`` do not say it.
     grid: the cube that a full turn sees, in voxels of one pixel at the axis, when None.
-    others: fields of ``Scan``: ``detector_model`` ("log" or "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``.
+    others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range, and angles that turn against the exposure.
     """
