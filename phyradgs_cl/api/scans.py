@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.scan import check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
