@@ -13,6 +13,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -68,6 +69,9 @@ def asd_pocs(
         return AsdPocs(system, options, seed, TvDescent(rt, scan.grid.shape), epsilon)
 
     return run_iterations("asd-pocs", make, scan, options, rt, report, resume)
+
+
+METHOD = Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True)
 
 
 class AsdPocs:

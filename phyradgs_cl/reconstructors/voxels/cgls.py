@@ -10,6 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -58,6 +59,11 @@ def cgls(
         return Cgls(system, options.noise_stop * noise)
 
     return run_iterations("cgls", make, scan, options, rt, report, resume)
+
+
+METHOD = Method(
+    cgls, {"default": CglsOptions()}, is_shared=True, stops_itself=lambda options: options.noise_stop > 0
+)
 
 
 class Cgls:

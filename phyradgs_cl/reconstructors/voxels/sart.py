@@ -11,6 +11,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -76,6 +77,10 @@ def os_sart(
 ) -> Reconstruction:
     """The same with several frames per correction."""
     return run_iterations("os-sart", lambda s: Sart(s, options, seed), scan, options, rt, report, resume)
+
+
+METHOD = Method(sart, {"default": SartOptions()}, is_shared=True)
+OS_METHOD = Method(os_sart, {"default": OS_SART}, is_shared=True)
 
 
 class Sart:

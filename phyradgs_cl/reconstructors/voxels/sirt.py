@@ -8,6 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -44,6 +45,9 @@ def sirt(
 ) -> Reconstruction:
     """The SIRT volume of a scan in 1/mm. ``seed`` is accepted for the common signature; SIRT draws nothing."""
     return run_iterations("sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume)
+
+
+METHOD = Method(sirt, {"default": SirtOptions()}, is_shared=True)
 
 
 class Sirt:
