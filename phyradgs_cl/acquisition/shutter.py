@@ -88,6 +88,7 @@ class Shutter:
         return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
+        """How many lines a panel of (rows, columns) has along the readout axis."""
         return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:
