@@ -1,7 +1,5 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
