@@ -158,7 +158,7 @@ def reconstruct(
             )
     except KeyboardInterrupt as error:
         if result is None or on_interrupt == "raise":
-            raise interrupted(result) from error
+            raise interrupted(result) from (error if result is None else None)
     if on_interrupt == "raise" and result.facts.get("interrupted_at") is not None:
         raise interrupted(result)
     return result

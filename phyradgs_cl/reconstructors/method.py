@@ -68,17 +68,13 @@ def own_method(name: str, function: Any) -> Method:
     def run(scan: Scan, options: Any, rt: Runtime, **given: Any) -> Reconstruction:
         started = time.perf_counter()
         made = function(scan, options, rt, **{key: value for key, value in given.items() if key in takes})
-        facts = {
-            "method": name,
-            "options": plain(option_facts(options)),
-            "seconds": time.perf_counter() - started,
-        }
+        seconds = time.perf_counter() - started
+        facts = {"method": name, "options": _plain(option_facts(options)), "seconds": seconds}
         result = _result(culprit, made, scan)
         return replace(result, facts={**facts, **result.facts})
 
-    return Method(
-        run, {"default": _default_options(culprit, function, by_place[1])}, is_resumable="resume" in takes
-    )
+    presets = {"default": _default_options(culprit, function, by_place[1])}
+    return Method(run, presets, is_resumable="resume" in takes)
 
 
 def imported(text: str) -> Any:
@@ -92,25 +88,19 @@ def imported(text: str) -> Any:
         remedy = "start in its folder, or add that to PYTHONPATH"
         raise InputError("--method", f"{text}: {error}", "package.module:function", remedy) from error
     except Exception as error:  # whatever a module does as it is imported
-        raise InputError(
-            "--method", f"{text}: {type(error).__name__}: {error}", "a module that can be imported"
-        ) from error
+        found_there = f"{text}: {type(error).__name__}: {error}"
+        raise InputError("--method", found_there, "a module that can be imported") from error
     try:
         return operator.attrgetter(name)(found)
     except AttributeError:
         raise InputError("--method", text, f"a function {name} in {module}") from None
 
 
-def plain(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Facts as files keep them: what JSON has no word for as Python prints it."""
-    return {
-        key: plain(value)
-        if isinstance(value, Mapping)
-        else value
-        if isinstance(value, int | float | str | None)
-        else repr(value)
-        for key, value in facts.items()
-    }
+def _plain(value: Any) -> Any:
+    """A fact as files keep it: what JSON has no word for as Python prints it."""
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    return value if isinstance(value, int | float | str | None) else repr(value)
 
 
 def _default_options(culprit: str, function: Any, parameter: inspect.Parameter) -> Any:
@@ -131,14 +121,9 @@ def _result(culprit: str, made: object, scan: Scan) -> Reconstruction:
     """What a function of somebody's own has given, checked."""
     if not isinstance(made, Reconstruction):
         if not isinstance(made, np.ndarray) or made.shape != scan.grid.shape:
-            found = (
-                f"an array of shape {made.shape}"
-                if isinstance(made, np.ndarray)
-                else f"a {type(made).__name__}"
-            )
-            raise InputError(
-                culprit, f"{found} as its result", f"a Reconstruction, or a volume of shape {scan.grid.shape}"
-            )
+            found = f"an array of shape {made.shape}" if isinstance(made, np.ndarray) else f"a {type(made).__name__}"
+            expected = f"a Reconstruction, or a volume of shape {scan.grid.shape}"
+            raise InputError(culprit, f"{found} as its result", expected)
         made = Reconstruction(made.astype(np.float32), scan.grid)
     if not np.isfinite(made.volume).all():
         raise NumericalError(culprit, "a volume with NaN or infinity", "finite numbers")
