@@ -32,7 +32,7 @@ class TimeCells:
 
     Cells with motion are segments of the frame: ``end_poses`` (C, 2, 12), and ``line_times`` (C, 3, lines): middle and
     half length of every line's window in the segment, in units of the segment's length from its mid-time, and the share
-    of its window that this is. ``weight`` is 1 then.
+    of its window that this is. ``weight`` is 1 then. A method raises InputError for cells of one's own that do not fit.
     """
 
     pose: np.ndarray
@@ -47,6 +47,7 @@ class TimeCells:
 
     @property
     def count(self) -> int:
+        """How many cells C there are."""
         return len(self.weight)
 
     def line_weights(self) -> np.ndarray:

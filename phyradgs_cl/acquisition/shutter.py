@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 
@@ -19,6 +20,7 @@ class Shutter:
     Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``; a readout of 0 is a
     global shutter. ``axis``: what is read out at one time; ``direction`` +1 reads index 0 first, −1 last. ``pulse_s``
     (start after the frame's start, length): when the beam is on, None always; lines see their window's part in it.
+    Times are in s. Raises InputError for times below 0, other words, and a pulse that meets no frame.
     """
 
     exposure_s: float
@@ -28,19 +30,18 @@ class Shutter:
     pulse_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("exposure_s", "readout_s"):
-            if not (np.isfinite(time_s := getattr(self, name)) and time_s >= 0):
-                raise InputError(name, str(time_s), "a time of at least 0 s")
+        checks.at_least("exposure_s", self.exposure_s, 0)
+        checks.at_least("readout_s", self.readout_s, 0)
         if self.axis not in AXES:
             raise InputError("readout axis", repr(self.axis), "'rows' or 'columns'")
         if self.direction not in (1, -1):
             expected = "1 (index 0 first) or -1 (index 0 last)"
             raise InputError("readout direction", str(self.direction), expected)
         if self.pulse_s is not None:
-            self._check_pulse(*self.pulse_s)
+            self._check_pulse(*checks.numbers("pulse_s", self.pulse_s, (2,)).tolist())
 
     def _check_pulse(self, start_s: float, length_s: float) -> None:
-        if not (np.isfinite(start_s) and np.isfinite(length_s) and length_s > 0):
+        if length_s <= 0:
             found = f"start {start_s} s, length {length_s} s"
             raise InputError("pulse_s", found, "a finite start and a length above 0 s")
         if start_s >= self.span_s or start_s + length_s <= 0:
@@ -87,6 +88,7 @@ class Shutter:
         return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
+        """How many lines a panel of (rows, columns) has along the readout axis."""
         return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:

@@ -6,30 +6,65 @@
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime.
 """
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan, Static, StaticStart
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    EncoderTable,
+    Exact,
+    FrameSweeps,
+    LineMiddles,
+    MicroViews,
+    Motion,
+    PerRow,
+    PoseTable,
+    Scan,
+    Shutter,
+    SpeedRamp,
+    Static,
+    StaticStart,
+    TimeCells,
+    Trajectory,
+)
 from phyradgs_cl.api.bridges import as_linear_operator, as_torch
 from phyradgs_cl.api.projectors import Projector, ray_operator
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
+from phyradgs_cl.api.scans import fly_scan, static_scan
+from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import Reconstruction
+from phyradgs_cl.reconstructors import Progress, Reconstruction
 
 __all__ = [
+    "CircularOrbit",
+    "ConeGeometry",
+    "ConstantSpeed",
+    "EncoderTable",
     "Exact",
+    "FrameSweeps",
     "Gaussians",
     "Grid",
+    "InputError",
     "LineMiddles",
     "MicroViews",
     "Motion",
     "PerRow",
+    "PhyradgsError",
+    "PoseTable",
+    "Progress",
     "Projector",
     "Reconstruction",
     "Scan",
+    "Shutter",
+    "SpeedRamp",
     "Static",
     "StaticStart",
+    "TimeCells",
+    "Trajectory",
     "as_linear_operator",
     "as_torch",
     "compare",
+    "fly_scan",
     "load_scan",
     "load_volume",
     "ray_operator",
@@ -37,4 +72,5 @@ __all__ = [
     "save_scan",
     "save_volume",
     "simulate",
+    "static_scan",
 ]

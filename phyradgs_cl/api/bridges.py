@@ -24,7 +24,10 @@ class Linear(Interface):
 
 
 def as_linear_operator(operator: Linear) -> LinearOperator:
-    """A ``RayOperator`` (or ``Projector.of_densities``) for scipy: flat float32 vectors, matvec and rmatvec."""
+    """A ``RayOperator`` (or ``Projector.of_densities``) for scipy: flat float32 vectors, matvec and rmatvec.
+
+    operator: anything linear with forward and adjoint. Raises InputError for what is not.
+    """
     domain, frames = _shapes(operator)
 
     def matvec(x: np.ndarray) -> np.ndarray:

@@ -21,7 +21,8 @@ def ray_operator(
 ) -> RayOperator:
     """Joseph's projector of a scan and its exact transpose: volumes (nz, ny, nx) to frames (F, rows, columns).
 
-    motion: how frames see the moving gantry (docs/methods.md, but ``exact``). grid: the scan's own when None.
+    motion: how frames see the moving gantry (docs/methods.md, but ``exact``). grid: the scan's own when None, in mm.
+    device: what ``--device`` takes, or a Runtime. Raises InputError for a motion with cells that move.
     """
     tables = [motion_of(motion).cells(scan, frame).still() for frame in range(scan.frames)]
     return RayOperator(runtime_of(device), grid or scan.grid, scan.geometry.detector_shape, tables)
@@ -30,8 +31,10 @@ def ray_operator(
 class Projector:
     """The paper's projector Φ: Gaussians to the frames of a scan, exactly integrated, and its gradients.
 
-    motion: any model of docs/methods.md that splats have. frames: which of the scan's, None for all. Averages line integrals
-    over an exposure. Parameter rows (11, G) are mean x y z and three scales in mm, quaternion w x y z, density in 1/mm.
+    motion: any model of docs/methods.md that splats have. frames: which of the scan's, None for all. Averages line
+    integrals over an exposure. Parameter rows (11, G) are mean x y z and three scales in mm, quaternion w x y z, density
+    in 1/mm. cutoff_sigma: where a Gaussian ends, 0 nowhere. affine: R2-Gaussian's approximation. device: what
+    ``--device`` takes, or a Runtime. Raises InputError for rows and frames that do not fit.
     """
 
     def __init__(

@@ -15,7 +15,8 @@ from phyradgs_cl.workflow import ReconstructionJob
 
 _METHOD = (
     "phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
-    "naf, sax-nerf: neural fields; the others are iterative on voxels."
+    "naf, sax-nerf: neural fields; MODULE:NAME: a function of your own (docs: api.md); "
+    "the others are iterative on voxels."
 )
 _MOTION = (
     "How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
@@ -39,7 +40,7 @@ def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
 
 
 RUN_OPTIONS: dict[str, Any] = {
-    "method": _asked(Literal[tuple(METHODS)], _METHOD, "phyradgs", case_sensitive=False),
+    "method": _asked(str, _METHOD, "phyradgs", metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
     "motion": _asked(
         Literal["static", "static-start", "micro-views", "per-row", "exact"],
         _MOTION,

@@ -8,7 +8,7 @@ from phyradgs_cl.metrics.ssim import ssim
 
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """psnr_db, ssim (3D) and data_range, the maximum of ``reference``, of a volume against the truth, both (z, y, x).
+    """psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``, of a volume against the truth, both (z, y, x).
     InputError: an empty reference, shapes that differ, NaN or infinity."""
     peak = float(reference.max())
     if peak <= 0:

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
+from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
-from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
+from phyradgs_cl.importers.formats.moving_poses import turn_of
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_json
