@@ -7,8 +7,16 @@ Everything is documented with runnable examples in docs/api.md. ``device`` is wh
 """
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan, Static, StaticStart
-from phyradgs_cl.api.bridges import as_linear_operator, as_torch
-from phyradgs_cl.api.projectors import Projector, ray_operator
+from phyradgs_cl.api.bridges import as_torch
+from phyradgs_cl.api.operators import LinearOperator, Operator
+from phyradgs_cl.api.projectors import (
+    SplatProjection,
+    initial_gaussians,
+    ray_operator,
+    splat_operator,
+    voxel_operator,
+    voxelise,
+)
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
@@ -19,17 +27,19 @@ __all__ = [
     "Gaussians",
     "Grid",
     "LineMiddles",
+    "LinearOperator",
     "MicroViews",
     "Motion",
+    "Operator",
     "PerRow",
-    "Projector",
     "Reconstruction",
     "Scan",
+    "SplatProjection",
     "Static",
     "StaticStart",
-    "as_linear_operator",
     "as_torch",
     "compare",
+    "initial_gaussians",
     "load_scan",
     "load_volume",
     "ray_operator",
@@ -37,4 +47,7 @@ __all__ = [
     "save_scan",
     "save_volume",
     "simulate",
+    "splat_operator",
+    "voxel_operator",
+    "voxelise",
 ]

@@ -8,7 +8,10 @@ from phyradgs_cl.runtime.memory import (
     DeviceArray,
     MemoryShortage,
     Room,
+    adopted,
     bytes_of,
+    is_cl_array,
+    lent,
     with_smaller_bricks,
 )
 from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
@@ -24,8 +27,11 @@ __all__ = [
     "Rates",
     "Room",
     "Runtime",
+    "adopted",
     "bytes_of",
     "choose_device",
+    "is_cl_array",
+    "lent",
     "list_devices",
     "profile_text",
     "with_smaller_bricks",
