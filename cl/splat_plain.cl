@@ -1,6 +1,5 @@
 /* Between the arrays that users hold and what the splats' kernels work on: parameter rows (11, count) in mm with quaternions
-   of any length and internal rows (11, stride) with unit ones; images without padding, rows or columns first, and lines with
-   a pitch. Twins: NumPy's, in tests/operators/test_splat_operator.py. */
+   of any length, and internal rows (11, stride) with unit ones. Twins: NumPy's, in tests/operators/test_splat_plain.py. */
 
 #define ROWS 11
 #define LENGTHS 6  /* mean and scale */
@@ -64,26 +63,4 @@ __kernel void row_copy(__global const float *from, const long from_start, const 
     const int g = (int)get_global_id(0);
     if (g < count)
         to[to_start + g] = factor * from[from_start + g];
-}
-
-__kernel void image_enter(
-    __global const float *plain,
-    const long start, const int line_step, const int pixel_step, /* of the image, of its lines and of their pixels */
-    const int lines, const int width, const int pitch,
-    __global float *image)                                       /* guard, then (lines, pitch); padding stays as it is */
-{
-    const int u = (int)get_global_id(0), v = (int)get_global_id(1);
-    if (u < width)
-        image[IMAGE_GUARD + (size_t)v * pitch + u] = plain[start + (long)v * line_step + (long)u * pixel_step];
-}
-
-__kernel void image_leave(
-    __global const float *image,
-    const int lines, const int width, const int pitch,
-    const long start, const int line_step, const int pixel_step,
-    __global float *plain)
-{
-    const int u = (int)get_global_id(0), v = (int)get_global_id(1);
-    if (u < width)
-        plain[start + (long)v * line_step + (long)u * pixel_step] = image[IMAGE_GUARD + (size_t)v * pitch + u];
 }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 # --- rounding ------------------------------------------------------------------------------------------------
 FLOAT64 = 1e-9  # two float64 ways to one number of order 1, or its relative error
+SUMS = 1e-12  # sums of float32 products in float64, or in pairs of float32, over the norms (5e-14)
 FLOAT32 = 1e-5  # the same where one way ends, or runs through a few operations, in float32
 
 # --- float64 oracles -----------------------------------------------------------------------------------------

@@ -30,11 +30,16 @@ def given_back(rt: Runtime, values: Values) -> Any:
     return lent(values, rt.queue) if isinstance(values, DeviceArray) else values
 
 
-def on_device(rt: Runtime, function: Callable[[DeviceArray], DeviceArray], values: Values) -> Values:
-    """``function`` of values wherever they lie, its result there too."""
+def placed(rt: Runtime, values: Values, there: bool) -> Values:
+    """Values on the device, if ``there``, or on the host; as they are if that is where they are."""
     if isinstance(values, DeviceArray):
-        return function(values)
-    return rt.download(function(rt.upload(values)))
+        return values if there else rt.download(values)
+    return rt.upload(values) if there else values
+
+
+def computed(rt: Runtime, there: bool, function: Callable[[Any], Values], values: Values) -> Values:
+    """``function``, which works on the device or on the host, of values wherever they are; its result is there too."""
+    return placed(rt, function(placed(rt, values, there)), isinstance(values, DeviceArray))
 
 
 def on_host(name: str, values: Any) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_of
-from phyradgs_cl.api.arrays import Values, on_device
+from phyradgs_cl.api.arrays import Values, computed, placed
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
 from phyradgs_cl.errors import InputError
@@ -67,11 +67,18 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        here = copy(engine)  # whose derivative stays at this volume
-        return here.expected(volume), here.adjoint
+        here, there = copy(engine), isinstance(volume, DeviceArray)  # a copy, whose derivative stays at this volume
+        return _own(rt, here.expected, volume, engine.frames_shape), partial(
+            computed, rt, there, lambda frames: _own(rt, here.adjoint, frames, engine.volume_shape)
+        )
 
     domain, frames = (_VOLUME, engine.volume_shape), (_FRAMES, engine.frames_shape)
     return Operator(rt, domain, frames, at, frames=lambda chosen: _intensities(rt, engine.subset(chosen)))
+
+
+def _own(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
+    """``function(values)`` in memory of its own: the engine's is used again once its arrays, but not their views, are gone."""
+    return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
 def splat_operator(
@@ -121,10 +128,9 @@ class GaussianOperator(Operator):
 
     def _seen(self, rows: Values) -> tuple[Values, Map]:
         rt, engine = self.rt, self._engine
-        point = engine.rows.enter(rows if isinstance(rows, DeviceArray) else rt.upload(rows))
-        frames = engine.forward(point)
-        y = frames if isinstance(rows, DeviceArray) else rt.download(frames)
-        return y, partial(on_device, rt, partial(engine.back, point))
+        point = engine.rows.enter(placed(rt, rows, True))
+        y = placed(rt, engine.forward(point), isinstance(rows, DeviceArray))
+        return y, partial(computed, rt, True, partial(engine.back, point))
 
     def _entered(self, side: tuple[str, Shape], values: Any) -> Values:
         given = values.rows() if isinstance(values, Gaussians) else values
@@ -151,8 +157,7 @@ class SplatProjection(GaussianOperator):
         rt, rows = self.rt, self._entered(self._domain, gaussians)
         if self._engine.is_layered:
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
-        upload = rows if isinstance(rows, DeviceArray) else rt.upload(rows)
-        engine = DensityOperator(self._engine, self._engine.rows.enter(upload))
+        engine = DensityOperator(self._engine, self._engine.rows.enter(placed(rt, rows, True)))
         return _densities(rt, engine, rows.shape[1], self._engine.frames_shape)
 
 
@@ -161,8 +166,8 @@ def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: S
         rt,
         (_DENSITY, (count,)),
         (_FRAMES, frames_shape),
-        partial(on_device, rt, engine.forward),
-        partial(on_device, rt, engine.adjoint),
+        partial(computed, rt, True, engine.forward),
+        partial(computed, rt, True, engine.adjoint),
         frames=lambda few: _densities(rt, engine.subset(few), count, (len(few), *frames_shape[1:])),
     )
 

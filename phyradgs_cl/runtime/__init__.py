@@ -1,13 +1,15 @@
 """The only room that knows OpenCL: devices, programs, buffers, launches."""
 
+from phyradgs_cl.runtime.algebra import DeviceSpace, HostSpace, Space
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.device import DEVICE_VARIABLE, DeviceInfo, choose_device, list_devices
-from phyradgs_cl.runtime.kernel import Kernel
 from phyradgs_cl.runtime.memory import (
     MEMORY_VARIABLE,
+    Array,
     DeviceArray,
     MemoryShortage,
     Room,
+    Traffic,
     adopted,
     bytes_of,
     is_cl_array,
@@ -15,18 +17,24 @@ from phyradgs_cl.runtime.memory import (
     with_smaller_bricks,
 )
 from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
+from phyradgs_cl.runtime.source import Kernel
 
 __all__ = [
     "DEVICE_VARIABLE",
     "MEMORY_VARIABLE",
+    "Array",
     "DeviceArray",
     "DeviceInfo",
+    "DeviceSpace",
+    "HostSpace",
     "Kernel",
     "KernelUse",
     "MemoryShortage",
     "Rates",
     "Room",
     "Runtime",
+    "Space",
+    "Traffic",
     "adopted",
     "bytes_of",
     "choose_device",

@@ -15,11 +15,10 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
-from phyradgs_cl.runtime.kernel import Kernel
-from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, memory_limit
+from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, Traffic, memory_limit
 from phyradgs_cl.runtime.opencl import cl
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
-from phyradgs_cl.runtime.source import kernel_source
+from phyradgs_cl.runtime.source import Kernel, kernel_source
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +51,7 @@ class Runtime:
         self.device: DeviceInfo
         self.device, self.reason = choose_device(device, self.ranks.local_rank)
         self.ledger = MemoryLedger(self.device, limit_bytes)
+        self.traffic = Traffic()
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         try:
             self.context = cl.Context([self.device.handle])
@@ -162,12 +162,14 @@ class Runtime:
         values = np.ascontiguousarray(values, dtype=array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, array.buffer, values, is_blocking=True)
+            self.traffic.count(up=values.nbytes)
 
     @naming_failures("a copy from it")
     def download(self, array: DeviceArray) -> np.ndarray:
         values = np.empty(array.shape, array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, values, array.buffer, is_blocking=True)
+            self.traffic.count(down=values.nbytes)
         return values
 
     @naming_failures("a copy from it")
@@ -176,12 +178,35 @@ class Runtime:
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
+        self.traffic.count(down=value.nbytes)
         return value[0]
 
     @naming_failures("a copy")
-    def copy(self, source: DeviceArray, target: DeviceArray) -> None:
-        event = cl.enqueue_copy(self.queue, target.buffer, source.buffer, byte_count=source.nbytes)
-        self._record("copy", event, 2 * source.nbytes)
+    def copy(
+        self,
+        source: DeviceArray,
+        target: DeviceArray,
+        *,
+        nbytes: int | None = None,
+        source_offset: int = 0,
+        target_offset: int = 0,
+    ) -> None:
+        """Bytes of one device array to another: all of the source's, or ``nbytes`` between the offsets given."""
+        count = source.nbytes if nbytes is None else nbytes
+        event = cl.enqueue_copy(
+            self.queue,
+            target.buffer,
+            source.buffer,
+            byte_count=count,
+            src_offset=source_offset,
+            dst_offset=target_offset,
+        )
+        self._record("copy", event, 2 * count)
+
+    @staticmethod
+    def local(nbytes: int) -> cl.LocalMemory:
+        """Local memory of a work-group, as an argument of a launch."""
+        return cl.LocalMemory(nbytes)
 
     # --- launches -----------------------------------------------------------------------------------
 
@@ -206,6 +231,7 @@ class Runtime:
     @naming_failures("the work before")
     def finish(self) -> None:
         self.queue.finish()
+        self.traffic.count()
 
     # --- profile ------------------------------------------------------------------------------------
 

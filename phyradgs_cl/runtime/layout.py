@@ -6,12 +6,58 @@ outside a row without a test. Kernels know it as ``IMAGE_GUARD``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.memory import DeviceArray
 
 GUARD = 16
+
+_TILE = 16  # rows and columns that a CPU's work-item turns at a time
+
+
+@dataclass(frozen=True)
+class Strides:
+    """Where element (z, y, x) of a volume, or of a stack of images, lies: ``start`` + z ``slice`` + y ``row`` + x, in floats."""
+
+    start: int
+    slice: int
+    row: int
+
+    @classmethod
+    def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> Strides:
+        """Of C-contiguous (nz, ny, nx), from element ``first`` on."""
+        _, ny, nx = shape
+        return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)
+
+    def vector(self) -> np.ndarray:
+        """As kernels take it."""
+        return np.array([self.start, self.row, self.slice, 0], np.int64)
+
+
+def move(
+    rt: Runtime,
+    source: tuple[DeviceArray, Strides],
+    target: tuple[DeviceArray, Strides],
+    shape: Sequence[int],
+    *,
+    turned: bool = False,
+) -> None:
+    """Copies (nz, ny, nx) floats from one layout to another on the device; ``turned``: to (nz, nx, ny)."""
+    nz, ny, nx = (int(n) for n in shape)
+    (from_array, from_strides), (to_array, to_strides) = source, target
+    ends = from_array, from_strides.vector(), to_array, to_strides.vector(), np.int32(ny), np.int32(nx)
+    if turned:
+        tile = 1 if rt.pixel_items else _TILE
+        kernel = rt.kernel("layout", "move_turned", TILE=tile)
+        rt.launch(kernel, (-(-nx // tile), -(-ny // tile), nz), *ends, group=rt.group())
+        return
+    blocks = -(-nx // rt.lanes)
+    kernel = rt.kernel("layout", "move_rows", TILE=1)
+    rt.launch(kernel, (blocks, ny, nz), *ends, group=rt.group(on_cpu=min(blocks, 8)))
 
 
 def pitch_of(width: int) -> int:

@@ -48,6 +48,25 @@ class DeviceArray:
         return self.size * self.dtype.itemsize
 
 
+Array = np.ndarray | DeviceArray
+"""Plain C-contiguous values where they are: operators give their results where their arguments lie."""
+
+
+@dataclass
+class Traffic:
+    """What has crossed the bus: bytes to the device and from it, and how often the host waited for the device."""
+
+    bytes_up: int = 0
+    bytes_down: int = 0
+    blocking: int = 0
+
+    def count(self, up: int = 0, down: int = 0) -> None:
+        """One call that waits."""
+        self.bytes_up += up
+        self.bytes_down += down
+        self.blocking += 1
+
+
 @dataclass(frozen=True)
 class Room:
     """What an operator may plan with: bytes that are free in all, and the most for one buffer."""

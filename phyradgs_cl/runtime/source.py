@@ -1,4 +1,4 @@
-"""Kernel sources: files of ``cl/`` with their headers pasted in.
+"""Kernels as they are declared, and their sources: files of ``cl/`` with their headers pasted in.
 
 An include path would fail on a folder whose name has a space, so headers are pasted with ``#line``
 marks, and the compiler's messages keep naming file and line.
@@ -7,11 +7,23 @@ marks, and the compiler's messages keep naming file and line.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import cache
 
 from phyradgs_cl.resources import resource
+from phyradgs_cl.runtime.opencl import cl
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
+
+
+@dataclass(eq=False)
+class Kernel:
+    """``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch; ``Runtime.launch`` takes it."""
+
+    program: str
+    function_name: str
+    options: tuple[str, ...]
+    built: cl.Kernel | None = None
 
 
 @cache

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 
@@ -16,47 +17,74 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import layered
-from phyradgs_cl.operators.rays.operator import RayOperator
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.operators.rays.memory import RayMemory
+from phyradgs_cl.operators.rays.operator import A, RayOperator
+from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, Space
+
+_HOST = HostSpace()
 
 
 class IntensityOperator:
     """I(x), and J and Jᵀ at the volume for which I was asked last (A and Aᵀ before that).
 
-    Arguments as for ``RayOperator``. It holds frames (F, rows, columns) once for every cell of a line, which is what the
-    softmax weights need.
+    Arguments as for ``RayOperator``, whose rule for NumPy's and device arrays holds here too; one operator is used with one
+    kind. It holds frames (F, rows, columns) once for every cell of a line, which is what the softmax weights need.
     """
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells]
     ) -> None:
-        ones, self._weights = layered(tables)
+        ones, weights = layered(tables)
         self.volume_shape = grid.shape
         self.frames_shape = (len(tables), *detector_shape)
         self._operators: list[RayOperator] = []
         for part in ones:  # one memory for all: they are used in turns
             memory = self._operators[0].memory if self._operators else None
             self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
-        self._shares = self._weights
+        self._by_row = tables[0].axis == "rows"
+        self._device = DeviceSpace(rt)
+        self._set(weights)
 
-    def expected(self, volume: np.ndarray) -> np.ndarray:
+    @property
+    def memory(self) -> RayMemory:
+        """That of all my projectors."""
+        return self._operators[0].memory
+
+    @property
+    def layers(self) -> int:
+        """The most cells of a line: so many times I hold frames."""
+        return len(self._operators)
+
+    def expected(self, volume: A, out: A | None = None) -> A:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
-        p = [operator.forward(volume) for operator in self._operators]
-        frames, shares = intensity_average(p, self._weights)
-        self._shares = [share.astype(np.float32) for share in shares]
-        return frames.astype(np.float32)
+        self._shares = []  # their memory is wanted again
+        if isinstance(volume, DeviceArray):
+            p = [self._device.apply(operator.forward, volume, self.frames_shape) for operator in self._operators]
+            frames, self._shares = self._device_average(p)
+        else:
+            averaged, shares = intensity_average(
+                [operator.forward(volume) for operator in self._operators], self._weights
+            )
+            frames, self._shares = averaged.astype(np.float32), [s.astype(np.float32) for s in shares]
+        return self._given(frames, out)
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
+    def forward(self, volume: A, out: A | None = None) -> A:
         """J d: a change of the volume (nz, ny, nx) to that of the frames (F, rows, columns) float32."""
-        pairs = zip(self._shares, self._operators, strict=True)
-        total: np.ndarray = np.sum([share * operator.forward(volume) for share, operator in pairs], axis=0)
-        return total
+        space = self._space(volume)
+        total: Any = None
+        for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
+            part = space.apply(operator.forward, volume, self.frames_shape)
+            total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
+        return self._given(total, out)
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: A, out: A | None = None) -> A:
         """Jᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
-        pairs = zip(self._shares, self._operators, strict=True)
-        total: np.ndarray = np.sum([operator.adjoint(share * frames) for share, operator in pairs], axis=0)
-        return total
+        space = self._space(frames)
+        total: Any = None
+        for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
+            part = space.apply(operator.adjoint, space.multiply(frames, share), self.volume_shape)
+            total = part if total is None else space.add(total, part)
+        return self._given(total, out)
 
     def subset(self, frames: Sequence[int]) -> IntensityOperator:
         """The same for some of the frames, in this order, with a volume of its own for J."""
@@ -64,6 +92,61 @@ class IntensityOperator:
         part = copy(self)
         part.frames_shape = (len(chosen), *self.frames_shape[1:])
         part._operators = [operator.subset(chosen) for operator in self._operators]
-        part._weights = [weight[chosen] for weight in self._weights]
-        part._shares = part._weights
+        part._set([weight[chosen] for weight in self._weights])
         return part
+
+    def _set(self, weights: list[np.ndarray]) -> None:
+        """Weights (F, lines, 1) or (F, 1, lines) of each layer; shares are those of a volume of zeros."""
+        self._weights = weights
+        self._line_weights: list[DeviceArray] = []
+        self._shares: list[Any] = []
+
+    def _space(self, like: Array) -> Space[Any]:
+        return self._device if isinstance(like, DeviceArray) else _HOST
+
+    def _given(self, result: Any, out: Any) -> Any:
+        """The result, in ``out`` if there is one."""
+        if out is None:
+            return result
+        if isinstance(out, DeviceArray):
+            self._device.rt.copy(result, out)
+        else:
+            out[...] = result
+        return out
+
+    def _shares_for(self, like: Array) -> list[Any]:
+        if not self._shares and isinstance(like, DeviceArray):
+            spread = [self._device.empty(self.frames_shape) for _ in self._operators]
+            for weights, share in zip(self._uploaded(), spread, strict=True):
+                self._launch("layer_weights", weights, share)
+            self._shares = spread
+        return self._shares or self._weights
+
+    def _device_average(self, p: list[DeviceArray]) -> tuple[DeviceArray, list[DeviceArray]]:
+        """``intensity_average`` of frames on the device, whose memory becomes that of the shares."""
+        least, total = self._device.empty(self.frames_shape), self._device.empty(self.frames_shape)
+        for k, (q, weights) in enumerate(zip(p, self._uploaded(), strict=True)):
+            self._launch("layer_least", q, weights, least, first=k == 0)
+        for k, (q, weights) in enumerate(zip(p, self._uploaded(), strict=True)):
+            self._launch("layer_seen", q, weights, least, total, first=k == 0)
+        rt = self._device.rt
+        rt.launch(
+            rt.kernel("cell_layers", "layer_average"), total.size, np.int64(total.size), least, total, group=rt.group(64)
+        )
+        return least, [self._device.multiply(q, total) for q in p]
+
+    def _launch(self, name: str, *arrays: DeviceArray, first: bool | None = None) -> None:
+        """A kernel over all pixels: its read-only arrays, shapes, whether it is the first layer, arrays to write."""
+        frames, rows, columns = self.frames_shape
+        rt, inputs = self._device.rt, 1 if first is None else 2
+        words = [np.int32(n) for n in (rows, columns, self._by_row)] + ([] if first is None else [np.int32(first)])
+        items = (columns, rows, frames)
+        kernel = rt.kernel("cell_layers", name)
+        rt.launch(kernel, items, *arrays[:inputs], *words, *arrays[inputs:], group=rt.group(on_cpu=16))
+
+    def _uploaded(self) -> list[DeviceArray]:
+        """Weights (F, lines) of each layer on the device, which keeps them."""
+        if not self._line_weights:
+            shape = (self.frames_shape[0], -1)
+            self._line_weights = [self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights]
+        return self._line_weights

@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, whole
 from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
-from phyradgs_cl.runtime.layout import GUARD, pitch_of
+from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16
 BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
@@ -52,6 +52,19 @@ class RayLayout:
 
     def frames_shape(self, count: int) -> tuple[int, int, int]:
         return count, self.lines, self.width
+
+    @property
+    def volume_strides(self) -> Strides:
+        """Where the voxels of a padded volume lie."""
+        _, ny, nx = self.brick.shape
+        row, slice_ = pitch_of(nx), pitch_of(nx) * (ny + 2 * BORDER)
+        return Strides(GUARD + BORDER * (slice_ + row), slice_, row)
+
+    @property
+    def frames_strides(self) -> Strides:
+        """Where the pixels of padded frames lie."""
+        row = pitch_of(self.width)
+        return Strides(GUARD, self.lines * row, row)
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
         """The volume (z, y, x) as a view of its padded floats."""

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import triple
 from phyradgs_cl.operators.bricks import Brick, cut, whole
 from phyradgs_cl.operators.rays.launches import owner_steps
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import Array, DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import Strides, move, pad_rows, unpad_rows
 
 _FRAMES_SHARE = 0.25  # of the room, for frames beside a brick
 
@@ -30,6 +32,7 @@ class RayMemory:
         self._bricks: list[Brick] = []
         self._batch = 0
         self._volume: DeviceArray | None = None
+        self._bordered: tuple[int, int, int] | None = None  # the shape of brick around which zeros lie
         self._frames: DeviceArray | None = None
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
@@ -79,18 +82,41 @@ class RayMemory:
         if self._volume is None:
             largest = self._bricks[0]
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
+            self._bordered = largest.shape
         layout = self.layout.of(brick)
+        if brick.shape != self._bordered:  # the borders of the shape before are voxels now
+            self._bordered = None
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
-    def write_volume(self, volume: np.ndarray, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """A brick of a volume (z, y, x) on the device; its padded floats are kept, fresh pages cost more than the copy."""
+    def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
+        """A brick of a volume (z, y, x) in the padded layout.
+
+        Of a host's volume the padded floats are kept: fresh pages cost more than the copy.
+        """
         layout, on_device = self.volume(brick)
+        if isinstance(volume, DeviceArray):
+            if self._bordered != brick.shape:
+                self.rt.fill(on_device, 0)
+            plain = Strides.plain(volume.shape, brick.start)
+            move(self.rt, (volume, plain), (on_device, layout.volume_strides), brick.shape)
+            self._bordered = brick.shape
+            return layout, on_device
+        self._bordered = brick.shape
         if brick.shape not in self._padded:
             self._padded = {brick.shape: np.zeros(layout.volume_floats, np.float32)}
         padded = self._padded[brick.shape]
         layout.inside(padded)[...] = volume[brick.box]
         self.rt.write(on_device, padded)
         return layout, on_device
+
+    def read_volume(self, layout: RayLayout, on_device: DeviceArray, result: Array) -> None:
+        """A padded brick to its place in a volume (z, y, x)."""
+        brick = layout.brick
+        if isinstance(result, DeviceArray):
+            plain = Strides.plain(result.shape, brick.start)
+            move(self.rt, (on_device, layout.volume_strides), (result, plain), brick.shape)
+        else:
+            result[brick.box] = layout.inside(self.rt.download(on_device))
 
     def turned(self, layout: RayLayout, volume: DeviceArray) -> DeviceArray | None:
         """A whole volume with z along a row, where there is room for that."""
@@ -107,3 +133,26 @@ class RayMemory:
             self._frames = self.rt.zeros(self.layout.frames_floats(self._batch))
         floats = self.layout.frames_floats(count)
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
+
+    def write_frames(self, frames: Array, part: slice, axis: str) -> DeviceArray:
+        """Some of the frames (F, rows, columns), lines first and padded; ``axis`` is the readout's."""
+        count = part.stop - part.start
+        on_device = self.frames(count)
+        if isinstance(frames, DeviceArray):
+            plain = Strides.plain(frames.shape, (part.start, 0, 0))
+            shape = count, *frames.shape[1:]
+            padded = on_device, self.layout.frames_strides
+            move(self.rt, (frames, plain), padded, shape, turned=axis == "columns")
+        else:
+            self.rt.write(on_device, pad_rows(Readout(axis).frames(frames[part])))
+        return on_device
+
+    def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
+        """The inverse of ``write_frames``: padded frames to their place among ``result`` (F, rows, columns)."""
+        shape = self.layout.frames_shape(part.stop - part.start)
+        if isinstance(result, DeviceArray):
+            plain = Strides.plain(result.shape, (part.start, 0, 0))
+            padded = on_device, self.layout.frames_strides
+            move(self.rt, padded, (result, plain), shape, turned=axis == "columns")
+        else:
+            result[part] = Readout(axis).frames(unpad_rows(self.rt.download(on_device), shape))

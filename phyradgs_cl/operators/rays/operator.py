@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from typing import Any
 from typing import Protocol as Interface
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,8 +18,9 @@ from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.upright import launch_upright, upright_block
-from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
-from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
+from phyradgs_cl.runtime import Array, DeviceArray, Runtime, with_smaller_bricks
+
+A = TypeVar("A", np.ndarray, DeviceArray)
 
 
 class LinearOperator(Interface):
@@ -29,12 +32,12 @@ class LinearOperator(Interface):
     @property
     def frames_shape(self) -> tuple[int, int, int]: ...
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
+    def forward(self, volume: A, out: A | None = None) -> A:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32, into ``out`` if there is one."""
         ...
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
-        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
+    def adjoint(self, frames: A, out: A | None = None) -> A:
+        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32, into ``out`` if there is one."""
         ...
 
     def subset(self, frames: Sequence[int]) -> LinearOperator:
@@ -45,6 +48,8 @@ class LinearOperator(Interface):
 class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
+    Results lie where the arguments do: NumPy's arrays give NumPy's, device arrays (plain, float32) device arrays, and of
+    those nothing crosses the bus. ``out``: memory for the result, of the same kind; without it, it is new.
     detector_shape (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis.
     Tables are uploaded once and shared with every subset, and so are the device's volume and frames: use an operator
     and its subsets one at a time, and operators that were given one ``memory``. Each call is one launch, or as few as
@@ -79,30 +84,32 @@ class RayOperator:
         """The cells of each frame."""
         return [self._tables[f] for f in self._chosen]
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
+    def forward(self, volume: A, out: A | None = None) -> A:
         """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
-        return self.project(volume, "log")
+        return self.project(volume, "log", out)
 
-    def intensity_gap(self, volume: np.ndarray) -> np.ndarray:
+    def intensity_gap(self, volume: A, out: A | None = None) -> A:
         """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
 
         Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
         to what an intensity detector measured of about x, it is what a log detector would have measured.
         """
-        return self.project(volume, "gap")
+        return self.project(volume, "gap", out)
 
-    def project(self, volume: np.ndarray, average: str) -> np.ndarray:
+    def project(self, volume: A, average: str, out: A | None = None) -> A:
         """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""
         _check_shape("volume", volume, self.volume_shape)
-        return with_smaller_bricks(
-            "ray-driven projector", lambda share: self._project(volume, average, share)
+        result = _room_for(self.rt, self.frames_shape, volume, out)
+        with_smaller_bricks(
+            "ray-driven projector", lambda share: self._project(volume, average, share, result)
         )
+        return result
 
-    def _project(self, volume: np.ndarray, average: str, share: float) -> np.ndarray:
+    def _project(self, volume: Array, average: str, share: float, result: Array) -> None:
         bricks = self.memory.plan(share)
         if average != "log" and len(bricks) > 1:
-            return self._project_layers(volume, average)
-        result = np.empty(self.frames_shape, np.float32)
+            self._project_layers(volume, average, result)
+            return
         for part in self.memory.batches(len(self._chosen)):
             listed = self._listed(part)
             frames = self.memory.frames(listed.size)
@@ -116,44 +123,45 @@ class RayOperator:
                 launch_forward(
                     self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
                 )
-            by_line = unpad_rows(self.rt.download(frames), layout.frames_shape(listed.size))
-            result[part] = self._readout.frames(by_line)
-        return result
+            self.memory.read_frames(frames, result, part, self._readout.axis)
 
     def _turned(self, layout: RayLayout, volume: DeviceArray, average: str) -> DeviceArray | None:
         """The volume for the kernel of upright rays; None where that does not apply."""
         return self.memory.turned(layout, volume) if self._upright and average == "log" else None
 
-    def _project_layers(self, volume: np.ndarray, average: str) -> np.ndarray:
-        """Averages that need a whole ray at a time, where no brick has one: every layer of cells by itself."""
+    def _project_layers(self, volume: Array, average: str, result: Array) -> None:
+        """Averages that need a whole ray at a time, where no brick has one: every layer by itself, averaged on the host."""
         ones, weights = layered(self.tables)
         like = (self.rt, self.grid, self.detector_shape)
-        return averaged(
-            [RayOperator(*like, tables, memory=self.memory).forward(volume) for tables in ones],
-            weights,
-            average,
-        )
+        on_host = self.rt.download(volume) if isinstance(volume, DeviceArray) else volume
+        parts = [RayOperator(*like, tables, memory=self.memory).forward(on_host) for tables in ones]
+        frames = averaged(parts, weights, average)
+        if isinstance(result, DeviceArray):
+            self.rt.write(result, frames)
+        else:
+            result[...] = frames
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: A, out: A | None = None) -> A:
         """Aᵀ y; frames (F, rows, columns), result (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
-        return with_smaller_bricks("ray-driven backprojector", lambda share: self._adjoint(frames, share))
+        result = _room_for(self.rt, self.volume_shape, frames, out)
+        with_smaller_bricks(
+            "ray-driven backprojector", lambda share: self._adjoint(frames, share, result)
+        )
+        return result
 
-    def _adjoint(self, frames: np.ndarray, share: float) -> np.ndarray:
+    def _adjoint(self, frames: Array, share: float, result: Array) -> None:
         bricks = self.memory.plan(share)
         parts = list(self.memory.batches(len(self._chosen)))
-        result = np.empty(self.volume_shape, np.float32)
         for k, brick in enumerate(bricks):
             layout, on_device = self.memory.volume(brick)
             for part in parts:
                 listed = self._listed(part)
-                by_line = self.memory.frames(listed.size)
                 if k == 0 or len(parts) > 1:
-                    self.rt.write(by_line, pad_rows(self._readout.frames(frames[part])))
+                    by_line = self.memory.write_frames(frames, part, self._readout.axis)
                 add = part.start > 0
                 launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
-            result[brick.box] = layout.inside(self.rt.download(on_device))
-        return result
+            self.memory.read_volume(layout, on_device, result)
 
     def subset(self, frames: Sequence[int]) -> RayOperator:
         """The same operator on some of the frames, in this order; cheap, but worth keeping if it is used again."""
@@ -188,6 +196,18 @@ def _check_tables(tables: Sequence[TimeCells], detector_shape: tuple[int, int]) 
             raise InputError("tables", found, f"{lines} {axis} in every frame")
 
 
-def _check_shape(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+def _check_shape(name: str, values: Array, shape: tuple[int, ...]) -> None:
     if values.shape != shape:
         raise InputError(name, f"shape {values.shape}", f"shape {shape}")
+    if isinstance(values, DeviceArray) and values.dtype != np.float32:
+        raise InputError(name, f"a device array of {values.dtype}", "float32")
+
+
+def _room_for(rt: Runtime, shape: tuple[int, ...], like: Array, out: Array | None) -> Any:
+    """Memory for a float32 result where ``like`` is: ``out``, or new."""
+    if out is not None:
+        _check_shape("out", out, shape)
+        if isinstance(out, DeviceArray) != isinstance(like, DeviceArray):
+            raise InputError("out", "an array elsewhere than the argument", "both on the device, or both NumPy's")
+        return out
+    return rt.empty(shape) if isinstance(like, DeviceArray) else np.empty(shape, np.float32)

@@ -53,7 +53,7 @@ class SplatOperator:
             intensity_unit=1.0 if intensity else None,
         )
         self.rows = PlainRows(rt, length_mm, line_integrals=True)
-        self._images = PlainImages(rt, self._projector.lines, self._projector.width, transposed=readout.axis != "rows")
+        self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._cells = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._ready = _Ready()
         self.frames_shape = (len(tables), *detector_shape)

@@ -8,8 +8,8 @@ import numpy as np
 
 from phyradgs_cl.fields.gaussians import DENSITY, ROWS
 from phyradgs_cl.operators.splats.layout import DeviceGaussians, stride_of
-from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
-from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
+from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of
 
 
 @dataclass(eq=False)
@@ -30,9 +30,9 @@ class PlainRows:
         self.rt = rt
         self._density = np.float32(length_mm if line_integrals else 1)
         self._units = np.float32(1 / length_mm), self._density
-        self._enter = rt.kernel("splat_plain", "rows_enter", IMAGE_GUARD=GUARD)
-        self._leave = rt.kernel("splat_plain", "rows_leave", IMAGE_GUARD=GUARD)
-        self._copy = rt.kernel("splat_plain", "row_copy", IMAGE_GUARD=GUARD)
+        self._enter = rt.kernel("splat_plain", "rows_enter")
+        self._leave = rt.kernel("splat_plain", "rows_leave")
+        self._copy = rt.kernel("splat_plain", "row_copy")
 
     def enter(self, rows: DeviceArray) -> SplatPoint:
         """The cloud of rows (11, G) float32; a copy, so that the rows may change afterwards."""
@@ -85,29 +85,28 @@ class PlainRows:
 class PlainImages:
     """Images (rows, columns) without padding, one after the other, to one padded image of ``lines`` by ``width``.
 
-    ``transposed``: the lines are the columns. A volume (nz, ny, nx) is an image of nz · ny lines.
+    ``turned``: the lines are the columns. A volume (nz, ny, nx) is an image of nz · ny lines.
     """
 
-    def __init__(self, rt: Runtime, lines: int, width: int, *, transposed: bool = False) -> None:
-        self.rt, self.lines, self.width = rt, lines, width
-        self._steps = (np.int32(1), np.int32(lines)) if transposed else (np.int32(width), np.int32(1))
-        self._shape = tuple(np.int32(n) for n in (lines, width, pitch_of(width)))
+    def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
+        self.rt, self._turned = rt, turned
+        self._by_line = 1, lines, width
+        self._plain = (1, width, lines) if turned else self._by_line
+        self._padded = Strides(GUARD, 0, pitch_of(width))
         self._image: DeviceArray | None = None
-        self._enter = rt.kernel("splat_plain", "image_enter", IMAGE_GUARD=GUARD)
-        self._leave = rt.kernel("splat_plain", "image_leave", IMAGE_GUARD=GUARD)
 
     def enter(self, images: DeviceArray, number: int = 0) -> DeviceArray:
         """Image ``number`` in the padded layout; valid until the next call."""
         if self._image is None:
-            self._image = padded_zeros(self.rt, self.lines, self.width)
-        where = np.int64(number * self.lines * self.width), *self._steps, *self._shape
-        self._launch(self._enter, images, *where, self._image)
+            self._image = padded_zeros(self.rt, *self._by_line[1:])
+        source, target = (images, self._place(number)), (self._image, self._padded)
+        move(self.rt, source, target, self._plain, turned=self._turned)
         return self._image
 
     def leave(self, image: DeviceArray, images: DeviceArray, number: int = 0) -> None:
         """A padded image to image ``number``."""
-        where = *self._shape, np.int64(number * self.lines * self.width), *self._steps
-        self._launch(self._leave, image, *where, images)
+        source, target = (image, self._padded), (images, self._place(number))
+        move(self.rt, source, target, self._by_line, turned=self._turned)
 
-    def _launch(self, kernel: Kernel, *args: object) -> None:
-        self.rt.launch(kernel, (self.width, self.lines), *args, group=self.rt.group(on_cpu=16))
+    def _place(self, number: int) -> Strides:
+        return Strides.plain(self._plain, (number, 0, 0))

@@ -1,0 +1,50 @@
+/* The intensity model over plain frames (F, rows, columns), a layer of time cells at a time: p of layer k has the weight
+   w_k of a line. Frames are -log(sum w exp(-p)), the shares w exp(-p) / sum w exp(-p), without overflow. Weights are
+   (F, lines); a line is a row, or a column where `by_row` is 0. A work-item takes one pixel. Twin: detector/average.py. */
+
+#define PIXEL                                                                                              \
+    const int u = (int)get_global_id(0), v = (int)get_global_id(1), f = (int)get_global_id(2);             \
+    if (u >= columns)                                                                                      \
+        return;                                                                                            \
+    const size_t at = ((size_t)f * rows + v) * columns + u;                                                \
+    const float weight = weights[by_row ? (size_t)f * rows + v : (size_t)f * columns + u];
+
+/* the least p of the layers so far that have weight; the first begins with infinity */
+__kernel void layer_least(
+    __global const float *p, __global const float *weights, const int rows, const int columns, const int by_row,
+    const int first, __global float *least)
+{
+    PIXEL
+    const float before = first ? INFINITY : least[at];
+    least[at] = weight > 0.0f ? fmin(before, p[at]) : before;
+}
+
+/* p to w exp(least - p), and the sum of that over the layers so far */
+__kernel void layer_seen(
+    __global float *p, __global const float *weights, const int rows, const int columns, const int by_row,
+    const int first, __global const float *least, __global float *total)
+{
+    PIXEL
+    const float seen = weight > 0.0f ? weight * exp(least[at] - p[at]) : 0.0f;
+    p[at] = seen;
+    total[at] = first ? seen : total[at] + seen;
+}
+
+/* least to the average, and the sum to its inverse; both 0 where no layer has weight */
+__kernel void layer_average(const long count, __global float *least, __global float *total)
+{
+    const size_t at = get_global_id(0);
+    if (at >= count)
+        return;
+    const int any = total[at] > 0.0f;
+    least[at] = any ? least[at] - log(total[at]) : 0.0f;
+    total[at] = any ? 1.0f / total[at] : 0.0f;
+}
+
+/* the weights themselves, over all pixels of their lines */
+__kernel void layer_weights(
+    __global const float *weights, const int rows, const int columns, const int by_row, __global float *spread)
+{
+    PIXEL
+    spread[at] = weight;
+}

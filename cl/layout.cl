@@ -1,0 +1,38 @@
+/* Plain arrays (nz, ny, nx) into the padded layouts of operators and out of them. An element (z, y, x) lies at
+   strides.s0 + y strides.s1 + z strides.s2 + x floats. Twins: NumPy's slices and swapaxes (tests/runtime/test_layout.py). */
+#include "common/lanes.h"
+
+static inline size_t row_of(const long4 strides, const int y, const int z)
+{
+    return (size_t)(strides.s0 + y * strides.s1 + z * strides.s2);
+}
+
+/* a work-item takes LANES elements of a row, and leaves what lies behind the row alone */
+__kernel void move_rows(
+    __global const float *source, const long4 from, __global float *target, const long4 to, const int rows, const int width)
+{
+    const int x = (int)get_global_id(0) * LANES, y = (int)get_global_id(1), z = (int)get_global_id(2);
+    if (x >= width)
+        return;
+    source += row_of(from, y, z) + x;
+    target += row_of(to, y, z) + x;
+    if (x + LANES <= width) {
+        V_STORE(V_LOAD(source), target);
+        return;
+    }
+    for (int k = 0; k < width - x; ++k)
+        target[k] = source[k];
+}
+
+/* rows become columns; a work-item takes TILE of each */
+__kernel void move_turned(
+    __global const float *source, const long4 from, __global float *target, const long4 to, const int rows, const int width)
+{
+    const int x0 = (int)get_global_id(0) * TILE, y0 = (int)get_global_id(1) * TILE, z = (int)get_global_id(2);
+    const int x1 = min(x0 + TILE, width), y1 = min(y0 + TILE, rows);
+    for (int x = x0; x < x1; ++x) {
+        __global float *column = target + row_of(to, x, z);
+        for (int y = y0; y < y1; ++y)
+            column[y] = source[row_of(from, y, z) + x];
+    }
+}

@@ -1,0 +1,257 @@
+"""Algebra of arrays where they are: one small interface, on the device by kernels (cl/algebra.cl) and on the host by NumPy.
+
+A method is written once, over a ``Space``. Every function gives a new array, or a number; numbers are all that comes back
+from a device. Sums are deterministic: the same arrays on the same device give the same bits.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, Generic, TypeVar
+from typing import Protocol as Interface
+
+import numpy as np
+
+from phyradgs_cl.runtime.context import Runtime
+from phyradgs_cl.runtime.memory import DeviceArray
+
+A = TypeVar("A")
+Shape = tuple[int, ...]
+_CPU_SPAN = 1 << 14  # elements that a work-item sums by itself
+_GPU_GROUP, _GPU_GROUPS = 256, 512
+_ITEMS = 64  # of a work-group on a CPU, element by element
+
+
+class Space(Interface, Generic[A]):
+    """Arrays of one kind. Shapes of operands are the same unless said otherwise."""
+
+    def array(self, values: np.ndarray) -> A:
+        """Host values as an array of this space, which may share their memory."""
+        ...
+
+    def numpy(self, x: A) -> np.ndarray:
+        """The values on the host; may share memory."""
+        ...
+
+    def full(self, shape: Shape, value: float) -> A: ...
+
+    def apply(self, function: Callable[..., Any], x: A, shape: Shape) -> A:
+        """``function(x)`` of ``shape``, as operators have it: where results lie on a device it is told ``out``."""
+        ...
+
+    def take(self, x: A, chosen: Sequence[int]) -> A:
+        """Some of the entries along the first axis, in this order."""
+        ...
+
+    def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
+        """x + ``scale`` y, clipped at 0 if asked."""
+        ...
+
+    def add_product(self, x: A, y: A, z: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
+        """x + ``scale`` y z element by element, clipped at 0 if asked."""
+        ...
+
+    def multiply(self, x: A, y: A) -> A:
+        """x y element by element; y may have the last axes of x alone."""
+        ...
+
+    def reciprocal(self, x: A, share: float) -> A:
+        """1/x; below ``share`` of the largest x as at that share, and 0 where x is not above 0."""
+        ...
+
+    def inner(self, x: A, y: A) -> float:
+        """Σ x y, summed in float64 or as accurately."""
+        ...
+
+    def norm(self, x: A) -> float:
+        """√Σ x²."""
+        ...
+
+    def largest(self, x: A, *, absolute: bool = False) -> float:
+        """The largest x, or |x|."""
+        ...
+
+
+class HostSpace:
+    """NumPy's arrays, of any float type: a ``Space``, and the twin of ``DeviceSpace``."""
+
+    def array(self, values: np.ndarray) -> np.ndarray:
+        return values
+
+    def numpy(self, x: np.ndarray) -> np.ndarray:
+        return x
+
+    def full(self, shape: Shape, value: float) -> np.ndarray:
+        return np.full(shape, value, np.float32)
+
+    def apply(self, function: Callable[..., Any], x: np.ndarray, shape: Shape) -> np.ndarray:
+        result: np.ndarray = function(x)
+        return result
+
+    def take(self, x: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
+        return x[list(chosen)]
+
+    def add(
+        self, x: np.ndarray, y: np.ndarray, scale: float = 1.0, *, nonnegative: bool = False
+    ) -> np.ndarray:
+        result: np.ndarray = x + np.float32(scale) * y
+        return np.maximum(result, 0, out=result) if nonnegative else result
+
+    def add_product(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray, scale: float = 1.0, *, nonnegative: bool = False
+    ) -> np.ndarray:
+        result: np.ndarray = x + np.float32(scale) * y * z
+        return np.maximum(result, 0, out=result) if nonnegative else result
+
+    def multiply(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return x * y
+
+    def reciprocal(self, x: np.ndarray, share: float) -> np.ndarray:
+        least = share * max(self.largest(x), 0.0) or 1.0
+        return np.where(x > 0, 1 / np.maximum(x, least), 0).astype(np.float32)
+
+    def inner(self, x: np.ndarray, y: np.ndarray) -> float:
+        return inner(x, y)
+
+    def norm(self, x: np.ndarray) -> float:
+        return norm(x)
+
+    def largest(self, x: np.ndarray, *, absolute: bool = False) -> float:
+        return float((np.abs(x) if absolute else x).max(initial=-np.inf))
+
+
+class DeviceSpace:
+    """Float32 arrays of one device: a ``Space`` that reuses the memory of arrays which nobody holds any more."""
+
+    def __init__(self, rt: Runtime) -> None:
+        self.rt = rt
+        self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
+
+    @cached_property
+    def _parts(self) -> DeviceArray:
+        """What the groups of a sum come to, each of 8 bytes."""
+        return self.rt.empty(_GPU_GROUPS, np.float64)
+
+    @cached_property
+    def _whole(self) -> DeviceArray:
+        return self.rt.empty(1, np.float64)
+
+    def empty(self, shape: Shape) -> DeviceArray:
+        """Memory whose content is anything. Work on the device is done in order, so it may still be read from."""
+        unused = self._unused[int(np.prod(shape, dtype=np.int64))]
+        memory = unused.pop() if unused else self.rt.empty(shape)
+        array = DeviceArray(memory.buffer, tuple(shape), memory.dtype)
+        weakref.finalize(array, unused.append, memory)
+        return array
+
+    def array(self, values: np.ndarray) -> DeviceArray:
+        array = self.empty(values.shape)
+        self.rt.write(array, values)
+        return array
+
+    def numpy(self, x: DeviceArray) -> np.ndarray:
+        return self.rt.download(x)
+
+    def full(self, shape: Shape, value: float) -> DeviceArray:
+        array = self.empty(shape)
+        self.rt.fill(array, value)
+        return array
+
+    def apply(self, function: Callable[..., Any], x: DeviceArray, shape: Shape) -> DeviceArray:
+        result: DeviceArray = function(x, out=self.empty(shape))
+        return result
+
+    def take(self, x: DeviceArray, chosen: Sequence[int]) -> DeviceArray:
+        result = self.empty((len(chosen), *x.shape[1:]))
+        each = result.nbytes // len(chosen)
+        for k, entry in enumerate(chosen):
+            self.rt.copy(x, result, nbytes=each, source_offset=entry * each, target_offset=k * each)
+        return result
+
+    def add(
+        self, x: DeviceArray, y: DeviceArray, scale: float = 1.0, *, nonnegative: bool = False
+    ) -> DeviceArray:
+        return self._each("add_scaled", x, np.float32(scale), y, _least(nonnegative))
+
+    def add_product(
+        self, x: DeviceArray, y: DeviceArray, z: DeviceArray, scale: float = 1.0, *, nonnegative: bool = False
+    ) -> DeviceArray:
+        return self._each("add_product", x, np.float32(scale), y, z, _least(nonnegative))
+
+    def multiply(self, x: DeviceArray, y: DeviceArray) -> DeviceArray:
+        return self._each("multiply", x, y, period=y.size)
+
+    def reciprocal(self, x: DeviceArray, share: float) -> DeviceArray:
+        least = share * max(self.largest(x), 0.0) or 1.0
+        return self._each("reciprocal", x, np.float32(least))
+
+    def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
+        """x − ``step`` y/‖y‖, and x where y is 0; nothing comes back."""
+        self._sum(y, y)
+        return self._each("descend", x, y, np.float32(step), self._whole)
+
+    def inner(self, x: DeviceArray, y: DeviceArray) -> float:
+        self._sum(x, y)
+        whole = self.rt.download(self._whole)
+        return float(whole[0] if self.rt.fp64 else whole.view(np.float32).astype(np.float64).sum())
+
+    def norm(self, x: DeviceArray) -> float:
+        return self.inner(x, x) ** 0.5
+
+    def largest(self, x: DeviceArray, *, absolute: bool = False) -> float:
+        groups = self._reduce("largest_parts", x, np.int32(absolute), scratch=4)
+        return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
+
+    def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
+        """An element-wise kernel of x and others, for runs of ``period`` elements."""
+        result, count = self.empty(x.shape), period or x.size
+        items = -(-count // self.rt.lanes), x.size // max(count, 1)
+        kernel = self.rt.kernel("algebra", name)
+        self.rt.launch(
+            kernel, items, x, *others, np.int64(count), result, group=self.rt.group(_ITEMS, _GPU_GROUP)
+        )
+        return result
+
+    def _sum(self, x: DeviceArray, y: DeviceArray) -> None:
+        """Σ x y into ``_whole``, on the device alone."""
+        groups = self._reduce("dot_parts", x, y, scratch=8)
+        group = self.rt.group(1, _GPU_GROUP)
+        kernel = self.rt.kernel("algebra", "dot_whole")
+        scratch = self.rt.local(8 * group)
+        self.rt.launch(kernel, group, self._parts, np.int32(groups), scratch, self._whole, group=group)
+
+    def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
+        """The first level of a sum over the first array: how many groups have a result in ``_parts``."""
+        count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP)
+        if self.rt.pixel_items:  # neighbours side by side
+            groups = min(_GPU_GROUPS, -(-count // group))
+            first_by, step, span = 1, groups * group, count
+        else:
+            span = max(_CPU_SPAN, -(-count // _GPU_GROUPS))
+            span = -(-span // self.rt.lanes) * self.rt.lanes
+            groups, first_by, step = -(-count // span), span, self.rt.lanes
+        where = (np.int64(n) for n in (count, first_by, step, span))
+        kernel = self.rt.kernel("algebra", name)
+        local = self.rt.local(scratch * group)
+        self.rt.launch(kernel, groups * group, *arguments, *where, local, self._parts, group=group)
+        return groups
+
+
+def norm(values: np.ndarray) -> float:
+    """Euclidean norm of a host's array of any shape, summed in float64."""
+    return inner(values, values) ** 0.5
+
+
+def inner(a: np.ndarray, b: np.ndarray) -> float:
+    """Inner product of two arrays of one shape on the host, summed in float64.
+
+    Not by BLAS, whose threads wait for cores that the device is using: on two busy ones that took most of a small run.
+    """
+    return float(np.einsum("i,i->", a.ravel(), b.ravel(), dtype=np.float64))
+
+
+def _least(nonnegative: bool) -> np.float32:
+    return np.float32(0 if nonnegative else -np.inf)

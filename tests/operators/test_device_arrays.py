@@ -1,0 +1,94 @@
+"""Operators between device arrays: what they do to NumPy's, bit for bit, and nothing crosses the bus."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+from memory_limits import room_for
+from ray_tables import noise, tables
+from tolerances import BRICKS, RAYS
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import IntensityOperator, RayOperator
+
+SHAPE = (7, 37)
+TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
+UPRIGHT = Grid((12, 17, 21), (0.1, 0.1, 0.1))
+AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
+
+
+def on_device(rt, call, values: np.ndarray) -> np.ndarray:
+    """What ``call`` makes of a device array, after its second call, which moves nothing."""
+    x = rt.upload(values)
+    out = call(x)
+    before = astuple(rt.traffic)
+    found = call(x)
+    assert astuple(rt.traffic) == before
+    into = call(x, out)
+    assert into is out
+    np.testing.assert_array_equal(rt.download(out), rt.download(found))
+    np.testing.assert_array_equal(rt.download(x), values)
+    return rt.download(found)
+
+
+@AXES
+@pytest.mark.parametrize(("motion", "grid"), [("static", UPRIGHT), ("per line", TALL), ("micro-views", TALL)])
+def test_rays(any_rt, motion, grid, axis) -> None:
+    operator = RayOperator(any_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
+    for part in (operator, operator.subset([2, 0])):
+        x, y = noise(grid.shape, 31), noise(part.frames_shape, 32)
+        for name in ("forward", "intensity_gap"):
+            call = getattr(part, name)
+            np.testing.assert_array_equal(on_device(any_rt, call, x), call(x), err_msg=name)
+        np.testing.assert_array_equal(on_device(any_rt, part.adjoint, y), part.adjoint(y))
+
+
+@AXES
+def test_the_intensity_model(any_rt, axis) -> None:
+    cells = tables("per line", SHAPE, axis, frames=3)
+    host, device = (IntensityOperator(any_rt, TALL, SHAPE, cells) for _ in range(2))
+    x, d = 4 * noise(TALL.shape, 33), noise(TALL.shape, 34)
+    for chosen in ([0, 1, 2], [2, 1]):
+        on_host, there = host.subset(chosen), device.subset(chosen)
+        y = noise(there.frames_shape, 35)
+        for name, values in (("forward", d), ("expected", x), ("forward", d), ("adjoint", y)):
+            expected = getattr(on_host, name)(values)
+            found = on_device(any_rt, getattr(there, name), values)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=RAYS * np.abs(expected).max(), err_msg=name)
+
+
+@AXES
+def test_bricks(any_rt, axis) -> None:
+    """Where a volume does not fit beside its copy, device arrays are cut on the device, and come out the same."""
+    cells = tables("per line", SHAPE, axis, frames=5)
+    x, y = noise(TALL.shape, 36), noise((5, *SHAPE), 37)
+    whole, parts = (RayOperator(any_rt, TALL, SHAPE, cells) for _ in range(2))
+    expected, back = whole.forward(x), whole.adjoint(y)
+    gap = whole.intensity_gap(x)
+    volume, frames = any_rt.upload(x), any_rt.upload(y)
+    projected, summed = any_rt.empty(y.shape), any_rt.empty(x.shape)
+    with room_for(any_rt, 250_000):
+        for _ in range(2):
+            parts.forward(volume, projected)
+            assert np.abs(any_rt.download(projected) - expected).max() <= BRICKS * expected.max()
+            np.testing.assert_array_equal(any_rt.download(parts.adjoint(frames, summed)), back)
+        assert len(parts.memory.plan()) > 1
+        parts.intensity_gap(volume, projected)
+        assert np.abs(any_rt.download(projected) - gap).max() <= 2 * BRICKS * expected.max()
+
+
+def test_what_does_not_fit_is_said(rt) -> None:
+    operator = RayOperator(rt, UPRIGHT, SHAPE, tables("static", SHAPE))
+    x = rt.zeros(UPRIGHT.shape)
+    for culprit, call in {
+        "volume": lambda: operator.forward(rt.zeros((1, 2, 3))),
+        "float32": lambda: operator.forward(rt.zeros(UPRIGHT.shape, np.int32)),
+        "frames": lambda: operator.adjoint(x),
+        "shape": lambda: operator.forward(x, x),
+        "elsewhere": lambda: operator.forward(x, np.zeros(operator.frames_shape, np.float32)),
+    }.items():
+        with pytest.raises(InputError, match=culprit):
+            call()
