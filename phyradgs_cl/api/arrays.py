@@ -30,7 +30,7 @@ def given_back(rt: Runtime, values: Values) -> Any:
     return lent(values, rt.queue) if isinstance(values, DeviceArray) else values
 
 
-def placed(rt: Runtime, values: Values, there: bool) -> Values:
+def placed(rt: Runtime, values: Values, there: bool) -> Any:
     """Values on the device, if ``there``, or on the host; as they are if that is where they are."""
     if isinstance(values, DeviceArray):
         return values if there else rt.download(values)

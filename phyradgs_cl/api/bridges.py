@@ -13,15 +13,15 @@ from phyradgs_cl.errors import InputError
 
 
 def as_torch(operator: Operator) -> Callable[..., Any]:
-    """The operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])`` of some frames.
+    """The operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])`` of some.
 
-    x (domain_shape) may lie on any device and have any floating type; y (range_shape) has the same, the work is done in
-    float32 on the operator's device, and tensors of float32 on the host are read and made without a copy of the host's. Linear
-    operators can be differentiated any number of times, others once; ``backward`` renders nothing again.
+    x (domain_shape) may lie on any device and have any floating type; y (range_shape) has the same. The work is done in
+    float32 on the operator's device; tensors of float32 on the host are read and made where they are, by DLPack. Linear
+    operators can be differentiated any number of times, others once, and ``backward`` renders nothing again.
 
     Raises InputError where PyTorch is not installed, for what is no operator, and as the operator does.
     """
-    torch = checks.package("torch", "for as_torch", "torch")
+    torch: Any = checks.package("torch", "for as_torch", "torch")
     if not isinstance(operator, Operator):
         expected = "what ray_operator, splat_operator or voxel_operator gives"
         raise InputError("operator", type(operator).__name__, expected)

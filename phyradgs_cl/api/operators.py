@@ -13,17 +13,18 @@ from phyradgs_cl.api.arrays import Values, entered, given_back
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
-Map = Callable[[Values], Values]
+Map = Callable[[Any], Any]
+"""From values to values of the same place."""
 Shape = tuple[int | None, ...]
 
 
 class Operator:
     """A differentiable map between arrays of two shapes, on a device: ``y = A(x)``, and ``A.T(y)``.
 
-    domain_shape, range_shape: shapes of x and y; None stands for any length. ``A.T`` is the transpose of the derivative at
-    the x of the last call. Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays; pyopencl Arrays (float32,
-    C order, on ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its transpose and
-    its frames share their memory on the device: use them one at a time.
+    domain_shape, range_shape: shapes of x and y; None stands for any length. ``A.T`` is the transpose of the derivative
+    at the x of the last call. Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays; pyopencl Arrays
+    (float32, C order, on ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its
+    transpose and its frames share their memory on the device: use them one at a time.
 
     Raises InputError, before anything is computed, for arrays of another shape, type or device.
     """
@@ -75,7 +76,7 @@ class Operator:
 
     @property
     def T(self) -> Operator:  # noqa: N802
-        """The transpose of the derivative at the last x, from ``range_shape`` to ``domain_shape``; InputError before that."""
+        """The transpose of the derivative at the last x, ``range_shape`` to ``domain_shape``; InputError before that."""
         return Operator(self.rt, self._range, self._domain, self._at_last)
 
     def frames(self, chosen: Sequence[int]) -> Any:

@@ -77,7 +77,7 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _own(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """``function(values)`` in memory of its own: the engine's is used again once its arrays, but not their views, are gone."""
+    """``function(values)`` in memory of its own: the engine's is used again when its arrays, if not their views, are gone."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
@@ -93,8 +93,8 @@ def splat_operator(
     """The paper's projector Φ: ``Gaussians``, or their parameter rows (11, G), to frames (F, rows, columns).
 
     Rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: any model of
-    docs/methods.md that splats have. affine: R2-Gaussian's approximation. cutoff_sigma: Mahalanobis radius where a Gaussian
-    ends, 0 never. pixel_footprint: pixels average over their area. PhyRadGS, Eq. 3.
+    docs/methods.md that splats have. affine: R2-Gaussian's approximation. cutoff_sigma: Mahalanobis radius where a
+    Gaussian ends, 0 never. pixel_footprint: pixels average over their area. PhyRadGS, Eq. 3.
 
     Raises InputError for a motion that there is not.
     """
@@ -145,6 +145,7 @@ class SplatProjection(GaussianOperator):
 
     def __init__(self, engine: SplatOperator, intensity: Any, chosen: Sequence[int]) -> None:
         """Use ``splat_operator``."""
+        self._splats = engine
         super().__init__(
             engine,
             (_FRAMES, engine.frames_shape),
@@ -154,11 +155,11 @@ class SplatProjection(GaussianOperator):
 
     def of_densities(self, gaussians: Gaussians) -> LinearOperator:
         """The part that is linear: densities (G,) in 1/mm of this cloud to frames; not under ``intensity``."""
-        rt, rows = self.rt, self._entered(self._domain, gaussians)
-        if self._engine.is_layered:
+        rt, engine, rows = self.rt, self._splats, self._entered(self._domain, gaussians)
+        if engine.is_layered:
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
-        engine = DensityOperator(self._engine, self._engine.rows.enter(placed(rt, rows, True)))
-        return _densities(rt, engine, rows.shape[1], self._engine.frames_shape)
+        linear = DensityOperator(engine, engine.rows.enter(placed(rt, rows, True)))
+        return _densities(rt, linear, rows.shape[1], engine.frames_shape)
 
 
 def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: Shape) -> LinearOperator:

@@ -1,8 +1,8 @@
 """Splats as whole operators in mm and 1/mm: of a scan's frames, and of a grid, each with its derivative's transpose.
 
-A cloud is entered once (``rows.enter``), then rendered and differentiated at as often as needed; neither takes the other's place:
-``back`` sees the Gaussians again from the poses (``prepare``), which it leaves out where the last call has just done so, and
-renders nothing. Everything lies on the device, without padding.
+A cloud is entered once (``rows.enter``), then rendered and differentiated as often as needed. ``back`` renders nothing: it
+sees the Gaussians again from the poses (``prepare``), and leaves that out where the last call has just done so. Everything
+lies on the device, without padding.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 
 
 class SplatOperator:
-    """Parameter rows (11, G) to frames (F, rows, columns) of line integrals, or what a detector of intensities makes of them.
+    """Parameter rows (11, G) to frames (F, rows, columns) of line integrals, averaged as they are or by ``intensity``.
 
-    ``tables`` has the time cells of each frame in mm, all read out along one axis; ``length_mm`` is the kernels' own unit of
+    ``tables`` has the time cells of each frame in mm, all read out along one axis; ``length_mm`` is the kernels' unit of
     length, in which their float32 likes the scene to be of order 1. Subsets share all memory: use them one at a time.
     """
 
