@@ -64,7 +64,7 @@ class DeviceError(PhyradgsError):
     exit_code = 5
 
 
-class NoSuchDeviceError(DeviceError):
+class NoSuchDeviceError(InputError, DeviceError):
     """The device that was asked for is not there: as wrong an option as any other."""
 
     exit_code = 2

@@ -21,7 +21,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.io import sha256_of, write_volume
 from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import METHODS, InputOptions, Reconstruction, reconstruct
+from phyradgs_cl.reconstructors import InputOptions, Reconstruction, method_of, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
@@ -84,13 +84,13 @@ def estimate(
     started = time.perf_counter()
     trials = _Trials(scan, method, options, rt, before)
     total = getattr(options, "iterations", None)
-    if total is None or not METHODS[method].is_resumable:
+    if total is None or not method_of(method).is_resumable:
         whole_s, each_s, total = trials.run(None), 0.0, 0
     elif isinstance(options, SplatOptions):
         whole_s, each_s = _of_schedule(trials, options, *_SPLAT_TRIALS)
     else:
         whole_s, each_s = _of_alike(trials, total, *_ITERATIVE_TRIALS)
-        if whole_s <= _AS_WELL_RUN_S and METHODS[method].stops_itself(options):
+        if whole_s <= _AS_WELL_RUN_S and method_of(method).stops_itself(options):
             whole_s = trials.run(total)  # only a run tells when
     around_s = around(trials.last) if around else 0.0
     spent_s, held = time.perf_counter() - started, peak_host_bytes()

@@ -28,6 +28,13 @@ def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
     return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
 
 
+def default_grid(geometry: ConeGeometry) -> Grid:
+    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
+    side_mm = 2 * field_of_view_mm(geometry)[1]
+    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
+    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)
+
+
 def misses(grid: Grid, geometry: ConeGeometry) -> bool:
     """Whether no voxel of ``grid`` is in the field of view."""
     low_mm, high_mm = grid.box_mm.T

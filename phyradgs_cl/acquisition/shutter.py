@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 
@@ -22,6 +23,7 @@ class Shutter:
     ``axis`` says what is read out at one time; ``direction`` +1 reads index 0 first, −1 last. A readout of
     zero is a global shutter. ``pulse_s`` (start after the frame's start, length) is when the beam is on, None
     always: a line sees the part of its window that lies in the pulse, and some lines may see nothing.
+    Times are in s. Raises InputError for times below 0, other words, and a pulse that meets no frame.
     """
 
     exposure_s: float
@@ -31,10 +33,8 @@ class Shutter:
     pulse_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
-            raise InputError("exposure_s", str(self.exposure_s), "a time of at least 0 s")
-        if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
-            raise InputError("readout_s", str(self.readout_s), "a time of at least 0 s")
+        checks.at_least("exposure_s", self.exposure_s, 0)
+        checks.at_least("readout_s", self.readout_s, 0)
         if self.axis not in AXES:
             raise InputError("readout axis", repr(self.axis), "'rows' or 'columns'")
         if self.direction not in (1, -1):
@@ -42,10 +42,10 @@ class Shutter:
                 "readout direction", str(self.direction), "1 (index 0 first) or -1 (index 0 last)"
             )
         if self.pulse_s is not None:
-            self._check_pulse(*self.pulse_s)
+            self._check_pulse(*checks.numbers("pulse_s", self.pulse_s, (2,)).tolist())
 
     def _check_pulse(self, start_s: float, length_s: float) -> None:
-        if not (np.isfinite(start_s) and np.isfinite(length_s) and length_s > 0):
+        if length_s <= 0:
             found = f"start {start_s} s, length {length_s} s"
             raise InputError("pulse_s", found, "a finite start and a length above 0 s")
         if start_s >= self.span_s or start_s + length_s <= 0:

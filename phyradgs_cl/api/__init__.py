@@ -6,11 +6,29 @@
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime.
 """
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan, Static, StaticStart
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    EncoderTable,
+    Exact,
+    FrameSweeps,
+    LineMiddles,
+    MicroViews,
+    Motion,
+    PerRow,
+    PoseTable,
+    Scan,
+    Shutter,
+    SpeedRamp,
+    Static,
+    StaticStart,
+    TimeCells,
+    Trajectory,
+)
 from phyradgs_cl.api.bridges import as_torch
 from phyradgs_cl.api.operators import LinearOperator, Operator
 from phyradgs_cl.api.projectors import (
-    SplatProjection,
     initial_gaussians,
     ray_operator,
     splat_operator,
@@ -18,27 +36,43 @@ from phyradgs_cl.api.projectors import (
     voxelise,
 )
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
+from phyradgs_cl.api.scans import fly_scan, static_scan
+from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import Reconstruction
+from phyradgs_cl.reconstructors import Interrupted, Progress, Reconstruction
 
 __all__ = [
+    "CircularOrbit",
+    "ConeGeometry",
+    "ConstantSpeed",
+    "EncoderTable",
     "Exact",
+    "FrameSweeps",
     "Gaussians",
     "Grid",
+    "InputError",
+    "Interrupted",
     "LineMiddles",
     "LinearOperator",
     "MicroViews",
     "Motion",
     "Operator",
     "PerRow",
+    "PhyradgsError",
+    "PoseTable",
+    "Progress",
     "Reconstruction",
     "Scan",
-    "SplatProjection",
+    "Shutter",
+    "SpeedRamp",
     "Static",
     "StaticStart",
+    "TimeCells",
+    "Trajectory",
     "as_torch",
     "compare",
+    "fly_scan",
     "initial_gaussians",
     "load_scan",
     "load_volume",
@@ -48,6 +82,7 @@ __all__ = [
     "save_volume",
     "simulate",
     "splat_operator",
+    "static_scan",
     "voxel_operator",
     "voxelise",
 ]

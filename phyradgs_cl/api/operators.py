@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import LinearOperator as ScipyOperator
 
-from phyradgs_cl.api.arrays import Values, entered, given_back
+from phyradgs_cl import checks
+from phyradgs_cl.api.arrays import Values, entered, given_back, on_host
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
@@ -26,6 +27,10 @@ class Operator:
     (float32, C order, on ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its
     transpose and its frames share their memory on the device: use them one at a time.
 
+    Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. One of your own has a Runtime rt, domain
+    and range_ as (name, shape), at: x to (y, function from dL/dy to dL/dx), and, if it has them, what makes the operators
+    of some frames and of intensity.
+
     Raises InputError, before anything is computed, for arrays of another shape, type or device.
     """
 
@@ -39,7 +44,6 @@ class Operator:
         frames: Callable[[list[int]], Any] | None = None,
         intensity: Callable[[], Operator] | None = None,
     ) -> None:
-        """Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``."""
         self.rt = rt
         self._domain, self._range = domain, range_
         self._at, self._frames, self._intensity = at, frames, intensity
@@ -62,7 +66,7 @@ class Operator:
 
     def to_device(self, values: Any) -> Any:
         """An array of any shape as a pyopencl Array, float32, on ``queue``: what loops on the device begin with."""
-        return given_back(self.rt, self.rt.upload(np.asarray(values, np.float32)))
+        return given_back(self.rt, self.rt.upload(on_host("values", values)))
 
     def __call__(self, x: Any) -> Any:
         """y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
@@ -86,9 +90,11 @@ class Operator:
         """
         if self._frames is None:
             raise InputError("frames", repr(self), "an operator from something to frames")
-        count, numbers = self._range[1][0], list(chosen)
-        if not numbers or not all(isinstance(f, int | np.integer) and 0 <= f < (count or 0) for f in numbers):
-            raise InputError("frames", str(numbers), f"at least one whole number from 0 to {(count or 0) - 1}")
+        count = self._range[1][0]
+        numbers = list(chosen) if isinstance(chosen, Sequence | np.ndarray) else chosen
+        known = isinstance(numbers, list) and all(isinstance(f, int | np.integer) and 0 <= f < (count or 0) for f in numbers)
+        if not known or not numbers:
+            raise InputError("frames", checks.shown(numbers), f"at least one whole number from 0 to {(count or 0) - 1}")
         return self._frames([int(f) for f in numbers])
 
     @cached_property
@@ -122,6 +128,9 @@ class LinearOperator(Operator, ScipyOperator):
 
     ``A.T`` is the exact transpose, at any time. For SciPy, ``A.shape`` is (size of y, size of x), vectors are flat, float32,
     C order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
+
+    rt, domain, range_, parts: as of ``Operator``; forward and adjoint: the two functions, from values to values. Raises
+    InputError as it does.
     """
 
     def __init__(
@@ -133,7 +142,6 @@ class LinearOperator(Operator, ScipyOperator):
         adjoint: Map,
         **parts: Any,
     ) -> None:
-        """Operators come from ``ray_operator``, and from ``of_densities`` of a ``splat_operator``."""
         Operator.__init__(self, rt, domain, range_, lambda x: (forward(x), adjoint), **parts)
         ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
         self._pair = forward, adjoint

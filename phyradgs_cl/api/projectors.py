@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.motion import motion_of
+from phyradgs_cl.acquisition import Exact, Motion, Scan
+from phyradgs_cl.acquisition.motion import STILL, check_motion, check_own_motion, motion_of
 from phyradgs_cl.api.arrays import Values, computed, placed
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
+from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import QUATERNION, ROWS, SCALE
@@ -39,14 +40,16 @@ _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 def ray_operator(
     scan: Scan, motion: str | Motion = "per-row", *, grid: Grid | None = None, device: Device = None
 ) -> LinearOperator:
-    """Joseph's projector of a scan and its exact transpose: volumes (nz, ny, nx) 1/mm to frames (F, rows, columns).
+    """Joseph's projector of a scan and its exact transpose: volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns).
 
-    motion: how frames see the moving gantry (docs/methods.md, but ``exact``). grid: the scan's own when None. ``intensity``
-    is for detectors that average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
+    motion: how frames see the moving gantry (docs/methods.md, but ``exact``), or a model of your own. grid: the voxels,
+    the scan's own when None. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors
+    that average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
-    Raises InputError for a motion that there is not, or that moves within a cell.
+    Raises InputError for what is no Scan or Grid, and for a motion that there is not or that moves within a cell.
     """
-    rt, model, voxels = runtime_of(device), motion_of(motion), grid or scan.grid
+    model, voxels = _checked(scan, motion, STILL), scan.grid if grid is None else _a_grid(grid)
+    rt = runtime_of(device)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
     return _rays(RayOperator(rt, voxels, scan.geometry.detector_shape, tables))
 
@@ -77,7 +80,7 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _own(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """``function(values)`` in memory of its own: the engine's is used again when its arrays, if not their views, are gone."""
+    """``function(values)`` in its own memory: the engine's is used again when its arrays, if not their views, are gone."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
@@ -90,16 +93,18 @@ def splat_operator(
     pixel_footprint: bool = False,
     device: Device = None,
 ) -> SplatProjection:
-    """The paper's projector Φ: ``Gaussians``, or their parameter rows (11, G), to frames (F, rows, columns).
+    """The paper's projector Φ of a scan: ``Gaussians``, or their parameter rows (11, G), to frames (F, rows, columns).
 
     Rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: any model of
     docs/methods.md that splats have. affine: R2-Gaussian's approximation. cutoff_sigma: Mahalanobis radius where a
-    Gaussian ends, 0 never. pixel_footprint: pixels average over their area. PhyRadGS, Eq. 3.
+    Gaussian ends, 0 never. pixel_footprint: pixels average over their area. device: what ``--device`` takes, or a
+    Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames. PhyRadGS, Eq. 3.
 
-    Raises InputError for a motion that there is not.
+    Raises InputError for what is no Scan, for a motion that there is not, and a cutoff out of range.
     """
-    checks.within("cutoff_sigma (0 cuts nothing off)", cutoff_sigma, 0, 100)
-    rt, model = runtime_of(device), motion_of(motion)
+    model = _checked(scan, motion, (*STILL, Exact()))
+    _check_cutoff(cutoff_sigma)
+    rt = runtime_of(device)
 
     def engine(detector: str, chosen: Sequence[int]) -> SplatOperator:
         tables, merges = tables_of(scan, model, detector)
@@ -176,12 +181,13 @@ def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: S
 def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
     """Gaussians, or parameter rows (11, G) as ``splat_operator`` takes them, to a volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    The field is evaluated at the voxels' centres, and the device holds all of them. cutoff_sigma: as there.
+    The field is evaluated at the voxels' centres in mm, and the device holds all of them. cutoff_sigma, device: as there.
 
-    Raises InputError for a cutoff out of range.
+    Raises InputError for what is no Grid, and a cutoff out of range.
     """
-    checks.within("cutoff_sigma (0 cuts nothing off)", cutoff_sigma, 0, 100)
-    return GaussianOperator(VoxelOperator(runtime_of(device), grid, cutoff_sigma=cutoff_sigma), (_VOLUME, grid.shape))
+    _check_cutoff(cutoff_sigma)
+    engine = VoxelOperator(runtime_of(device), _a_grid(grid), cutoff_sigma=cutoff_sigma)
+    return GaussianOperator(engine, (_VOLUME, grid.shape))
 
 
 def voxelise(
@@ -189,15 +195,15 @@ def voxelise(
 ) -> np.ndarray:
     """The field of a cloud at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
 
-    Of grids of any size: the device holds a brick at a time. ``voxel_operator`` has the gradient. cutoff_sigma: Mahalanobis
-    radius where a Gaussian ends, 0 never.
+    gaussians: in mm and 1/mm. grid: of any size, the device holds a brick at a time; ``voxel_operator`` has the gradient.
+    cutoff_sigma: Mahalanobis radius where a Gaussian ends, 0 never. device: what ``--device`` takes, or a Runtime.
 
-    Raises InputError for what is no cloud, or a cutoff out of range.
+    Raises InputError for what is no cloud or Grid, and a cutoff out of range.
     """
-    checks.within("cutoff_sigma (0 cuts nothing off)", cutoff_sigma, 0, 100)
+    _check_cutoff(cutoff_sigma)
+    length_mm = _a_grid(grid).half_longest_mm  # the kernels' float32 likes lengths of order 1
     if not isinstance(gaussians, Gaussians):
         raise InputError("gaussians", type(gaussians).__name__, "Gaussians", "of rows (11, G): Gaussians.from_rows(rows)")
-    length_mm = grid.half_longest_mm  # the kernels' float32 likes lengths of order 1
     rows = gaussians.scaled(1 / length_mm, 1.0).rows()
     return voxelise_rows(runtime_of(device), rows, grid.scaled(1 / length_mm), cutoff_sigma=cutoff_sigma)
 
@@ -205,14 +211,36 @@ def voxelise(
 def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Device = None) -> Gaussians:
     """The cloud in mm and 1/mm with which ``phyradgs`` begins: ``count`` Gaussians drawn from an FDK volume.
 
-    count: 0 chooses it from the scan's grid; fewer come back where too few voxels attenuate. seed: of the draw.
+    count: 0 chooses it from the scan's grid; fewer come back where too few voxels attenuate. seed: of the draw. The
+    result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
 
-    Raises InputError for a count that is negative.
+    Raises InputError for what is no Scan, and a count or a seed below 0.
     """
+    check_scan(scan)
+    checks.whole("seed", seed, 0, 2**63)
     options = SplatOptions(gaussians=count)
     scale, population, _ = first_cloud(runtime_of(device), scan, options, seed)
     rows = options.activation(scan.grid.scaled(1 / scale.length_mm)).apply(population.raw.astype(np.float64))
     return Gaussians.from_rows(rows).scaled(scale.length_mm, scale.density_per_mm)
+
+
+def _checked(scan: Scan, motion: str | Motion, taken: tuple[Motion, ...]) -> Motion:
+    """The model of a motion that fits the scan."""
+    check_scan(scan)
+    model = motion_of(motion)
+    check_motion(model, taken)
+    check_own_motion(model, scan)
+    return model
+
+
+def _a_grid(grid: Grid) -> Grid:
+    if not isinstance(grid, Grid):
+        raise InputError("grid", checks.shown(grid), "a Grid")
+    return grid
+
+
+def _check_cutoff(cutoff_sigma: float) -> None:
+    checks.within("cutoff_sigma (0 cuts nothing off)", cutoff_sigma, 0, 100)
 
 
 def _check_rows(rows: np.ndarray) -> None:

@@ -15,7 +15,6 @@ from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import numbers, pair_parser
 
 LARGEST_MM = 1e6
-MethodName = Literal[tuple(METHODS)]  # type: ignore[valid-type]
 MotionName = Literal["static", "static-start", "micro-views", "per-row", "exact"]
 Axis = Literal[AXES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
@@ -99,11 +98,12 @@ RoiMm = Annotated[
 
 # what a reconstruction is asked for; commands that speak of one share these words
 Method = Annotated[
-    MethodName | None,  # type: ignore[valid-type]
+    str | None,
     typer.Option(
-        case_sensitive=False,
+        metavar=f"{'|'.join(METHODS)}|MODULE:NAME",
         help="phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
-        "naf, sax-nerf: neural fields; the others are iterative on voxels.",
+        "naf, sax-nerf: neural fields; MODULE:NAME: a function of your own (docs: api.md); "
+        "the others are iterative on voxels.",
         show_default="phyradgs",
     ),
 ]

@@ -1,5 +1,6 @@
 """Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
 
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.io.checkpoint import (
     checkpoint_path,
     former_checkpoint_path,
@@ -8,7 +9,6 @@ from phyradgs_cl.io.checkpoint import (
     write_checkpoint,
 )
 from phyradgs_cl.io.hashing import hashing, sha256_of
-from phyradgs_cl.io.hdf5.grid import default_grid
 from phyradgs_cl.io.lock import only_run
 from phyradgs_cl.io.output import check_writable, written_beside
 from phyradgs_cl.io.scan.reader import ToAttenuation, read_scan, scan_summary

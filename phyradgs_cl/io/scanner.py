@@ -8,12 +8,12 @@ from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
-from phyradgs_cl.io.hdf5.grid import default_grid
 from phyradgs_cl.io.hdf5.units import LENGTH
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.text import near_miss

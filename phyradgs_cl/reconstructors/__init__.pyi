@@ -1,10 +1,13 @@
+from .method import Method as Method
 from .preprocess import InputOptions as InputOptions
 from .registry import METHODS as METHODS
-from .registry import Method as Method
 from .registry import input_options as input_options
 from .registry import method_name as method_name
+from .registry import method_of as method_of
 from .registry import method_options as method_options
 from .registry import reconstruct as reconstruct
+from .registry import usual_preset as usual_preset
+from .result import Interrupted as Interrupted
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
 from .result import Reconstruction as Reconstruction

@@ -12,11 +12,12 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.reconstructors.frame_pairs import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, element, joined, raw_text
 from phyradgs_cl.report.pictures.png import base64_of
-from phyradgs_cl.report.pictures.projections import View, computed_views
+from phyradgs_cl.report.pictures.projections import computed_views
 from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 
@@ -59,7 +60,7 @@ def write_report(
     return run
 
 
-def report_page(run: Run, views: Sequence[View] = ()) -> str:
+def report_page(run: Run, views: Sequence[FramePair] = ()) -> str:
     """The page as text; ``views`` as from ``computed_views``."""
     parts = {
         "slices": sections.slices_section(run),

@@ -8,13 +8,13 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow
 from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.reconstructors.frame_pairs import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report.charts.curve import convergence_charts
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
 from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
-from phyradgs_cl.report.pictures.projections import TIMES_PER_LINE, View
 from phyradgs_cl.report.pictures.slices import planes_of, windows_of
 from phyradgs_cl.report.pictures.viewer import viewer
 from phyradgs_cl.report.run import Run
@@ -34,7 +34,7 @@ def slices_section(run: Run) -> Markup:
     return _section("slices", "Slices", element("p", told + ".", class_="note"), viewer(planes, windows))
 
 
-def metrics_section(run: Run, views: Sequence[View]) -> Markup | None:
+def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
     """Numbers against the truth, and against the measurement where frames were computed."""
     facts: dict[str, object] = dict(run.metrics)
     if run.reference is not None:
@@ -91,7 +91,7 @@ def shutter_section(run: Run) -> Markup | None:
     return _section("shutter", "Shutter in space and time", _charts(charts))
 
 
-def projections_section(run: Run, views: Sequence[View]) -> Markup | None:
+def projections_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
     """Measured, computed and residual frames; one range of grey values for all, one of residuals."""
     if not views or run.scan is None:
         return None
@@ -132,7 +132,7 @@ def facts_table(facts: Mapping[str, object]) -> Markup:
     return element("table", element("tbody", *lines))
 
 
-def _view(view: View, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
+def _view(view: FramePair, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
     residual = png_bytes(top_row_first(bytes_of(view.residual, -limit, limit)), diverging())
     pictures = [
         ("measured", png_bytes(top_row_first(bytes_of(view.measured, *window)))),

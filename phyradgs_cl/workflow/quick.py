@@ -7,7 +7,7 @@ from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import OutputError
-from phyradgs_cl.reconstructors import METHODS
+from phyradgs_cl.reconstructors import usual_preset
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import scanner_for, scanner_options
 from phyradgs_cl.workflow.simulate import SimulationJob, run_simulation
@@ -37,7 +37,7 @@ def quick_grid(
     settings = []
     for method, motion in _ROWS:
         splats = {"iterations": iterations} if method in ("r2", "phyradgs") else {}
-        settings.append(Setting(method, next(iter(METHODS[method].presets)), {**motion, **splats}, {}))
+        settings.append(Setting(method, usual_preset(method), {**motion, **splats}, {}))
     scans = {name: folder / "scans" / f"{name}_seed{seed}.h5" for name in PHANTOMS}
     missing = [name for name, path in scans.items() if not path.exists()]
     if missing:

@@ -39,6 +39,7 @@ from phyradgs_cl.reconstructors import (
     ProgressReport,
     Reconstruction,
     State,
+    method_of,
     method_options,
     reconstruct,
 )
@@ -57,7 +58,7 @@ _FOREIGN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".npy", ".npz", ".tif", 
 
 @dataclass(frozen=True)
 class ReconstructionJob:
-    """Which scan to reconstruct by which method, a name of METHODS, into which file."""
+    """Which scan to reconstruct by which method, as from ``method_name``, into which file."""
 
     scan: Path
     output: Path
@@ -185,7 +186,7 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     """Says what can be reconstructed, but is hardly what was meant."""
-    motion = options.motion
+    motion = getattr(options, "motion", None)
     if (
         scan.detector_model == "intensity"
         and not hasattr(options, "detector_model")
@@ -213,6 +214,8 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
 
 def _averages(scan: Scan, options: Any) -> bool:
     """Whether the method merges several poses into a line: of one pose, both detector models are the same."""
+    if not hasattr(options, "motion"):
+        return False
     cells = options.motion.cells(scan, 0)
     return cells.is_moving or cells.averages
 
@@ -263,8 +266,8 @@ def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
 
 
 def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
-    resumable = [name for name, method in METHODS.items() if method.is_resumable]
-    if job.method not in resumable:
+    if not method_of(job.method).is_resumable:
+        resumable = [name for name, method in METHODS.items() if method.is_resumable]
         raise InputError(
             "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(resumable)}"
         )

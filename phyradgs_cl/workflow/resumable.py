@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path
-from phyradgs_cl.reconstructors import METHODS, ProgressReport, Reconstruction
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, method_of
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob, run_reconstruction
 
@@ -17,7 +17,7 @@ def go_on(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """As ``run_reconstruction``; a checkpoint of another scan or other options, or a damaged one, is set aside."""
     checkpoint = checkpoint_path(job.output)
-    if checkpoint.is_file() and METHODS[job.method].is_resumable:
+    if checkpoint.is_file() and method_of(job.method).is_resumable:
         try:
             return run_reconstruction(replace(job, resume=True), make_runtime, report)
         except InputError as error:

@@ -15,7 +15,6 @@ from scipy.sparse.linalg import cg, lsqr
 from tolerances import FINITE_DIFFERENCE_STEP, FLOAT32, GRADIENT
 
 from phyradgs_cl.api import (
-    Exact,
     Gaussians,
     MicroViews,
     Operator,
@@ -268,60 +267,6 @@ def test_an_empty_cloud_makes_empty_frames(rt, scan) -> None:
     nothing = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))
     splats = splat_operator(scan, device=rt)
     assert not splats(nothing).any() and splats.T(np.ones(splats.range_shape)).shape == (11, 0)
-
-
-def _elsewhere(operator: Operator) -> pyopencl.array.Array:
-    queue = pyopencl.CommandQueue(pyopencl.Context([operator.rt.device.handle]))
-    return pyopencl.array.zeros(queue, operator.domain_shape, np.float32)
-
-
-def _otherwise(operator: Operator) -> pyopencl.array.Array:
-    queue = pyopencl.CommandQueue(operator.queue.context)
-    return pyopencl.array.zeros(queue, operator.domain_shape, np.float32)
-
-
-FLAT = np.zeros((11, 2))
-BAD = {
-    "motion within cells": (lambda scan, rays, splats: ray_operator(scan, "exact"), "still cells"),
-    "no such motion": (lambda scan, rays, splats: splat_operator(scan, "quick"), "motion.*micro-views"),
-    "cutoff": (lambda scan, rays, splats: splat_operator(scan, cutoff_sigma=-1), "cutoff_sigma"),
-    "cutoff of voxels": (lambda scan, rays, splats: voxel_operator(scan.grid, cutoff_sigma=-1), "cutoff_sigma"),
-    "rows for a cloud": (lambda scan, rays, splats: voxelise(FLAT, scan.grid), "gaussians.*from_rows"),
-    "negative count": (lambda scan, rays, splats: initial_gaussians(scan, -1), "gaussians"),
-    "shape": (lambda scan, rays, splats: rays(np.zeros(3)), r"volume.*\(3,\).*\(12, 12, 12\)"),
-    "shape of frames": (lambda scan, rays, splats: rays.T(np.zeros((1, 2, 3))), r"frames.*\(6, 20, 20\)"),
-    "rows": (lambda scan, rays, splats: splats(np.zeros((10, 3))), r"rows.*\(11, any\)"),
-    "flat Gaussians": (lambda scan, rays, splats: splats(FLAT), "rows.*scale"),
-    "NaN": (lambda scan, rays, splats: splats(FLAT * np.nan), "rows.*NaN"),
-    "words": (lambda scan, rays, splats: rays("volume"), "volume.*real numbers"),
-    "complex": (lambda scan, rays, splats: rays(np.zeros(rays.domain_shape, complex)), "volume.*complex"),
-    "number of a frame": (lambda scan, rays, splats: rays.frames([6]), r"frames.*\[6\].*0 to 5"),
-    "no frame": (lambda scan, rays, splats: splats.frames([]), "frames"),
-    "frames of a transpose": (lambda scan, rays, splats: rays.T.frames([0]), "frames"),
-    "intensity of intensity": (lambda scan, rays, splats: rays.intensity.intensity, "intensity"),
-    "densities of it": (
-        lambda scan, rays, splats: splats.intensity.of_densities(Gaussians.from_rows(FLAT + 1)),
-        "of_densities.*linear",
-    ),
-    "no point yet": (lambda scan, rays, splats: splats.frames([1]).T(np.zeros((1, 20, 20))), "call the operator first"),
-    "another context": (lambda scan, rays, splats: rays(_elsewhere(rays)), "volume.*another OpenCL context.*to_device"),
-    "another queue": (lambda scan, rays, splats: rays(_otherwise(rays)), "volume.*another queue"),
-    "float64 there": (lambda scan, rays, splats: rays(rays.to_device(0).astype(float)), "volume.*float64"),
-    "order there": (
-        lambda scan, rays, splats: rays(rays.to_device(np.zeros(rays.domain_shape)).transpose((2, 1, 0))),
-        "volume.*C order",
-    ),
-    "no operator": (lambda scan, rays, splats: as_torch(scan), "operator.*Scan"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_what_does_not_fit_is_named(rt, scan, case, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch", sys)  # what asks for it has a look at the operator first
-    call, words = BAD[case]
-    with pytest.raises(InputError, match=words) as caught:
-        call(scan, ray_operator(scan, device=rt), splat_operator(scan, Exact(), device=rt))
-    assert "\n" not in str(caught.value)
 
 
 def test_without_pytorch_its_installation_is_named(rt, scan, monkeypatch) -> None:

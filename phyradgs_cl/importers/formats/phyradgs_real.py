@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
+from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
+from phyradgs_cl.importers.formats.moving_poses import turn_of
 from phyradgs_cl.importers.formats.phyradgs_synthetic import (
     exposure_of_blurred_s,
     readout_ratio,

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
+from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.formats.moving_poses import Turned, plain_geometry, table_over_time, turn_of
+from phyradgs_cl.importers.formats.moving_poses import Turned, table_over_time, turn_of
 from phyradgs_cl.importers.formats.rtk_xml import RtkGeometry, read_rtk_xml
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.folder import SafeFolder

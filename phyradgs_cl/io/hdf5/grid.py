@@ -6,8 +6,6 @@ import math
 
 import h5py
 
-from phyradgs_cl.acquisition import ConeGeometry
-from phyradgs_cl.acquisition.field_of_view import field_of_view_mm
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
@@ -40,10 +38,3 @@ def write_grid(parent: h5py.Group, grid: Grid) -> None:
     write_number(group, "shape", grid.shape)
     write_number(group, "voxel_size", grid.voxel_size_mm, "mm")
     write_number(group, "offset", grid.offset_mm, "mm")
-
-
-def default_grid(geometry: ConeGeometry) -> Grid:
-    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
-    side_mm = 2 * field_of_view_mm(geometry)[1]
-    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
-    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)

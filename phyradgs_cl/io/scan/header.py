@@ -10,12 +10,13 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.facts import read_facts
-from phyradgs_cl.io.hdf5.grid import default_grid, read_grid
+from phyradgs_cl.io.hdf5.grid import read_grid
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.detector import (

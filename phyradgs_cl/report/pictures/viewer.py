@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from phyradgs_cl.drawing import round_length
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.markup import Markup, element, joined, json_block
 from phyradgs_cl.report.pictures.png import base64_of, data_uri, diverging
@@ -85,15 +86,9 @@ def _picture(plane: Plane, name: str) -> Markup:
     sheet = element("div", image, element("canvas", aria_hidden="true"), class_="sheet")
     ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
     marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
-    bar_mm = _round_length(_BAR * width_mm)
+    bar_mm = round_length(_BAR * width_mm)
     bar = element("span", f"{number(bar_mm)} mm", class_="bar", style=f"width: {100 * bar_mm / width_mm:.6g}%")
     return element("div", sheet, *lines, *marks, bar, class_="picture")
-
-
-def _round_length(most: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten up to ``most``."""
-    power = 10.0 ** math.floor(math.log10(most))
-    return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))
 
 
 def _place(plane: Plane, k: int) -> str:

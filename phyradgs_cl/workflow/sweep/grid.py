@@ -15,7 +15,7 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
-from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_name, method_options
+from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options, usual_preset
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
@@ -50,7 +50,7 @@ class Setting:
     @property
     def label(self) -> str:
         """The setting in a line: the preset where it is not the method's first, options with dotted names."""
-        usual = next(iter(METHODS[self.method].presets))
+        usual = usual_preset(self.method)
         named = [] if self.preset == usual else [f"preset={self.preset}"]
         named += [f"{name}={_shown(value)}" for name, value in flat({**self.before, **self.changes})]
         return " ".join([self.method, *named])
@@ -214,4 +214,4 @@ def _checked(values: dict[str, Any]) -> Setting:
 
 
 def _preset(method: str, preset: str | None) -> str:
-    return next(iter(METHODS[method].presets)) if preset is None else preset
+    return usual_preset(method) if preset is None else preset
