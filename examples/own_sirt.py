@@ -1,10 +1,10 @@
-"""SIRT of one's own, on arrays of the device: python own_sirt.py scan.h5 volume.h5 [iterations]"""
+"""SIRT of one's own, on arrays of the device: python examples/own_sirt.py [scan.h5 [iterations]]"""
 
 import sys
 
 import numpy as np
 
-from phyradgs_cl.api import Reconstruction, compare, load_scan, ray_operator, save_volume
+from phyradgs_cl.api import Reconstruction, compare, load_scan, ray_operator, save_volume, simulate
 
 
 def sirt(A, frames, iterations):
@@ -19,9 +19,9 @@ def sirt(A, frames, iterations):
 
 
 if __name__ == "__main__":
-    scan = load_scan(sys.argv[1])
-    iterations = int(sys.argv[3]) if len(sys.argv) > 3 else 50
+    scan = load_scan(sys.argv[1]) if len(sys.argv) > 1 else simulate("foot", size=32, detector=48)
+    iterations = int(sys.argv[2]) if len(sys.argv) > 2 else 50
     volume = sirt(ray_operator(scan, "per-row"), scan.projections, iterations)
     if scan.reference is not None:
         print(f"PSNR {compare(volume, scan.reference)['psnr_db']:.2f} dB")
-    save_volume(sys.argv[2], Reconstruction(volume, scan.grid))
+    save_volume("own_sirt.h5", Reconstruction(volume, scan.grid))

@@ -1,11 +1,11 @@
-"""Gaussians trained on a fly-scan by a loop of one's own, in PyTorch: python train_own.py scan.h5 volume.h5 [steps]"""
+"""Gaussians trained on a fly-scan by a loop of one's own, in PyTorch: python examples/train_own.py [scan.h5 [steps]]"""
 
 import sys
 
 import numpy as np
 import torch
 
-from phyradgs_cl import api
+import phyradgs_cl.api as api
 
 
 def train(scan, steps, smoothness=0.02, seed=0):
@@ -40,9 +40,9 @@ def train(scan, steps, smoothness=0.02, seed=0):
 
 
 if __name__ == "__main__":
-    scan = api.load_scan(sys.argv[1])
-    cloud = train(scan, int(sys.argv[3]) if len(sys.argv) > 3 else 2000)
-    result = api.Reconstruction(api.voxelise(cloud, scan.grid), scan.grid, cloud)
+    scan = api.load_scan(sys.argv[1]) if len(sys.argv) > 1 else api.simulate("foot", size=24, detector=32, noise="tigre")
+    cloud = train(scan, int(sys.argv[2]) if len(sys.argv) > 2 else 300)
+    volume = api.voxelise(cloud, scan.grid)
     if scan.reference is not None:
-        print(f"PSNR {api.compare(result.volume, scan.reference)['psnr_db']:.2f} dB")
-    api.save_volume(sys.argv[2], result)
+        print(f"PSNR {api.compare(volume, scan.reference)['psnr_db']:.2f} dB from {cloud.count} Gaussians")
+    api.save_volume("train_own.h5", api.Reconstruction(volume, scan.grid, cloud))

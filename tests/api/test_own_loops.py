@@ -59,14 +59,14 @@ def test_a_loop_over_arrays_of_the_device_moves_scalars_alone(rt: Runtime, scan:
 
 
 @pytest.mark.parametrize("example", ["own_sirt", "train_own"])
-def test_an_example_runs_as_it_stands(rt: Runtime, scan: Scan, tmp_path: Path, monkeypatch, capsys, example) -> None:
+def test_an_example_comes_near_the_method(rt: Runtime, scan: Scan, tmp_path: Path, monkeypatch, capsys, example) -> None:
     if example == "train_own" and not importlib.util.find_spec("torch"):
         return
-    assert len((EXAMPLES / f"{example}.py").read_text(encoding="utf-8").splitlines()) <= 60
-    save_scan(tmp_path / "scan.h5", scan)
-    monkeypatch.setattr(sys, "argv", ["", str(tmp_path / "scan.h5"), str(tmp_path / "volume.h5"), "30"])
+    monkeypatch.chdir(tmp_path)
+    save_scan("scan.h5", scan)
+    monkeypatch.setattr(sys, "argv", ["", "scan.h5", "30"])
     runpy.run_path(str(EXAMPLES / f"{example}.py"), run_name="__main__")
-    volume = load_volume(tmp_path / "volume.h5").volume
+    volume = load_volume(f"{example}.h5").volume
     found = compare(volume, scan.reference)["psnr_db"]
     assert f"PSNR {found:.2f} dB" in capsys.readouterr().out
     method = {"own_sirt": "sirt", "train_own": "phyradgs"}[example]
