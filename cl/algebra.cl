@@ -33,7 +33,7 @@ __kernel void add_scaled(
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;
     if (rest > 0)
-        store_some(fmax(fma((vf)(scale), load_some(y + at, rest), load_some(x + at, rest)), (vf)(least)), result + at, rest);
+        store_some(fmax(load_some(x + at, rest) + scale * load_some(y + at, rest), (vf)(least)), result + at, rest);
 }
 
 /* x + scale y z, at least `least` */
@@ -80,9 +80,9 @@ static inline sum_t sum_of_lanes(vwide a)
 }
 static inline vwide plus_product(const vwide a, const vf x, const vf y) { return a + V_WIDE(x) * V_WIDE(y); }
 static inline vwide wide_zero(void) { return (vwide)(0.0); }
-static inline float share_of(const float step, const sum_t squares)
+static inline float share_of(const float2 step, const sum_t squares)
 {
-    return squares > 0.0 ? (float)(step / sqrt(squares)) : 0.0f;
+    return squares > 0.0 ? (float)(((double)step.x + step.y) / sqrt(squares)) : 0.0f;
 }
 #else
 typedef float2 sum_t; /* high, low */
@@ -113,9 +113,9 @@ static inline vwide wide_zero(void)
     a.high = a.low = (vf)(0.0f);
     return a;
 }
-static inline float share_of(const float step, const sum_t squares)
+static inline float share_of(const float2 step, const sum_t squares)
 {
-    return squares.x > 0.0f ? step / sqrt(squares.x + squares.y) : 0.0f;
+    return squares.x > 0.0f ? step.x / sqrt(squares.x + squares.y) : 0.0f;
 }
 #endif
 
@@ -173,9 +173,9 @@ __kernel void largest_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* x − y step/√squares: a step of fixed length down y, whose sum of squares is on the device; none where y is 0 */
+/* x − y step/√squares: a step of fixed length (high, low) down y, whose sum of squares is on the device; none if y is 0 */
 __kernel void descend(
-    __global const float *x, __global const float *y, const float step, __global const sum_t *squares, const long count,
+    __global const float *x, __global const float *y, const float2 step, __global const sum_t *squares, const long count,
     __global float *result)
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;

@@ -129,3 +129,8 @@ CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum
 RANK_GRADIENT = 1e-6
 # Voxel methods on several ranks, which add up their own frames first; measured up to 7e-7 after 8 iterations.
 RANK_VOLUME = 1e-5
+
+# --- voxel methods on the device -------------------------------------------------------------------------------
+# relative L2 to the same lines over NumPy's arrays: rounding of single operations (1e-7), which steps of a fixed length
+# down a gradient of unit vectors do not damp
+RESIDENT = dict.fromkeys(("sart", "os-sart", "sirt", "cgls", "fista-tv"), 1e-6) | {"asd-pocs": 2e-4}

@@ -5,9 +5,12 @@ Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777; backward differences and their f
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import cast
+
 import numpy as np
 
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Runtime, SameArray
 
 _SMALLEST = 1e-8
 
@@ -20,32 +23,33 @@ class TvDescent:
         nz, ny, nx = shape
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._kernel = rt.kernel("tv_descent", "tv_gradient")
-        self._volume, self._gradient = rt.empty(shape), rt.empty(shape)
+        self._space = DeviceSpace(rt)
 
-    def gradient(self, volume: np.ndarray) -> np.ndarray:
-        """dTV/dvolume (z, y, x) float32."""
+    def gradient(self, volume: SameArray) -> SameArray:
+        """dTV/dvolume (z, y, x) float32, on the device where the volume is."""
+        return self._where_it_is(self._gradient, volume)
+
+    def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
+        """``count`` steps of Euclidean length ``step`` (1/mm) downhill; of a device array on the device alone."""
+
+        def descended(x: DeviceArray) -> DeviceArray:
+            for _ in range(count):
+                x = self._space.descend(x, self._gradient(x), step)
+            return x
+
+        return self._where_it_is(descended, volume)
+
+    def _gradient(self, volume: DeviceArray) -> DeviceArray:
         nz, ny, nx = self.shape
-        self.rt.write(self._volume, volume)
-        self.rt.launch(
-            self._kernel,
-            (nx, ny, nz),
-            self._volume,
-            self._shape4,
-            self._gradient,
-            group=self.rt.group(on_cpu=16),
-        )
-        return self.rt.download(self._gradient)
+        gradient = self._space.empty(self.shape)
+        items, group = (nx, ny, nz), self.rt.group(on_cpu=16)
+        self.rt.launch(self._kernel, items, volume, self._shape4, gradient, group=group)
+        return gradient
 
-    def __call__(self, volume: np.ndarray, step: float, count: int) -> np.ndarray:
-        """``count`` steps of Euclidean length ``step`` (1/mm) downhill."""
-        result = volume.astype(np.float32, copy=True)
-        for _ in range(count):
-            gradient = self.gradient(result)
-            length = float(np.linalg.norm(gradient.ravel().astype(np.float64)))
-            if length == 0:
-                break
-            result -= np.float32(step / length) * gradient
-        return result
+    def _where_it_is(self, function: Callable[[DeviceArray], DeviceArray], volume: SameArray) -> SameArray:
+        if isinstance(volume, DeviceArray):
+            return cast(SameArray, function(volume))
+        return cast(SameArray, self.rt.download(function(self.rt.upload(volume, np.float32))))
 
 
 def tv_gradient(volume: np.ndarray) -> np.ndarray:

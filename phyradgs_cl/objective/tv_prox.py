@@ -6,9 +6,11 @@ an axis may be weighted, for voxels that are not cubes.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
-from phyradgs_cl.runtime import Kernel, Runtime
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
 
 
 class TvProx:
@@ -28,8 +30,6 @@ class TvProx:
         self._primal_step, self._dual_step = rt.kernel("tv_prox", "tv_primal"), rt.kernel("tv_prox", "tv_dual")
         self._dual = rt.zeros((3, *shape))
         self._moved = rt.zeros((3, *shape))
-        self._volume = rt.empty(shape)
-        self._observed = rt.empty(shape)
 
     @property
     def dual(self) -> np.ndarray:
@@ -41,32 +41,42 @@ class TvProx:
         self.rt.write(self._dual, values)
 
     def __call__(
-        self, volume: np.ndarray, weight: float, iterations: int, *, nonnegative: bool
-    ) -> np.ndarray:
-        """The map of a volume (z, y, x), float32, after ``iterations`` from the last dual."""
+        self, volume: SameArray, weight: float, iterations: int, *, nonnegative: bool, out: DeviceArray | None = None
+    ) -> SameArray:
+        """The map of a volume (z, y, x), float32, after ``iterations`` from the last dual.
+
+        A device array gives a device array, ``out`` if there is one, and nothing crosses the bus.
+        """
+        is_there = isinstance(volume, DeviceArray)
+        observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
+        result = self.rt.empty(self.shape) if out is None else out
+        self._map(observed, weight, iterations, nonnegative, result)
+        return cast(SameArray, result if is_there else self.rt.download(result))
+
+    def _map(
+        self, observed: DeviceArray, weight: float, iterations: int, nonnegative: bool, result: DeviceArray
+    ) -> None:
         if weight <= 0:
-            same: np.ndarray = np.maximum(volume, 0) if nonnegative else volume.copy()
-            return same
-        self.rt.write(self._observed, volume)
+            self._primal(observed, 0.0, nonnegative, result)
+            return
         self.rt.copy(self._dual, self._moved)
         step = np.float32(1 / (_lipschitz(self.axis_weights) * weight))
         t = 1.0
         for _ in range(iterations):
-            self._primal(weight, nonnegative)
+            self._primal(observed, weight, nonnegative, result)
             t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
             self._launch(
-                self._dual_step, self._volume, self._shape4, self._weights4, step, np.float32((t - 1) / t_next),
+                self._dual_step, result, self._shape4, self._weights4, step, np.float32((t - 1) / t_next),
                 self._dual, self._moved,
             )  # fmt: skip
             t = t_next
         self.rt.copy(self._dual, self._moved)
-        self._primal(weight, nonnegative)
-        return self.rt.download(self._volume)
+        self._primal(observed, weight, nonnegative, result)
 
-    def _primal(self, weight: float, nonnegative: bool) -> None:
+    def _primal(self, observed: DeviceArray, weight: float, nonnegative: bool, result: DeviceArray) -> None:
         self._launch(
-            self._primal_step, self._observed, self._moved, self._shape4, self._weights4, np.float32(weight),
-            np.int32(nonnegative), self._volume,
+            self._primal_step, observed, self._moved, self._shape4, self._weights4, np.float32(weight),
+            np.int32(nonnegative), result,
         )  # fmt: skip
 
     def _launch(self, kernel: Kernel, *arguments: object) -> None:

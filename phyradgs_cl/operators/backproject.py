@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -14,8 +15,8 @@ from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
 from phyradgs_cl.operators.rays.layout import voxel_matrices
-from phyradgs_cl.runtime import DeviceArray, Room, Runtime, with_smaller_bricks
-from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of, unpad_rows
+from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, with_smaller_bricks
+from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
 _VIEWS_PER_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28
@@ -26,24 +27,25 @@ _UPRIGHT = 1e-7  # of the depth: how far u or depth may move over the whole heig
 _Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
-def backproject(
-    rt: Runtime, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid
-) -> np.ndarray:
+def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> SameArray:
     """Σ_f weight_f / z² · frame_f(u, v) at every voxel centre, z the voxel's depth as a share of the ray.
 
-    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). Returns (z, y, x) float32.
+    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). Returns (z, y, x) float32, on the
+    device where the frames are.
     """
     matrices = voxel_matrices(pose, grid)
     block = 0 if rt.pixel_items else _upright_block(matrices, grid)
-    views = _Views(frames.transpose(0, 2, 1) if block else frames, matrices, weight)
+    views = _Views(frames, bool(block), matrices, weight)
     if block:
-        return _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, block, *where))
-    return _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
+        volume = _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, block, *where))
+    else:
+        volume = _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
+    return cast(SameArray, volume)
 
 
 def backproject_lines(
-    rt: Runtime, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
-) -> np.ndarray:
+    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
+) -> SameArray:
     """The same where every line of a frame has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
 
     A voxel takes the line r whose pose projects it onto r, by linear interpolation between neighbouring lines, and
@@ -51,63 +53,94 @@ def backproject_lines(
     across lines (``axis`` columns) once more for the filter's scale (docs/mathematics.md).
     """
     readout = Readout(axis)
-    frames, pose = readout.frames(frames), readout.poses(pose)
-    matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(frames), -1)
+    pose = readout.poses(pose)
+    matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(pose), -1)
     across = np.int32(axis == "columns")
-    views = _Views(frames, matrices, weight)
-    return _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where))
+    views = _Views(frames, axis == "columns", matrices, weight)
+    return cast(SameArray, _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """Frames (F, lines, width), the matrices (F, …) and weights (F,) that go with them."""
+    """Frames (F, rows, columns), whether columns become rows, the matrices (F, …) and weights (F,) that go with them."""
 
-    frames: np.ndarray
+    frames: Array
+    is_turned: bool
     matrices: np.ndarray
     weight: np.ndarray
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(lines, width) of each as the kernels have it."""
+        _, rows, columns = self.frames.shape
+        return (columns, rows) if self.is_turned else (rows, columns)
+
     def bytes(self, count: int) -> int:
         """What so many of them take on the device."""
-        _, rows, width = self.frames.shape
+        rows, width = self.shape
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
+
+    def padded(self, rt: Runtime, part: slice) -> DeviceArray:
+        """Some of the images, each a padded one by itself."""
+        count, (rows, width) = part.stop - part.start, self.shape
+        pitch = pitch_of(width)
+        each = 2 * GUARD + rows * pitch
+        if isinstance(self.frames, DeviceArray):
+            stacked = rt.zeros((count, each))
+            source = self.frames, Strides.plain(self.frames.shape, (part.start, 0, 0))
+            shape = count, *self.frames.shape[1:]
+            move(rt, source, (stacked, Strides(GUARD, each, pitch)), shape, turned=self.is_turned)
+            return stacked
+        frames = self.frames[part]
+        on_host = np.zeros((count, each), np.float32)
+        body = on_host[:, GUARD : GUARD + rows * pitch].reshape(count, rows, pitch)
+        body[:, :, :width] = frames.swapaxes(1, 2) if self.is_turned else frames
+        return rt.upload(on_host)
 
     def parts(self, room: Room) -> Iterator[slice]:
         """Views that go to the device in one piece."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
         count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
-        for first in range(0, len(self.frames), count):
-            yield slice(first, min(first + count, len(self.frames)))
+        for first in range(0, len(self.matrices), count):
+            yield slice(first, min(first + count, len(self.matrices)))
 
 
 _Launch = Callable[["_Arguments", Brick, DeviceArray], None]
 
 
-def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> np.ndarray:
+def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> Array:
     """The volume (z, y, x), in bricks of a multiple of ``step`` voxels along z where it does not fit as a whole."""
 
-    def attempt(share: float) -> np.ndarray:
+    is_resident = isinstance(views.frames, DeviceArray)
+    volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
+
+    def attempt(share: float) -> None:
         room = rt.room()
         parts = list(views.parts(room.scaled(share)))
         views_bytes = views.bytes(parts[0].stop)
         bricks = cut(grid.shape, (step, 1), lambda shape: (_volume_bytes(shape), views_bytes), room, share)
-        volume = np.empty(grid.shape, np.float32)
         for brick in bricks:
-            volume[brick.box] = _backprojected(rt, views, parts, brick, launch)
-        return volume
+            padded = _backprojected(rt, views, parts, brick, launch)
+            if isinstance(volume, DeviceArray):
+                move(rt, (padded, _strides(brick)), (volume, Strides.plain(grid.shape, brick.start)), brick.shape)
+            else:
+                volume[brick.box] = unpad_rows(rt.download(padded), brick.shape)
 
-    return with_smaller_bricks("FDK's backprojection", attempt)
+    with_smaller_bricks("FDK's backprojection", attempt)
+    return volume
 
 
 def _backprojected(
     rt: Runtime, views: _Views, parts: list[slice], brick: Brick, launch: _Launch
-) -> np.ndarray:
+) -> DeviceArray:
+    """A brick in the padded layout."""
     nz, ny, nx = brick.shape
     volume = padded_zeros(rt, nz * ny, nx)
     for part in parts:
-        images = _images(rt, views.frames[part], views.matrices[part], views.weight[part])
+        images = _images(rt, views, part)
         launch(images, brick, volume)
         del images  # before the next part's
-    return unpad_rows(rt.download(volume), brick.shape)
+    return volume
 
 
 def _general(rt: Runtime, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
@@ -149,21 +182,25 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> int:
     return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_per_voxel, 1e-3)))
 
 
-def _images(rt: Runtime, frames: np.ndarray, matrices: np.ndarray, weight: np.ndarray) -> _Arguments:
+def _images(rt: Runtime, views: _Views, part: slice) -> _Arguments:
     """The kernels' first arguments: padded images on the device, matrices, weights, and their sizes."""
-    views, rows, width = frames.shape
-    pitch = pitch_of(width)
-    stacked = np.zeros((views, 2 * GUARD + rows * pitch), np.float32)
-    body = stacked[:, GUARD : GUARD + rows * pitch].reshape(views, rows, pitch)
-    body[:, :, :width] = frames
-    sizes = (np.int32(views), np.int32(rows), np.int32(width), np.int32(pitch), np.int64(stacked.shape[1]))
-    return (rt.upload(stacked), rt.upload(matrices, np.float32), rt.upload(weight, np.float32), *sizes)
+    images, (rows, width) = views.padded(rt, part), views.shape
+    count, each = images.shape
+    sizes = (np.int32(count), np.int32(rows), np.int32(width), np.int32(pitch_of(width)), np.int64(each))
+    tables = (rt.upload(table[part], np.float32) for table in (views.matrices, views.weight))
+    return (images, *tables, *sizes)
 
 
 def _volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
     nz, ny, nx = brick.shape
     shape, origin = np.array([nx, ny, nz, 0], np.int32), np.array([*brick.start[::-1], 0], np.int32)
     return shape, origin, np.int32(pitch_of(nx))
+
+
+def _strides(brick: Brick) -> Strides:
+    """Where the voxels of a padded brick lie."""
+    _, ny, nx = brick.shape
+    return Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
 
 
 def _volume_bytes(shape: Shape) -> int:

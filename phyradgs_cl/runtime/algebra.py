@@ -191,7 +191,8 @@ class DeviceSpace:
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """x − ``step`` y/‖y‖, and x where y is 0; nothing comes back."""
         self._sum(y, y)
-        return self._each("descend", x, y, np.float32(step), self._whole)
+        high = np.float32(step)
+        return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
     def inner(self, x: DeviceArray, y: DeviceArray) -> float:
         self._sum(x, y)

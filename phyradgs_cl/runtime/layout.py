@@ -21,7 +21,7 @@ _TILE = 16  # rows and columns that a CPU's work-item turns at a time
 
 @dataclass(frozen=True)
 class Strides:
-    """Where element (z, y, x) of a volume, or of a stack of images, lies: ``start`` + z ``slice`` + y ``row`` + x, in floats."""
+    """Where element (z, y, x) of a volume or stack of images lies: ``start`` + z ``slice`` + y ``row`` + x, in floats."""
 
     start: int
     slice: int

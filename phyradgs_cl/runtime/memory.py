@@ -50,6 +50,7 @@ class DeviceArray:
 
 Array = np.ndarray | DeviceArray
 """Plain C-contiguous values where they are: operators give their results where their arguments lie."""
+SameArray = TypeVar("SameArray", bound=Array)
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tolerances import BRICKS, RAYS
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.operators import IntensityOperator, RayOperator, backproject, backproject_lines
 
 SHAPE = (7, 37)
 TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
@@ -92,3 +92,31 @@ def test_what_does_not_fit_is_said(rt) -> None:
     }.items():
         with pytest.raises(InputError, match=culprit):
             call()
+
+
+@AXES
+def test_backprojection(any_rt, make_geometry, axis) -> None:
+    """Frames that are on the device give the same bits; only poses and weights go up."""
+    grid, pixels, rng = Grid((11, 9, 19), (0.12, 0.2, 0.1)), (13, 18), np.random.default_rng(38)
+    geometry, frames = make_geometry(*pixels), rng.uniform(-1, 1, (9, *pixels)).astype(np.float32)
+    lines = pixels[axis == "columns"]
+    angles = rng.uniform(0, 6, (9, 1)) + np.linspace(-0.1, 0.1, lines)
+    poses = geometry.pose(angles.ravel()).reshape(9, lines, 12)
+    tilted = poses[:, 0].copy()
+    tilted[:, 9:12] += 0.05 * tilted[:, 6:9]
+    views = any_rt.upload(frames)
+    calls = {
+        "lines": lambda y: backproject_lines(any_rt, y, poses, np.ones(9), grid, axis),
+        "upright": lambda y: backproject(any_rt, y, poses[:, 0], np.ones(9), grid),
+        "tilted": lambda y: backproject(any_rt, y, tilted, np.ones(9), grid),
+    }
+    for name, call in calls.items():
+        expected = call(frames)
+        for room in (10**7, 40_000):
+            with room_for(any_rt, room):
+                before = replace(any_rt.traffic)
+                volume = call(views)
+                assert any_rt.traffic.bytes_down == before.bytes_down
+                assert any_rt.traffic.bytes_up - before.bytes_up <= 4 * 9 * (12 * lines + 1) * 9
+                np.testing.assert_array_equal(any_rt.download(volume), expected, err_msg=name)
+                del volume

@@ -14,7 +14,8 @@ from phyradgs_cl.metrics import psnr
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
-from phyradgs_cl.reconstructors.voxels.system import System, norm
+from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.runtime.algebra import norm
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 ITERATIONS = {"sart": 6, "os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 6, "fista-tv": 25}

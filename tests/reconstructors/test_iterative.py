@@ -26,7 +26,8 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
 from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, spread_order
 from phyradgs_cl.reconstructors.voxels.sirt import Sirt, SirtOptions
-from phyradgs_cl.reconstructors.voxels.system import System, norm
+from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.runtime.algebra import norm
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")

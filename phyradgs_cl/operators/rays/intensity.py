@@ -18,8 +18,8 @@ from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import layered
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.rays.operator import A, RayOperator
-from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, Space
+from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, SameArray, Space
 
 _HOST = HostSpace()
 
@@ -43,6 +43,7 @@ class IntensityOperator:
             self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
         self._by_row = tables[0].axis == "rows"
         self._device = DeviceSpace(rt)
+        self._shares: list[Any] = []
         self._set(weights)
 
     @property
@@ -51,13 +52,14 @@ class IntensityOperator:
         return self._operators[0].memory
 
     @property
-    def layers(self) -> int:
-        """The most cells of a line: so many times I hold frames."""
-        return len(self._operators)
+    def holds(self) -> tuple[int, int]:
+        """Volumes and stacks of frames that I take on a device beside ``memory``: p and share of every cell of a line."""
+        return 2, 2 * len(self._operators) + 3
 
-    def expected(self, volume: A, out: A | None = None) -> A:
+    def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
         self._shares = []  # their memory is wanted again
+        frames: Array
         if isinstance(volume, DeviceArray):
             p = [self._device.apply(operator.forward, volume, self.frames_shape) for operator in self._operators]
             frames, self._shares = self._device_average(p)
@@ -65,26 +67,30 @@ class IntensityOperator:
             averaged, shares = intensity_average(
                 [operator.forward(volume) for operator in self._operators], self._weights
             )
-            frames, self._shares = averaged.astype(np.float32), [s.astype(np.float32) for s in shares]
-        return self._given(frames, out)
+            frames = averaged.astype(np.float32)
+            self._shares = [share.astype(np.float32) for share in shares]
+        same: SameArray = self._given(frames, out)
+        return same
 
-    def forward(self, volume: A, out: A | None = None) -> A:
+    def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """J d: a change of the volume (nz, ny, nx) to that of the frames (F, rows, columns) float32."""
         space = self._space(volume)
         total: Any = None
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
             part = space.apply(operator.forward, volume, self.frames_shape)
             total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
-        return self._given(total, out)
+        same: SameArray = self._given(total, out)
+        return same
 
-    def adjoint(self, frames: A, out: A | None = None) -> A:
+    def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Jᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         space = self._space(frames)
         total: Any = None
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
             part = space.apply(operator.adjoint, space.multiply(frames, share), self.volume_shape)
             total = part if total is None else space.add(total, part)
-        return self._given(total, out)
+        same: SameArray = self._given(total, out)
+        return same
 
     def subset(self, frames: Sequence[int]) -> IntensityOperator:
         """The same for some of the frames, in this order, with a volume of its own for J."""
@@ -99,15 +105,16 @@ class IntensityOperator:
         """Weights (F, lines, 1) or (F, 1, lines) of each layer; shares are those of a volume of zeros."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
-        self._shares: list[Any] = []
+        self._shares = []
 
     def _space(self, like: Array) -> Space[Any]:
         return self._device if isinstance(like, DeviceArray) else _HOST
 
-    def _given(self, result: Any, out: Any) -> Any:
+    def _given(self, result: Any, out: SameArray | None) -> SameArray:
         """The result, in ``out`` if there is one."""
         if out is None:
-            return result
+            new: SameArray = result
+            return new
         if isinstance(out, DeviceArray):
             self._device.rt.copy(result, out)
         else:

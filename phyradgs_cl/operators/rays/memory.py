@@ -77,6 +77,16 @@ class RayMemory:
         for start in range(0, count, self._batch):
             yield slice(start, min(start + self._batch, count))
 
+    def holds_all(self, frames: int) -> bool:
+        """Whether a whole volume and so many frames fit beside each other; if so, that memory is taken now."""
+        if len(self.plan()) > 1 or self._batch < frames:
+            return False
+        self.volume(self._bricks[0])
+        self.frames(frames)
+        if self._columns_bytes and self._columns is None:
+            self._columns = self.rt.zeros(self._columns_bytes // 4)
+        return True
+
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
         """Memory for a brick, whatever is in it."""
         if self._volume is None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from copy import copy
 from typing import Any
 from typing import Protocol as Interface
-from typing import TypeVar
 
 import numpy as np
 
@@ -18,9 +17,7 @@ from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.upright import launch_upright, upright_block
-from phyradgs_cl.runtime import Array, DeviceArray, Runtime, with_smaller_bricks
-
-A = TypeVar("A", np.ndarray, DeviceArray)
+from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
 
 
 class LinearOperator(Interface):
@@ -32,12 +29,12 @@ class LinearOperator(Interface):
     @property
     def frames_shape(self) -> tuple[int, int, int]: ...
 
-    def forward(self, volume: A, out: A | None = None) -> A:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32, into ``out`` if there is one."""
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
         ...
 
-    def adjoint(self, frames: A, out: A | None = None) -> A:
-        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32, into ``out`` if there is one."""
+    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         ...
 
     def subset(self, frames: Sequence[int]) -> LinearOperator:
@@ -84,11 +81,11 @@ class RayOperator:
         """The cells of each frame."""
         return [self._tables[f] for f in self._chosen]
 
-    def forward(self, volume: A, out: A | None = None) -> A:
+    def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
         return self.project(volume, "log", out)
 
-    def intensity_gap(self, volume: A, out: A | None = None) -> A:
+    def intensity_gap(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
 
         Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
@@ -96,10 +93,10 @@ class RayOperator:
         """
         return self.project(volume, "gap", out)
 
-    def project(self, volume: A, average: str, out: A | None = None) -> A:
+    def project(self, volume: SameArray, average: str, out: SameArray | None = None) -> SameArray:
         """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""
         _check_shape("volume", volume, self.volume_shape)
-        result = _room_for(self.rt, self.frames_shape, volume, out)
+        result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
         with_smaller_bricks(
             "ray-driven projector", lambda share: self._project(volume, average, share, result)
         )
@@ -141,10 +138,10 @@ class RayOperator:
         else:
             result[...] = frames
 
-    def adjoint(self, frames: A, out: A | None = None) -> A:
+    def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Aᵀ y; frames (F, rows, columns), result (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
-        result = _room_for(self.rt, self.volume_shape, frames, out)
+        result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
         with_smaller_bricks(
             "ray-driven backprojector", lambda share: self._adjoint(frames, share, result)
         )

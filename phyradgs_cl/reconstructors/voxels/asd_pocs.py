@@ -21,8 +21,8 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.voxels.run import run_iterations
-from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions
-from phyradgs_cl.reconstructors.voxels.system import System, inner, norm
+from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, kept_columns
+from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 
@@ -63,11 +63,12 @@ def asd_pocs(
     """The ASD-POCS volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
 
     def make(system: System) -> AsdPocs:
-        start = static_fdk(rt, scan)
-        epsilon = options.residual_share * norm(system.residual(start))
+        start = system.space.array(static_fdk(rt, scan))
+        epsilon = options.residual_share * system.space.norm(system.residual(start))
         return AsdPocs(system, options, seed, TvDescent(rt, scan.grid.shape), epsilon)
 
-    return run_iterations("asd-pocs", make, scan, options, rt, report, resume)
+    volumes = 8 + kept_columns(scan, options)
+    return run_iterations("asd-pocs", make, scan, options, rt, report, resume, volumes=volumes, frames=2)
 
 
 class AsdPocs:
@@ -83,28 +84,30 @@ class AsdPocs:
         self.tv_step = 0.0
 
     def step(self) -> float:
-        options = self.options
+        options, space = self.options, self.system.space
         self.sart.volume = self.volume
         self.sart.step()
-        by_data = self.sart.volume - self.volume
-        data_length = norm(by_data)
-        residual = norm(self.system.residual(self.sart.volume))
+        by_data = space.add(self.sart.volume, self.volume, -1.0)
+        data_length = space.norm(by_data)
+        residual = space.norm(self.system.residual(self.sart.volume))
         if self.tv_step == 0:
             self.tv_step = options.tv_share * data_length
         self.volume = self.descend(self.sart.volume, self.tv_step, options.tv_steps)
-        by_tv = self.volume - self.sart.volume
-        tv_length = norm(by_tv)
+        by_tv = space.add(self.volume, self.sart.volume, -1.0)
+        tv_length = space.norm(by_tv)
         if tv_length > options.tv_ratio * data_length and residual > self.epsilon:
             self.tv_step *= options.tv_reduction
-        cosine = inner(by_tv, by_data) / max(tv_length * data_length, 1e-30)
+        cosine = space.inner(by_tv, by_data) / max(tv_length * data_length, 1e-30)
         if cosine < -0.99 and residual <= self.epsilon:
             self.finished = "data and TV in balance"
         return residual
 
     def state(self) -> dict[str, np.ndarray]:
-        return {**self.sart.state(), "volume": self.volume, "tv_step": np.array(self.tv_step)}
+        volume = self.system.space.numpy(self.volume)
+        return {**self.sart.state(), "volume": volume, "tv_step": np.array(self.tv_step)}
 
     def restore(self, state: State) -> None:
         self.sart.restore(state)
-        self.volume, tv_step = state_arrays(state, ["volume", "tv_step"])
+        self.volume = self.sart.volume
+        (tv_step,) = state_arrays(state, ["tv_step"])
         self.tv_step = float(tv_step)

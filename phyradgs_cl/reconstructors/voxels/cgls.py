@@ -18,7 +18,7 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
-from phyradgs_cl.reconstructors.voxels.system import System, inner, norm
+from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 
@@ -53,11 +53,17 @@ def cgls(
     """The least-squares volume of a scan in 1/mm, as far as the iterations get. CGLS draws nothing from ``seed``."""
 
     def make(system: System) -> Cgls:
-        pixels = system.measured.size if system.valid is None else np.count_nonzero(system.valid)
-        noise = noise_level(system.measured, system.valid) * np.sqrt(pixels)
-        return Cgls(system, options.noise_stop * noise)
+        return Cgls(system, options.noise_stop * _noise(system))
 
-    return run_iterations("cgls", make, scan, options, rt, report, resume)
+    return run_iterations("cgls", make, scan, options, rt, report, resume, volumes=7, frames=3)
+
+
+def _noise(system: System) -> float:
+    """The norm of the measurement's noise."""
+    measured = system.space.numpy(system.measured)
+    valid = None if system.valid is None else np.broadcast_to(system.space.numpy(system.valid) != 0, measured.shape)
+    pixels = measured.size if valid is None else np.count_nonzero(valid)
+    return float(noise_level(measured, valid) * np.sqrt(pixels))
 
 
 class Cgls:
@@ -69,46 +75,48 @@ class Cgls:
 
     def __init__(self, system: System, enough: float = 0.0) -> None:
         self.system, self.enough = system, enough
-        self.volume = np.zeros(system.operator.volume_shape, np.float32)
+        self.volume = system.space.full(system.volume_shape, 0.0)
         self.finished: str | None = None
-        self.residual = system.measured.astype(np.float32)
-        self.gradient = system.operator.adjoint(self.residual)
+        self.residual = system.measured
+        self.gradient = system.adjoint(self.residual)
         self.direction = self.gradient
-        self.gamma = inner(self.gradient, self.gradient)
+        self.gamma = system.space.inner(self.gradient, self.gradient)
 
     def step(self) -> float:
+        space = self.system.space
         projected = self.system.derivative(self.direction)
-        energy = inner(projected, projected)
+        energy = space.inner(projected, projected)
         if self.gamma == 0 or energy == 0:
             self.finished = "exact solution"
-            return norm(self.residual)
+            return space.norm(self.residual)
         linear = self.system.intensity is None
-        slope = self.gamma if linear else inner(self.gradient, self.direction)
-        alpha = np.float32(slope / energy)
-        self.volume = self.volume + alpha * self.direction
-        self.residual = self.residual - alpha * projected if linear else self.system.residual(self.volume)
+        slope = self.gamma if linear else space.inner(self.gradient, self.direction)
+        alpha = slope / energy
+        self.volume = space.add(self.volume, self.direction, alpha)
+        self.residual = space.add(self.residual, projected, -alpha) if linear else self.system.residual(self.volume)
         gradient = self.system.back(self.residual)
-        gamma = inner(gradient, gradient)
-        turned = 0.0 if linear else inner(gradient, self.gradient)
-        beta = np.float32(max(gamma - turned, 0.0) / self.gamma)
-        self.direction = gradient + beta * self.direction
+        gamma = space.inner(gradient, gradient)
+        turned = 0.0 if linear else space.inner(gradient, self.gradient)
+        beta = max(gamma - turned, 0.0) / self.gamma
+        self.direction = space.add(gradient, self.direction, beta)
         self.gradient, self.gamma = gradient, gamma
-        length = norm(self.residual)
+        length = space.norm(self.residual)
         if length <= self.enough:
             self.finished = "residual as small as the noise"
         return length
 
     def state(self) -> dict[str, np.ndarray]:
-        return {
+        arrays = {
             "volume": self.volume,
             "residual": self.residual,
             "direction": self.direction,
             "gradient": self.gradient,
-            "gamma": np.array(self.gamma),
         }
+        on_host = {name: self.system.space.numpy(array) for name, array in arrays.items()}
+        return {**on_host, "gamma": np.array(self.gamma)}
 
     def restore(self, state: State) -> None:
-        arrays = state_arrays(state, list(self.state()))
-        self.volume, self.residual, self.direction, self.gradient, gamma = arrays
+        *arrays, gamma = state_arrays(state, ["volume", "residual", "direction", "gradient", "gamma"])
+        self.volume, self.residual, self.direction, self.gradient = map(self.system.space.array, arrays)
         self.gamma = float(gamma)
         self.system.stand_at(self.volume)

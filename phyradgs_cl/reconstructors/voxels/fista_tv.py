@@ -7,6 +7,7 @@ O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -22,8 +23,10 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
-from phyradgs_cl.reconstructors.voxels.system import System, inner, norm
+from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
+
+_ARRAYS = ("volume", "previous", "projected", "projected_previous")
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def fista_tv(
     def make(system: System) -> FistaTv:
         return FistaTv(system, options, TvProx(rt, scan.grid.shape, axis_weights(scan.grid)))
 
-    return run_iterations("fista-tv", make, scan, options, rt, report, resume)
+    return run_iterations("fista-tv", make, scan, options, rt, report, resume, volumes=12, frames=3)
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
@@ -78,46 +81,46 @@ class FistaTv:
 
     def __init__(self, system: System, options: FistaTvOptions, prox: TvProx) -> None:
         self.system, self.options, self.prox = system, options, prox
-        shape = system.operator.volume_shape
-        self.volume = np.zeros(shape, np.float32)
+        space = system.space
+        self.volume = space.full(system.volume_shape, 0.0)
         self.previous = self.volume
-        self.projected = np.zeros_like(system.measured)
+        self.projected = space.full(system.measured.shape, 0.0)
         self.projected_previous = self.projected
         self.momentum = 1.0
         self.finished: str | None = None
         # AᵀA has no negative entry: its largest row sum bounds its norm
-        normal = system.operator.adjoint(system.weighed(system.row_sums()))
-        self.curvature = float(normal.max()) or 1.0
-        largest = float(np.abs(system.operator.adjoint(system.weighed(system.measured))).max())
-        self.tv_weight = options.tv_weight * largest
+        self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
+        gradient = system.adjoint(system.weighed(system.measured))
+        self.tv_weight = options.tv_weight * space.largest(gradient, absolute=True)
 
     def step(self) -> float:
-        following = (1 + np.sqrt(1 + 4 * self.momentum**2)) / 2
-        beta = np.float32((self.momentum - 1) / following)
-        point = self.volume + beta * (self.volume - self.previous)
-        projected = self.projected + beta * (self.projected - self.projected_previous)
-        gradient = self.system.back(self.system.weighed(self.system.measured - projected))
-        moved = point + np.float32(1 / self.curvature) * gradient
-        weight = self.tv_weight / self.curvature
-        volume = self.prox(moved, weight, self.options.tv_iterations, nonnegative=self.options.nonnegative)
-        uphill = inner(point - volume, volume - self.volume) > 0
+        system, space, options = self.system, self.system.space, self.options
+        following = float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
+        beta = (self.momentum - 1) / following
+        point = space.add(self.volume, system.less(self.volume, self.previous), beta)
+        projected = space.add(self.projected, system.less(self.projected, self.projected_previous), beta)
+        gradient = system.back(system.weighed(system.less(system.measured, projected)))
+        moved = space.add(point, gradient, 1 / self.curvature)
+        prox = partial(
+            self.prox,
+            weight=self.tv_weight / self.curvature,
+            iterations=options.tv_iterations,
+            nonnegative=options.nonnegative,
+        )
+        volume = space.apply(prox, moved, system.volume_shape)
+        uphill = space.inner(system.less(point, volume), system.less(volume, self.volume)) > 0
         self.previous, self.volume = self.volume, volume
-        self.projected_previous, self.projected = self.projected, self.system.expected(volume)
+        self.projected_previous, self.projected = self.projected, system.expected(volume)
         self.momentum = 1.0 if uphill else following
-        return norm(self.system.measured - self.projected)
+        return space.norm(system.less(system.measured, self.projected))
 
     def state(self) -> dict[str, np.ndarray]:
-        return {
-            "volume": self.volume,
-            "previous": self.previous,
-            "projected": self.projected,
-            "projected_previous": self.projected_previous,
-            "momentum": np.array(self.momentum),
-            "dual": self.prox.dual,
-        }
+        arrays = (self.volume, self.previous, self.projected, self.projected_previous)
+        on_host = dict(zip(_ARRAYS, map(self.system.space.numpy, arrays), strict=True))
+        return {**on_host, "momentum": np.array(self.momentum), "dual": self.prox.dual}
 
     def restore(self, state: State) -> None:
-        arrays = state_arrays(state, list(self.state()))
-        self.volume, self.previous, self.projected, self.projected_previous, momentum, dual = arrays
+        *arrays, momentum, dual = state_arrays(state, [*_ARRAYS, "momentum", "dual"])
+        self.volume, self.previous, self.projected, self.projected_previous = map(self.system.space.array, arrays)
         self.momentum, self.prox.dual = float(momentum), dual
         self.system.stand_at(self.volume)

@@ -1,6 +1,6 @@
 """The iterative voxel methods between scan and loop: options, system, convergence, facts.
 
-A method is a class with ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it.
+A method is a class with ``system``, ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 from typing import Protocol as Interface
 
 import numpy as np
@@ -21,10 +21,11 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.checkpoint import check_like, count_of
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
-from phyradgs_cl.reconstructors.voxels.system import System, norm
+from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 MOST_ITERATIONS = 1_000_000
+_SYSTEM_FRAMES = 6  # stacks of frames: measurement, mask, transmission, and what one comparison makes
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,9 @@ class IterativeOptions:
 class Algorithm(Interface):
     """One iterative method on one system."""
 
-    volume: np.ndarray
-    """The present estimate (nz, ny, nx) float32, 1/mm; a new array after every step."""
+    system: System
+    volume: Any
+    """The present estimate (nz, ny, nx) float32, 1/mm, an array of the system's space; a new one after every step."""
     finished: str | None
     """Why the method stops by itself, else None."""
 
@@ -82,16 +84,22 @@ def run_iterations(
     rt: Runtime,
     report: ProgressReport,
     resume: State | None,
+    *,
+    volumes: int,
+    frames: int,
 ) -> Reconstruction:
     """Builds the scan's system, runs the method on it, and returns volume, record and facts.
 
+    ``volumes`` and ``frames`` (stacks of all of them) are what the method holds at one time, its tables included: where the
+    device has room for them they stay on it.
     The record has a line an iteration: residual ‖p − A x‖/‖p‖, change ‖x − x'‖/‖x‖, seconds since the start.
     """
     started = time.perf_counter()
     system = System.of_scan(rt, scan, options.motion, options.detector_model)
     if options.transmission_weights:
         system = system.transmission_weighted()
-    run = _Iterations(make(system), options, scan.grid, norm(system.measured) or 1.0)
+    system = system.resident(rt, volumes + 2, frames + _SYSTEM_FRAMES)
+    run = _Iterations(make(system), options, scan.grid, system.space.norm(system.measured) or 1.0)
     loop = Loop(run, rt.ranks, report, started)
     loop.run(resume)
     facts: dict[str, object] = {
@@ -104,7 +112,7 @@ def run_iterations(
         "interrupted_at": loop.interrupted_at,
         "ranks": rt.ranks.size,
     }
-    volume, state = run.algorithm.volume, loop.state_if_interrupted()
+    (volume, _), state = run.present_volume(), loop.state_if_interrupted()
     return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
 
 
@@ -125,11 +133,12 @@ class _Iterations:
         return self.algorithm.finished or ("tolerance" if self.change < self.options.tolerance else None)
 
     def step(self) -> None:
-        before = self.algorithm.volume
+        before, space = self.algorithm.volume, self.algorithm.system.space
         self.residual = self.algorithm.step() / self.measured_norm
         self.iteration += 1
-        size = norm(self.algorithm.volume)
-        self.change = norm(self.algorithm.volume - before) / size if size else 0.0
+        size = space.norm(self.algorithm.volume)
+        moved = space.add(self.algorithm.volume, before, -1.0)
+        self.change = space.norm(moved) / size if size else 0.0
 
     def measures(self) -> dict[str, float]:
         return {"residual": self.residual, "change": self.change}
@@ -143,4 +152,4 @@ class _Iterations:
         self.algorithm.restore(state)
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        return self.algorithm.volume, self.grid
+        return self.algorithm.system.space.numpy(self.algorithm.volume), self.grid

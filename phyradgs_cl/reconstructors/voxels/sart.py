@@ -5,7 +5,10 @@ Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jian
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +22,7 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
-from phyradgs_cl.reconstructors.voxels.system import System, norm, reciprocal, row_weights
+from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 from phyradgs_cl.runtime import Runtime
 
 ORDERS = ("spread", "random", "ordered")
@@ -62,7 +65,7 @@ def sart(
     resume: State | None = None,
 ) -> Reconstruction:
     """The SART volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
-    return run_iterations("sart", lambda s: Sart(s, options, seed), scan, options, rt, report, resume)
+    return _run("sart", scan, options, rt, seed, report, resume)
 
 
 def os_sart(
@@ -75,7 +78,33 @@ def os_sart(
     resume: State | None = None,
 ) -> Reconstruction:
     """The same with several frames per correction."""
-    return run_iterations("os-sart", lambda s: Sart(s, options, seed), scan, options, rt, report, resume)
+    return _run("os-sart", scan, options, rt, seed, report, resume)
+
+
+def _run(
+    method: str,
+    scan: Scan,
+    options: SartOptions,
+    rt: Runtime,
+    seed: int,
+    report: ProgressReport,
+    resume: State | None,
+) -> Reconstruction:
+    def make(system: System) -> Sart:
+        return Sart(system, options, seed)
+
+    volumes = 4 + kept_columns(scan, options)
+    return run_iterations(method, make, scan, options, rt, report, resume, volumes=volumes, frames=2)
+
+
+def kept_columns(scan: Scan, options: SartOptions) -> int:
+    """Column weights, a volume per subset, that are kept and not made anew."""
+    subsets = -(-scan.frames // options.frames_per_subset)
+    return min(subsets, _most_kept(scan.grid.shape))
+
+
+def _most_kept(volume_shape: Sequence[int]) -> int:
+    return max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1)
 
 
 class Sart:
@@ -85,8 +114,8 @@ class Sart:
     """
 
     def __init__(self, system: System, options: SartOptions, seed: int) -> None:
-        self.options, self.seed = options, seed
-        self.volume = np.zeros(system.operator.volume_shape, np.float32)
+        self.system, self.options, self.seed = system, options, seed
+        self.volume = system.space.full(system.volume_shape, 0.0)
         self.relaxation = options.relaxation
         self.finished: str | None = None
         self.iteration = 0
@@ -95,20 +124,18 @@ class Sart:
         groups = [order[i : i + size] for i in range(0, len(order), size)]
         self.subsets = [system.subset(group) for group in groups]
         self._row_weights = [row_weights(subset) for subset in self.subsets]
-        kept = max(_WEIGHT_CACHE_BYTES // self.volume.nbytes, 1)
-        self._column_weights = [reciprocal(subset.column_sums()) for subset in self.subsets[:kept]]
+        kept = _most_kept(system.volume_shape)
+        self._column_weights = [column_weights(subset) for subset in self.subsets[:kept]]
 
     def step(self) -> float:
-        volume, squares = self.volume.copy(), 0.0
+        space, squares, clip = self.system.space, 0.0, self.options.nonnegative
         for index in self._pass():
             subset = self.subsets[index]
-            residual = subset.residual(volume)
-            squares += norm(residual) ** 2
-            update = subset.back(self._row_weights[index] * residual)
-            volume += np.float32(self.relaxation) * self._columns(index) * update
-            if self.options.nonnegative:
-                np.maximum(volume, 0, out=volume)
-        self.volume = volume
+            residual = subset.residual(self.volume)
+            squares += space.norm(residual) ** 2
+            update = subset.back(space.multiply(residual, self._row_weights[index]))
+            columns = self._columns(index)
+            self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
         self.relaxation *= self.options.relaxation_reduction
         self.iteration += 1
         return float(np.sqrt(squares))
@@ -119,21 +146,22 @@ class Sart:
             return list(range(count))
         return np.random.default_rng([self.seed, self.iteration]).permutation(count).tolist()
 
-    def _columns(self, index: int) -> np.ndarray:
+    def _columns(self, index: int) -> Any:
         """Column weights; those that the cache has no room for are made anew."""
         if index < len(self._column_weights):
             return self._column_weights[index]
-        return reciprocal(self.subsets[index].column_sums())
+        return column_weights(self.subsets[index])
 
     def state(self) -> dict[str, np.ndarray]:
         return {
-            "volume": self.volume,
+            "volume": self.system.space.numpy(self.volume),
             "relaxation": np.array(self.relaxation),
             "pass": np.array(self.iteration),
         }
 
     def restore(self, state: State) -> None:
-        self.volume, relaxation, iteration = state_arrays(state, ["volume", "relaxation", "pass"])
+        volume, relaxation, iteration = state_arrays(state, ["volume", "relaxation", "pass"])
+        self.volume = self.system.space.array(volume)
         self.relaxation, self.iteration = float(relaxation), int(iteration)
 
 

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.result import (
     state_arrays,
 )
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
-from phyradgs_cl.reconstructors.voxels.system import System, norm, reciprocal, row_weights
+from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 from phyradgs_cl.runtime import Runtime
 
 
@@ -43,7 +43,9 @@ def sirt(
     resume: State | None = None,
 ) -> Reconstruction:
     """The SIRT volume of a scan in 1/mm. ``seed`` is accepted for the common signature; SIRT draws nothing."""
-    return run_iterations("sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume)
+    return run_iterations(
+        "sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume, volumes=4, frames=1
+    )
 
 
 class Sirt:
@@ -54,19 +56,22 @@ class Sirt:
 
     def __init__(self, system: System, options: SirtOptions) -> None:
         self.system, self.options = system, options
-        self.volume = np.zeros(system.operator.volume_shape, np.float32)
+        self.volume = system.space.full(system.volume_shape, 0.0)
         self.finished: str | None = None
-        self._rows = row_weights(system)
-        self._columns = reciprocal(system.column_sums()) * np.float32(options.relaxation)
+        self._rows, self._columns = row_weights(system), column_weights(system)
 
     def step(self) -> float:
+        space, options = self.system.space, self.options
         residual = self.system.residual(self.volume)
-        volume = self.volume + self._columns * self.system.back(self._rows * residual)
-        self.volume = np.maximum(volume, 0) if self.options.nonnegative else volume
-        return norm(residual)
+        update = self.system.back(space.multiply(residual, self._rows))
+        self.volume = space.add_product(
+            self.volume, self._columns, update, options.relaxation, nonnegative=options.nonnegative
+        )
+        return space.norm(residual)
 
     def state(self) -> dict[str, np.ndarray]:
-        return {"volume": self.volume}
+        return {"volume": self.system.space.numpy(self.volume)}
 
     def restore(self, state: State) -> None:
-        (self.volume,) = state_arrays(state, ["volume"])
+        (volume,) = state_arrays(state, ["volume"])
+        self.volume = self.system.space.array(volume)
