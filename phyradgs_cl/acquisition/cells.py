@@ -12,8 +12,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl import checks
-from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
@@ -38,7 +36,7 @@ class TimeCells:
     Cells with motion are segments of the frame: ``end_poses`` (C, 2, 12) at their two ends, and ``line_times``
     (C, 3, lines), which say of every line the middle and half the length of its window's part in the segment, in units of
     the segment's length from its mid-time, and the share of its window that this part is. ``weight`` is 1 then.
-    Raises InputError for arrays whose lengths do not fit each other.
+    A method raises InputError for cells of one's own whose lengths do not fit each other.
     """
 
     pose: np.ndarray
@@ -50,11 +48,6 @@ class TimeCells:
     axis: str = "rows"
     end_poses: np.ndarray | None = None
     line_times: NDArray[np.float64] | None = None
-
-    def __post_init__(self) -> None:
-        checks.shape("time cells' pose", self.pose, (self.count, POSE_LENGTH))
-        for name in ("time_s", "line_start", "line_stop"):
-            checks.shape(f"time cells' {name}", getattr(self, name), (self.count,))
 
     @property
     def count(self) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
@@ -80,7 +81,7 @@ class MicroViews:
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line at its own ``sub_intervals`` exact times, as the simulator has it. Raises InputError for a count below 1."""
+    """Every line at its own ``sub_intervals`` exact times, as in the simulator. Raises InputError for a count below 1."""
 
     name: str = field(default="per-row", init=False, repr=False)
     sub_intervals: int = 5
@@ -123,7 +124,7 @@ class Exact:
         checks.within("--time-error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: its segments. intensity_peak: a line integral, as for ``segments_for``."""
+        """The ``TimeCells`` of one frame of a scan: its segments. intensity_peak: as for ``segments_for``."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -189,6 +190,9 @@ def check_own_motion(motion: object, scan: Scan) -> None:
     if (made.lines, made.axis) != (scan.lines, scan.shutter.axis):
         found, expected = f"cells for {made.lines} {made.axis}", f"{scan.lines} {scan.shutter.axis}"
         raise InputError(culprit, found, expected)
+    checks.shape(f"{culprit}: pose", made.pose, (made.count, POSE_LENGTH))
+    for name in ("time_s", "line_start", "line_stop"):
+        checks.shape(f"{culprit}: {name}", getattr(made, name), (made.count,))
     weights = made.line_weights()
     worst = float(weights[np.argmax(np.abs(weights - 1))])
     if abs(worst - 1) > _WHOLE:

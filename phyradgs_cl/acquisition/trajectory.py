@@ -241,8 +241,9 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
         made = PoseTable(time_s, poses[at], "trajectory")
-        between = (times[:, :-1] + times[:, 1:]) / 2
-        gaps = (np.abs(made.pose(f, t) - trajectory.pose(f, t)).max() for f, t in enumerate(between))
+        between = (time_s[:-1] + time_s[1:]) / 2  # of all samples: those of a frame that overlaps are in between too
+        inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
+        gaps = (np.abs(made.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
         worst_mm = max(gaps)
         if worst_mm <= error_mm:
             return made

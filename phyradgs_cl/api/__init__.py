@@ -40,7 +40,7 @@ from phyradgs_cl.api.scans import fly_scan, static_scan
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import Interrupted, Progress, Reconstruction
+from phyradgs_cl.reconstructors import Progress, Reconstruction
 
 __all__ = [
     "CircularOrbit",
@@ -52,7 +52,6 @@ __all__ = [
     "Gaussians",
     "Grid",
     "InputError",
-    "Interrupted",
     "LineMiddles",
     "LinearOperator",
     "MicroViews",

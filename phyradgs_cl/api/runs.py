@@ -22,12 +22,12 @@ from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
     InputOptions,
-    Interrupted,
     ProgressReport,
     Reconstruction,
     State,
     ignore_progress,
     input_options,
+    interrupted,
     method_name,
     method_of,
     method_options,
@@ -94,11 +94,12 @@ def simulate(
 ) -> Scan:
     """A fly-scan (or, with ``protocol="static"``, a stop-and-shoot scan) of a phantom, with its truth as reference.
 
-    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm. scanner: a name or a TOML
-    file. protocol: "rapid", "standard" or "static". size: voxels along the longest side of grid and reference. detector:
-    columns, rows in proportion. device: what ``--device`` takes, or a Runtime. options: those of ``phyradgs simulate``
-    with underscores (views, exposure_deg, readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model,
-    peak, lag, jitter_deg, seed …).
+    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm.
+    scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
+    size: voxels along the longest side of grid and reference. detector: columns, rows in proportion.
+    device: what ``--device`` takes, or a Runtime.
+    options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
+    readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
     Raises InputError for what there is not, or what is out of range.
     """
@@ -124,20 +125,23 @@ def reconstruct(
 ) -> Reconstruction:
     """The volume (nz, ny, nx) of a scan in 1/mm, by any method of docs/methods.md, and of splats the Gaussians in mm.
 
-    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md). options:
-    the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested ones are
-    dicts (``control={"every": 50}``). preset: where they start from. grid: its voxels, in place of the scan's; or
-    ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different (docs/methods.md#the-grid). seed: of what is drawn
-    at random; the same seed on the same device gives the same bits. report: a function that is called with every
-    ``Progress``; True: a line with rate and time left, on a terminal or in a notebook; False: nothing. One that raises
-    KeyboardInterrupt ends the run as Ctrl-C does. resume: the partial result of an interrupted run of the same scan and
-    options, to go on from. on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is
-    done: "raise" ``Interrupted``, a KeyboardInterrupt whose ``partial`` is the result so far; "return" that result.
+    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md).
+    options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested
+    ones are dicts (``control={"every": 50}``). preset: where they start from.
+    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
+    (docs/methods.md#the-grid).
+    seed: of what is drawn at random; the same seed on the same device gives the same bits.
+    report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
+    notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
+    resume: the partial result of an interrupted run of the same scan and options, to go on from.
+    on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" a
+    KeyboardInterrupt whose attribute ``partial`` is the result so far, or None; "return" that result.
+    device: what ``--device`` takes, or a Runtime.
 
     Raises:
         InputError: options that the method does not have, or what is no scan, method, grid or partial result.
         NumericalError: numbers overflow.
-        Interrupted: see ``on_interrupt``.
+        KeyboardInterrupt: see ``on_interrupt``.
     """
     _check_reconstruct(scan, grid, report, on_interrupt, seed)
     scan.check_timing()
@@ -154,9 +158,9 @@ def reconstruct(
             )
     except KeyboardInterrupt as error:
         if result is None or on_interrupt == "raise":
-            raise Interrupted(result) from error
+            raise interrupted(result) from error
     if on_interrupt == "raise" and result.facts.get("interrupted_at") is not None:
-        raise Interrupted(result)
+        raise interrupted(result)
     return result
 
 

@@ -41,16 +41,18 @@ def fly_scan(
 ) -> Scan:
     """A scan whose gantry never stops, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given. geometry:
-    distances and pixels in mm. angles_deg: (F,) the gantry's, as each frame's first line opens, counterclockwise seen
-    from above. exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise. readout_ratio:
-    readout over exposure time, from the first line's opening to the last's; 0 is a global shutter. readout: what is read
-    out at one time, "rows" or "columns"; readout_direction: 1 index 0 first, −1 last. exposure_s: of one line, s; only
-    files and times in plots show it. flats, darks: (n, rows, columns) counts without an object, and without a beam (0
-    when None). mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used. quantity: what
-    ``frames`` hold, "attenuation", "transmission" or "counts", where that does not follow from ``flats``. grid: the cube
-    that a full turn sees, in voxels of one pixel at the axis, when None. others: ``detector_model`` ("log" or
-    "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``: fields of ``Scan``.
+    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given.
+    geometry: distances and pixels in mm.
+    angles_deg: (F,) the gantry's, as each frame's first line opens, counterclockwise seen from above.
+    exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise.
+    readout_ratio: readout over exposure time, from the first line's opening to the last's; 0 is a global shutter.
+    readout: what is read out at one time, "rows" or "columns". readout_direction: 1 index 0 first, -1 last.
+    exposure_s: of one line, s; only files and times in plots show it.
+    flats, darks: (n, rows, columns) counts without an object, and without a beam (0 when None).
+    mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used.
+    quantity: what ``frames`` hold, "attenuation", "transmission" or "counts", where ``flats`` do not say it.
+    grid: the cube that a full turn sees, in voxels of one pixel at the axis, when None.
+    others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range, and angles that turn against the exposure.
     """

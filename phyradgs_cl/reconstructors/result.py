@@ -65,19 +65,17 @@ class Reconstruction:
         return plot_result(self, scan, frame, device)
 
 
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, or a notebook's stop button, during a reconstruction.
+def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
+    """A KeyboardInterrupt with the result so far as its attribute ``partial``; None where there is no volume yet.
 
-    Attributes:
-        partial: the ``Reconstruction`` as far as it got, which ``reconstruct(..., resume=partial)`` goes on from; None where
-            there was no volume yet.
+    No class of its own: Python ends by the signal, so that shells stop too, for exactly this one.
     """
-
-    def __init__(self, partial: Reconstruction | None = None) -> None:
-        at = None if partial is None else partial.facts.get("interrupted_at")
-        done = "before there was a volume" if partial is None else "at its end" if at is None else f"after iteration {at}"
-        super().__init__(f"interrupted {done}" + ("" if partial is None else "; the volume so far is the error's partial"))
-        self.partial = partial
+    at = None if partial is None else partial.facts.get("interrupted_at")
+    when = "at its end" if at is None else f"after iteration {at}"
+    kept = f"{when}; the volume so far is the error's partial"
+    error = KeyboardInterrupt(f"interrupted {'before there was a volume' if partial is None else kept}")
+    error.partial = partial  # type: ignore[attr-defined]
+    return error
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,7 @@ class Progress:
     ``loss`` is what ``quantity`` names, dimensionless; ``gaussians``: how many, 0 where there are none.
 
     ``state`` makes what a run needs to go on from here, ``volume`` the present volume (nz, ny, nx) in 1/mm with its grid;
-    both are for the time of the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does, with
-    ``Interrupted``.
+    both are for the time of the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does.
     """
 
     iteration: int

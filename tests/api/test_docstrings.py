@@ -15,7 +15,7 @@ SHAPE = re.compile(r"\((?:[A-Z]\w*|\.\.\.|n?[zvyxu]|n|rows|lines|\d+)(?:,|\))")
 UNIT = re.compile(
     r"\b(?:mm|1/mm|s|rad|radians|degrees|deg|dB|dimensionless|line integrals?|counts|1/s)\b|_(?:mm|s|rad|deg)\b"
 )
-ERROR = re.compile(r"\b[A-Z]\w*Error\b|\bInterrupted\b")
+ERROR = re.compile(r"\b[A-Z]\w*Error\b|\bKeyboardInterrupt\b")
 ARRAYS = ("ndarray", "NDArray", "ArrayLike", "Gaussians", "Scan")
 
 
@@ -73,9 +73,9 @@ def test_a_name_says_what_it_takes_and_gives(name) -> None:
 
 
 def test_the_test_sees_what_is_not_said(monkeypatch) -> None:
-    def silent(volume: "np.ndarray", side_mm: float) -> None: ...  # noqa: F821
+    def silent(volume: np.ndarray, side_mm: float) -> None: ...  # noqa: F821
 
-    def brief(volume: "np.ndarray", side_mm: float) -> None:  # noqa: F821
+    def brief(volume: np.ndarray, side_mm: float) -> None:  # noqa: F821
         """The volume."""
 
     monkeypatch.setattr(api, "silent", silent, raising=False)
