@@ -25,7 +25,8 @@ class Operator:
     domain_shape, range_shape: shapes of x and y; None stands for any length. ``A.T`` is the transpose of the derivative
     at the x of the last call. Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays; pyopencl Arrays
     (float32, C order, on ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its
-    transpose and its frames share their memory on the device: use them one at a time.
+    transpose and its frames share their memory on the device: use them one at a time. ``A.frames([3, 7])`` are some of
+    its frames, ``A.intensity`` is the same for a detector that averages photons.
 
     Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. One of your own has a Runtime rt, domain
     and range_ as (name, shape), at: x to (y, function from dL/dy to dL/dx), and, if it has them, what makes the operators
