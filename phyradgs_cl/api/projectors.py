@@ -121,7 +121,7 @@ def splat_operator(
         )
 
     everything = range(scan.frames)
-    return SplatProjection(engine("log", everything), partial(engine, "intensity"), everything)
+    return SplatProjection(engine("log", everything), everything, partial(engine, "intensity"))
 
 
 class GaussianOperator(Operator):
@@ -148,14 +148,16 @@ class GaussianOperator(Operator):
 class SplatProjection(GaussianOperator):
     """What ``splat_operator`` gives: an ``Operator`` from Gaussians to frames."""
 
-    def __init__(self, engine: SplatOperator, intensity: Any, chosen: Sequence[int]) -> None:
-        """Use ``splat_operator``."""
+    def __init__(
+        self, engine: SplatOperator, chosen: Sequence[int], intensity: Callable[[Sequence[int]], SplatOperator] | None
+    ) -> None:
+        """Of the ``chosen`` frames of a scan; ``intensity`` makes the engine that averages photons in such frames."""
         self._splats = engine
         super().__init__(
             engine,
             (_FRAMES, engine.frames_shape),
-            frames=lambda few: SplatProjection(engine.subset(few), intensity, [chosen[f] for f in few]),
-            intensity=lambda: SplatProjection(intensity(chosen), intensity, chosen),
+            frames=lambda few: SplatProjection(engine.subset(few), [chosen[f] for f in few], intensity),
+            intensity=None if intensity is None else partial(_averaging, intensity, chosen),
         )
 
     def of_densities(self, gaussians: Gaussians) -> LinearOperator:
@@ -165,6 +167,10 @@ class SplatProjection(GaussianOperator):
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
         linear = DensityOperator(engine, engine.rows.enter(placed(rt, rows, True)))
         return _densities(rt, linear, rows.shape[1], engine.frames_shape)
+
+
+def _averaging(engine: Callable[[Sequence[int]], SplatOperator], chosen: Sequence[int]) -> SplatProjection:
+    return SplatProjection(engine(chosen), chosen, None)
 
 
 def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: Shape) -> LinearOperator:
@@ -217,6 +223,7 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
     Raises InputError for what is no Scan, and a count or a seed below 0.
     """
     check_scan(scan)
+    checks.whole("count (0 chooses it from the grid)", count, 0, 100_000_000)
     checks.whole("seed", seed, 0, 2**63)
     options = SplatOptions(gaussians=count)
     scale, population, _ = first_cloud(runtime_of(device), scan, options, seed)

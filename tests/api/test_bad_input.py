@@ -296,7 +296,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: api.voxelise(Gaussians.from_rows(FLAT + 1), (8, 8, 8)), "grid: found"),
     ],
     "initial_gaussians": [
-        (lambda: api.initial_gaussians(GOOD, -1), "--gaussians"),
+        (lambda: api.initial_gaussians(GOOD, -1), "count .*found -1"),
         (lambda: api.initial_gaussians(FRAMES), "scan: found .*expected a Scan"),
         (lambda: api.initial_gaussians(GOOD, seed=-1), "seed: found -1"),
     ],
@@ -307,6 +307,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: splats().frames([]), "frames: found"),
         (lambda: rays().T.frames([0]), "frames: .*from something to frames"),
         (lambda: rays().intensity.intensity, "intensity: .*line integrals"),
+        (lambda: splats().intensity.intensity, "intensity: .*line integrals"),
         (lambda: rays().to_device("x"), "values: found str"),
         (lambda: rays().T(FRAMES[:1]), r"frames: found shape \(1, 6, 8\)"),
     ],
