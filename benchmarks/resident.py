@@ -2,7 +2,7 @@
 
     python benchmarks/resident.py OTHER [--pairs N] [--json docs/results/resident.json] [--quick] [--device D]
 
-OTHER is the folder of another checkout. A fly-scan of the jaw, 25 frames of 256² on 128³ voxels, every line at its own times,
+OTHER is the folder of another checkout. A fly-scan of the jaw, 25 frames of 256² on 128³ voxels, each line at its own times,
 is made once; then both checkouts reconstruct it in turns, each run in a process of its own. Figures are processor seconds of
 an iteration over all threads (the first one, which builds kernels, and the set-up excepted), the least of all pairs, and the
 median of the ratios pair by pair, which a busy machine spoils less than seconds.

@@ -113,8 +113,10 @@ def nothing(rt: Runtime) -> None:
 
 def tiny_scan(rt: Runtime, model: str) -> Scan:
     volume = np.random.default_rng(0).uniform(0, 1, GRID.shape).astype(np.float32)
-    source = VolumeSource(rt, volume, GRID, GEOMETRY, "rows")
-    options = SimulationOptions(Protocol(views=3, exposure_deg=20.0), detector_model=model, time_samples=2)
+    axis = "rows" if model == "log" else "columns"
+    source = VolumeSource(rt, volume, GRID, GEOMETRY, axis)
+    protocol = Protocol(views=3, exposure_deg=20.0)
+    options = SimulationOptions(protocol, axis, detector_model=model, time_samples=2)
     return simulate(source, GEOMETRY, GRID, options)
 
 
@@ -127,7 +129,7 @@ def method(rt: Runtime, name: str, motion: str) -> None:
         changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0, "shape_weight": 0.1}
         changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
     elif name != "fdk":
-        changes["iterations"] = 1
+        changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
     reconstruct(scan, name, rt, method_options(name, None, changes))
 
 

@@ -39,6 +39,7 @@ RUNS = [
     ("sirt", {"iterations": 2, "motion": "per-row"}),
     ("asd-pocs", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 2, "motion": "static"}),
+    ("fista-tv", {"iterations": 1, "motion": "per-row"}),
 ]
 IDS = [f"{name} {changes['motion']}" for name, changes in RUNS]
 
@@ -65,8 +66,8 @@ def scan(rt) -> Scan:
     x = np.linspace(-1, 1, 14)
     ball = (x[None, None] ** 2 + x[None, 1:13, None] ** 2 + x[1:12, None, None] ** 2 < 0.6).astype(np.float32)
     protocol = Protocol(views=5, exposure_deg=20.0)
-    options = SimulationOptions(protocol, detector_model="intensity", time_samples=3)
-    return simulate(VolumeSource(rt, ball, GRID, GEOMETRY, "rows"), GEOMETRY, GRID, options)
+    options = SimulationOptions(protocol, "columns", detector_model="intensity", time_samples=3)
+    return simulate(VolumeSource(rt, ball, GRID, GEOMETRY, "columns"), GEOMETRY, GRID, options)
 
 
 @pytest.mark.parametrize(("name", "changes"), RUNS, ids=IDS)

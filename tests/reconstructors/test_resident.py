@@ -36,7 +36,7 @@ def scan() -> Scan:
     return replace(simulate(AnalyticSource(shepp_logan(1.0), geometry), geometry, GRID, options), pixel_mask=mask)
 
 
-def options_of(method: str, model: str, iterations: int = 6):
+def options_of(method: str, model: str, iterations: int = 4):
     changes = {"motion": "per-row", "sub_intervals": 2, "iterations": iterations, "detector_model": model}
     if method in ("sart", "fista-tv"):
         changes["transmission_weights"] = True
@@ -52,7 +52,7 @@ def test_an_iteration_moves_numbers_alone(scan, method, model) -> None:
     seen: list[Traffic] = []
     result = reconstruct(scan, method, rt, options_of(method, model), report=lambda p: seen.append(replace(rt.traffic)))
     moved = np.diff([(t.bytes_up, t.bytes_down, t.blocking) for t in seen], axis=0)
-    assert len(moved) == 5
+    assert len(moved) == 3
     assert moved[:, 1].min() > 0, "the record has numbers, which somebody has to have asked for"
     assert moved[:, :2].sum(axis=1).max() <= MOST_BYTES
     assert rt.traffic.bytes_down - seen[-1].bytes_down == result.volume.nbytes

@@ -90,3 +90,16 @@ def test_a_shortage_is_met_once(caplog) -> None:
 def test_a_buffer_of_nothing_takes_one_element(rt) -> None:
     assert rt.download(rt.empty((0, 7))).shape == (0, 7)
     assert rt.upload(np.zeros((3, 0), np.float32)).nbytes == 0
+
+
+def test_traffic_is_what_crosses_the_bus() -> None:
+    rt = Runtime()
+    x = rt.upload(np.arange(6, dtype=np.float32))
+    rt.write(x, np.zeros(6, np.float32))
+    y = rt.zeros(6)
+    rt.copy(x, y)
+    assert (rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking) == (48, 0, 2)
+    rt.download(y)
+    rt.read_item(y, 2)
+    rt.finish()
+    assert (rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking) == (48, 28, 5)
