@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +17,13 @@ from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, pos
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
+from phyradgs_cl.text import near_miss
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DETECTOR_MODELS = ("log", "intensity")
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
 
 
@@ -101,7 +104,8 @@ class Scan:
         """A stop-and-shoot scan with a pose of its own for every frame.
 
         frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next
-        column, step to the next row, x y z each. grid: the cube that a full turn sees when None. others: fields of ``Scan``.
+        column, step to the next row, x y z each. grid: the cube that a full turn sees when None. others: fields of ``Scan``:
+        detector_model, pixel_mask, reference, title, lag, provenance.
 
         Raises InputError for shapes that do not fit, and a panel that the source does not face.
         """
@@ -114,6 +118,7 @@ class Scan:
         geometry = plain_geometry(table, panel)
         shutter, start_s = Shutter(0.0), np.arange(len(values), dtype=np.float64)
         trajectory = resting_trajectory(geometry, table, start_s)
+        check_others(others)
         return cls(values, geometry, trajectory, shutter, start_s, grid or default_grid(geometry), False, **others)
 
     @classmethod
@@ -210,6 +215,13 @@ class Scan:
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
+
+
+def check_others(others: Iterable[str]) -> None:
+    """InputError for a keyword that is none of the fields of a scan that whoever has frames may add."""
+    for name in others:
+        if name not in _OTHERS:
+            raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
 
 
 def _line_integrals(frames: ArrayLike) -> np.ndarray:

@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.scan import check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.options import QUANTITIES, ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
-from phyradgs_cl.text import near_miss
 
-_OTHERS = ("detector_model", "reference", "title", "lag", "provenance")
 _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the gantry turns
 
 
@@ -151,11 +150,9 @@ def _scan(
     pixels: LineIntegrals, orbit: CircularOrbit, shutter: Shutter, start_s: np.ndarray, grid: Grid | None, is_fly: bool,
     others: dict[str, Any],
 ) -> Scan:  # fmt: skip
-    for name in others:
-        if name not in _OTHERS:
-            raise InputError(
-                name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out")
-            )
+    check_others(others)
+    if "pixel_mask" in others:
+        raise InputError("pixel_mask", "an option of Scan itself", "mask", "write mask=")
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly
     return Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import operator
 import os
 import sys
 import time
@@ -87,10 +88,6 @@ def imported(text: str) -> Any:
         sys.path.append(os.getcwd())
     try:
         found = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
-    except AttributeError:
-        raise InputError("--method", text, f"a function {name} in {module}") from None
     except ModuleNotFoundError as error:
         remedy = "start in its folder, or add that to PYTHONPATH"
         raise InputError("--method", f"{text}: {error}", "package.module:function", remedy) from error
@@ -98,7 +95,10 @@ def imported(text: str) -> Any:
         raise InputError(
             "--method", f"{text}: {type(error).__name__}: {error}", "a module that can be imported"
         ) from error
-    return found
+    try:
+        return operator.attrgetter(name)(found)
+    except AttributeError:
+        raise InputError("--method", text, f"a function {name} in {module}") from None
 
 
 def plain(facts: Mapping[str, Any]) -> dict[str, Any]:

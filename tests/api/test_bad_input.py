@@ -132,6 +132,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: fly(detektor_model="log"), "detektor_model: .*did you mean 'detector_model'"),
         (lambda: fly(detector_model="linear"), "detector_model: found 'linear'"),
         (lambda: fly(grid=16), "grid: found 16; expected a Grid"),
+        (lambda: fly(pixel_mask=FRAMES[0]), "pixel_mask: .*write mask="),
     ],
     "static_scan": [
         (lambda: static_scan(FRAMES, CONE, ANGLES[:2]), r"angles_deg: found shape \(2,\)"),
@@ -149,6 +150,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: replace(GOOD, frame_start_s=[0.0]), r"frame_start_s: found shape \(1,\)"),
         (lambda: replace(GOOD, pixel_mask=np.ones(6)), r"pixel_mask: found shape \(6,\)"),
         (lambda: replace(GOOD, reference=np.ones((2, 2, 2))), r"reference: found shape \(2, 2, 2\)"),
+        (lambda: Scan.from_poses(FRAMES, POSES, is_fly=True), "is_fly: found no such option"),
         (lambda: GOOD.plot(4), "frame: found 4; expected a number from 0 to 3"),
         (
             lambda: reconstruct(replace(GOOD, trajectory=Nowhere()), "fdk"),
