@@ -1,7 +1,5 @@
 """Checks for the public doors: each raises InputError with the culprit's name, or returns nothing."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """How far a run is, on stderr: one line rewritten on a terminal or in a notebook, a line every ten seconds elsewhere."""
 
-from __future__ import annotations
-
 import sys
 import time
 from contextlib import suppress
@@ -34,7 +32,7 @@ class Ticker:
         self.first: int | None = None
         self.is_open = self.is_counting = False
 
-    def __enter__(self) -> Ticker:
+    def __enter__(self) -> "Ticker":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -48,7 +46,6 @@ class Ticker:
             self.is_open, self.is_counting = True, False
 
     def progress(self, p: Progress) -> None:
-        """The report of a reconstruction."""
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 

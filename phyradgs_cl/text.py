@@ -1,7 +1,5 @@
 """Text from strangers: made fit for terminals, pages and files, and compared with what is known."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable

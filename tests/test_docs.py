@@ -21,7 +21,6 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
-from phyradgs_cl.reconstructors.registry import Method
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -68,9 +67,7 @@ def test_the_worked_example_of_a_method_works(rt, small_scan, monkeypatch) -> No
     module = ModuleType("landweber_of_the_docs")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     exec(compile(source, "docs/methods.md", "exec"), module.__dict__)
-    line = next(b for b in re.findall(r"```python\n(.*?)```", text, re.S) if '"landweber":' in b)
-    entry = eval("{" + line.strip() + "}", {**module.__dict__, "Method": Method})
-    monkeypatch.setitem(METHODS, "landweber", entry["landweber"])
+    monkeypatch.setitem(METHODS, "landweber", module.METHOD)
     static, fly = (
         reconstruct(
             small_scan,

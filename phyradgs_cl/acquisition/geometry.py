@@ -1,10 +1,8 @@
 """Cone-beam geometry: where source and detector stand at a gantry angle.
 
-A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from one
-column to the next (û·du) and from one row to the next (v̂·dv). Operators take poses, never angles.
+A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
+and from row to row (v̂·dv). Operators take poses, never angles.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
@@ -56,7 +54,7 @@ class ConeGeometry:
         )
         return np.concatenate([self.source_to_axis_mm * radial, first_pixel, du * u_hat, dv * v_hat], -1)
 
-    def scaled(self, factor: float) -> ConeGeometry:
+    def scaled(self, factor: float) -> "ConeGeometry":
         """The same geometry with every length multiplied by ``factor``."""
         dv, du = self.pixel_size_mm
         off_v, off_u = self.detector_offset_mm
@@ -68,7 +66,7 @@ class ConeGeometry:
             detector_offset_mm=(off_v * factor, off_u * factor),
         )
 
-    def finer(self, factor: int) -> ConeGeometry:
+    def finer(self, factor: int) -> "ConeGeometry":
         """The same panel with every pixel cut into ``factor`` by ``factor``."""
         rows, columns = self.detector_shape
         dv, du = self.pixel_size_mm

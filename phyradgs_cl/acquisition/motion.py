@@ -1,10 +1,8 @@
 """Motion models: how a reconstruction turns a frame of a scan into time cells.
 
-A model is a small frozen class with ``cells(scan, frame)``; a class of your own works in every method (docs/methods.md). A
-scan that is not a fly-scan has one pose per frame in every model here.
+A model is a frozen class with ``cells(scan, frame)``; one of your own works in every method (docs/methods.md). A scan
+that is not a fly-scan has one pose per frame in all of these.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
@@ -34,7 +32,6 @@ class Motion(Interface):
 
 
 def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int]:
-    """What the builders of cells begin with."""
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 
@@ -156,10 +153,8 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """The inverse of ``motion_facts``; None for a model that is not ours. Fields of other models are passed over.
-
-    Raises InputError and TypeError for values that a model does not take.
-    """
+    """The inverse of ``motion_facts``; None for a model that is not ours, whose fields are passed over. InputError and
+    TypeError for values that a model does not take."""
     name = facts.get("name")
     for model in MODELS:
         own = [f.name for f in fields(model) if f.init]

@@ -23,9 +23,7 @@ def plot_frame(scan: Scan, frame: int) -> Figure:
     figure = new_figure(10, 4.2)
     picture, windows = figure.subplots(1, 2, width_ratios=(1, 1.1))
     image = scan.projections[frame].astype(np.float64)
-    if scan.pixel_mask is not None:
-        mask = np.asarray(scan.pixel_mask)
-        image[(mask if mask.ndim == 2 else mask[frame]) != 0] = np.nan
+    image[~scan.valid[frame]] = np.nan
     size_mm = tuple(
         n * d for n, d in zip(scan.geometry.detector_shape, scan.geometry.pixel_size_mm, strict=True)
     )

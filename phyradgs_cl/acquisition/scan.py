@@ -76,9 +76,8 @@ class Scan:
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
         if self.projections.shape != expected:
-            raise InputError(
-                "projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}"
-            )
+            found = f"shape {self.projections.shape}"
+            raise InputError("projections", found, f"(frames, rows, columns) = {expected}")
         if frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
         object.__setattr__(self, "frame_start_s", checks.numbers("frame_start_s", self.frame_start_s, (frames,)))
@@ -183,6 +182,12 @@ class Scan:
         return len(self.projections)
 
     @property
+    def valid(self) -> np.ndarray:
+        """Which pixels may be used, bool (F, nv, nu): a view."""
+        unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
+        return np.broadcast_to(unmasked, self.projections.shape)
+
+    @property
     def lines(self) -> int:
         """Lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
@@ -194,7 +199,8 @@ class Scan:
         reference = self.reference
         if reference is not None:
             first = grid.start_in(self.grid)
-            reference = None if first is None else _part(reference, first, grid.shape)
+            parts = None if first is None else [slice(s, s + n) for s, n in zip(first, grid.shape, strict=True)]
+            reference = None if parts is None else reference[tuple(parts)]
         return replace(self, grid=grid, reference=reference)
 
     def with_grid(self, choice: GridChoice) -> Scan:
@@ -232,8 +238,3 @@ def _line_integrals(frames: ArrayLike) -> np.ndarray:
     if not all(np.isfinite(frame).all() for frame in values):  # by frame, which needs little memory
         checks.finite("projections", values)
     return values
-
-
-def _part(volume: np.ndarray, first: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    z, y, x = (slice(start, start + count) for start, count in zip(first, shape, strict=True))
-    return volume[z, y, x]

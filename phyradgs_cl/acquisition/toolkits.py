@@ -5,8 +5,6 @@ TIGRE's cone is ours: source at (DSO cos α, DSO sin α, 0), columns along the t
 its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -91,13 +91,8 @@ class EncoderTable:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        time_s = checks.numbers(f"{self.culprit} times", self.time_s)
-        table = checks.numbers(f"{self.culprit} angles", self.angle_rad_table)
-        if time_s.ndim != 1 or time_s.size < 2 or table.shape != time_s.shape:
-            found = f"shapes {time_s.shape} and {table.shape}"
-            raise InputError(self.culprit, found, "two equal 1D arrays of at least 2 samples")
-        if np.any(np.diff(time_s) <= 0):
-            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        wanted = "two equal 1D arrays of at least 2 samples"
+        time_s, table = _checked_table(self.culprit, self.time_s, self.angle_rad_table, (), "angles", wanted)
         object.__setattr__(self, "time_s", time_s)
         object.__setattr__(self, "angle_rad_table", table)
 
@@ -182,13 +177,8 @@ class PoseTable:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        time_s = checks.numbers(f"{self.culprit} times", self.time_s)
-        table = checks.numbers(self.culprit, self.table)
-        if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, POSE_LENGTH):
-            found = f"shapes {time_s.shape} and {table.shape}"
-            raise InputError(self.culprit, found, "times (T,) and poses (T, 12), T at least 2")
-        if np.any(np.diff(time_s) <= 0):
-            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        expected, row = "times (T,) and poses (T, 12), T at least 2", (POSE_LENGTH,)
+        time_s, table = _checked_table(self.culprit, self.time_s, self.table, row, "poses", expected)
         normal = np.cross(table[:, 6:9], table[:, 9:12])
         if np.any(np.linalg.norm(normal, axis=1) <= 0):
             raise InputError(self.culprit, "parallel pixel steps", "û·du and v̂·dv that span a plane")
@@ -229,11 +219,8 @@ def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.n
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) + ``span_s``.
-
-    Raises InputError where a fine table still does not follow it, as where frames that overlap in time are elsewhere at the
-    same moment.
-    """
+    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) +
+    ``span_s``; InputError where a fine table does not, as where frames overlap in time and are elsewhere."""
     apart = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)
@@ -260,8 +247,20 @@ def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.
 
 
 def _check_finite(kinematics: ConstantSpeed | SpeedRamp) -> None:
-    for field_ in fields(kinematics):
-        checks.numbers(field_.name, getattr(kinematics, field_.name), ())
+    for one in fields(kinematics):
+        checks.numbers(one.name, getattr(kinematics, one.name), ())
+
+
+def _checked_table(
+    culprit: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rising times (T,) and finite rows (T, *row), float64."""
+    time_s, table = checks.numbers(f"{culprit} times", times), checks.numbers(f"{culprit} {what}", rows)
+    if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
+        raise InputError(culprit, f"shapes {time_s.shape} and {table.shape}", expected)
+    if np.any(np.diff(time_s) <= 0):
+        raise InputError(culprit, "times that do not increase", "strictly increasing times in s")
+    return time_s, table
 
 
 def _body_frames(table: np.ndarray) -> np.ndarray:
@@ -276,9 +275,6 @@ def _check_covered(culprit: str, frame: int, t: np.ndarray, table_s: np.ndarray)
     """A measured table is never extrapolated; a nanosecond of slack absorbs rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
-        raise InputError(
-            culprit,
-            f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s",
-            f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)",
-            "extend the table or drop the frame",
-        )
+        found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"
+        expected = f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)"
+        raise InputError(culprit, found, expected, "extend the table or drop the frame")

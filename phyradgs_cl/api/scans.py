@@ -1,7 +1,5 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +11,10 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Sc
 from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.scan import check_others
 from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.detector.attenuation import QUANTITIES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.options import QUANTITIES, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
 
 _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the gantry turns

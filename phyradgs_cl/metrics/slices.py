@@ -1,7 +1,5 @@
 """A figure of the three middle slices beside the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,22 +24,12 @@ _INCH, _DPI = 3.2, 110
 def slices_png(
     path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str, grid: Grid | None = None
 ) -> None:
-    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference.
+    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference. z and y point up.
 
-    Grey values run over the truth's range in both columns, so that a wrong gain shows; the difference has
-    a scale of its own, symmetric about 0. Titles carry the slice's number and root mean square error, the
-    heading PSNR and SSIM. z and y point up in the pictures.
-
-    Args:
-        path: file to write.
-        result: (z, y, x).
-        reference: (z, y, x), the truth, or None where there is none: then there is one column.
-        title: the heading's first line.
-        grid: of both, for a bar of a length in mm; None draws none.
-
-    Raises:
-        InputError: not 3D, shapes that differ, NaN or infinity.
-        OutputError: the file cannot be written.
+    Grey values run over the truth's range, so that a wrong gain shows; the difference has a scale of its own, symmetric
+    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line; ``grid`` of
+    both, for a bar of a length. InputError: not 3D, shapes that differ, NaN or infinity. OutputError: the file cannot be
+    written.
     """
     volume = np.asarray(result)
     shape("result", volume, (None, None, None))
@@ -63,10 +51,8 @@ def _numbers(result: Image, reference: Image) -> str:
     return f"PSNR {psnr(result, reference):.2f} dB, SSIM {ssim(result, reference):.4f}"
 
 
-def draw_slices(figure: FigureBase, volume: Image, truth: Image | None, grid: Grid | None) -> None:
-    """The three middle slices of a volume (z, y, x) in 1/mm below each other; of a truth, and of the difference, beside
-    them.
-    """
+def draw_slices(figure: "FigureBase", volume: Image, truth: Image | None, grid: Grid | None) -> None:
+    """The middle slices of a volume (z, y, x) in 1/mm below each other, those of a truth and of the difference beside."""
     if truth is not None:
         shape("reference", truth, volume.shape)
         finite("reference", truth)

@@ -1,7 +1,5 @@
 """Frames of a scan against the same frames computed from a volume, each line at its own times."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,17 +55,10 @@ def frame_pairs(
         computed = computed - operator.intensity_gap(volume)
     pairs = []
     for frame, image in zip(frames, computed, strict=True):
-        valid = _valid(scan, frame)
+        valid = scan.valid[frame]
         measured = np.where(valid, scan.projections[frame], 0).astype(np.float32)
         pairs.append(FramePair(frame, measured, np.where(valid, image, 0).astype(np.float32), valid))
     return pairs
-
-
-def _valid(scan: Scan, frame: int) -> NDArray[np.bool_]:
-    if scan.pixel_mask is None:
-        return np.ones(scan.geometry.detector_shape, bool)
-    mask = np.asarray(scan.pixel_mask)
-    return (mask if mask.ndim == 2 else mask[frame]) == 0
 
 
 def _rms(values: NDArray[np.floating]) -> float:

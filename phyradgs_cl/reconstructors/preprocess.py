@@ -11,7 +11,6 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.fields import GridChoice
-from phyradgs_cl.reconstructors.fdk import unmasked_frames
 
 MEDIAN_EDGES = (0, 3, 5)
 
@@ -52,3 +51,20 @@ def median_frames(scan: Scan, edge: int) -> np.ndarray:
     frames = unmasked_frames(scan)
     smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]
     return np.stack(smooth).astype(np.float32)
+
+
+def unmasked_frames(scan: Scan) -> np.ndarray:
+    """The scan's line integrals with masked pixels filled in, for methods that cannot leave pixels out."""
+    if scan.pixel_mask is None:
+        return scan.projections
+    return fill_masked(scan.projections, np.broadcast_to(scan.pixel_mask != 0, scan.projections.shape))
+
+
+def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Frames (F, v, u) with masked pixels linearly interpolated along their row (0 in a row without any)."""
+    filled = frames.copy()
+    for f, v in zip(*np.nonzero(mask.any(axis=-1)), strict=True):
+        bad = mask[f, v]
+        good = np.flatnonzero(~bad)
+        filled[f, v, bad] = np.interp(np.flatnonzero(bad), good, filled[f, v, good]) if good.size else 0.0
+    return filled

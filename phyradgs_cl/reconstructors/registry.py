@@ -1,53 +1,68 @@
-"""The methods by name, and those of one's own. Adding one is a file beside this one and a line in METHODS."""
+"""The methods by name, and those of one's own. Adding one is a file that says its METHOD, and a line in METHODS."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import fields, is_dataclass, replace
+from importlib import import_module
 from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, Motion, Scan
 from phyradgs_cl.acquisition.motion import MODELS, STILL, check_own_motion
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, fdk
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
-from phyradgs_cl.reconstructors.neural.naf import NAF_PRESETS, naf
-from phyradgs_cl.reconstructors.neural.sax_nerf import SAX_PRESETS, sax_nerf
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
-from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED
-from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
-from phyradgs_cl.reconstructors.splats.r2 import r2
-from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocsOptions, asd_pocs
-from phyradgs_cl.reconstructors.voxels.cgls import CglsOptions, cgls
-from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions, fista_tv
-from phyradgs_cl.reconstructors.voxels.sart import OS_SART, SartOptions, os_sart, sart
-from phyradgs_cl.reconstructors.voxels.sirt import SirtOptions, sirt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
-_ALL = (*STILL, Exact())
+_ALL = (*STILL, Exact())  # of methods of one's own
 
 
-METHODS = {
-    "phyradgs": Method(phyradgs, PRESETS, is_shared=True),
-    "r2": Method(r2, {"published": R2_PUBLISHED}, is_shared=True),
-    "sart": Method(sart, {"default": SartOptions()}, is_shared=True),
-    "os-sart": Method(os_sart, {"default": OS_SART}, is_shared=True),
-    "sirt": Method(sirt, {"default": SirtOptions()}, is_shared=True),
-    "cgls": Method(
-        cgls, {"default": CglsOptions()}, is_shared=True, stops_itself=lambda options: options.noise_stop > 0
-    ),
-    "asd-pocs": Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True),
-    "fista-tv": Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True),
-    "naf": Method(naf, NAF_PRESETS),
-    "sax-nerf": Method(sax_nerf, SAX_PRESETS),
-    "fdk": Method(fdk, FDK_PRESETS, is_resumable=False),
-}
+class _Methods(MutableMapping[str, Method]):
+    """Methods by name, each imported when it is asked for: what it needs takes time."""
+
+    def __init__(self, places: Mapping[str, str]) -> None:
+        self._found: dict[str, str | Method] = dict(places)
+
+    def __getitem__(self, name: str) -> Method:
+        found = self._found[name]
+        if isinstance(found, str):
+            module, _, attribute = found.partition(":")
+            found = getattr(import_module(f"phyradgs_cl.reconstructors.{module}"), attribute or "METHOD")
+            self._found[name] = found
+        return found
+
+    def __setitem__(self, name: str, method: Method) -> None:
+        self._found[name] = method
+
+    def __delitem__(self, name: str) -> None:
+        del self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+
+METHODS = _Methods({
+    "phyradgs": "splats.phyradgs",
+    "r2": "splats.r2",
+    "sart": "voxels.sart",
+    "os-sart": "voxels.sart:OS_METHOD",
+    "sirt": "voxels.sirt",
+    "cgls": "voxels.cgls",
+    "asd-pocs": "voxels.asd_pocs",
+    "fista-tv": "voxels.fista_tv",
+    "naf": "neural.naf",
+    "sax-nerf": "neural.sax_nerf",
+    "fdk": "fdk",
+})
 
 
 def method_name(method: object) -> str:

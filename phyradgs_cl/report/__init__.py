@@ -1,17 +1,5 @@
 """A reconstruction as a page, a picture or a window for people."""
 
-from phyradgs_cl.report.page import report_page, write_report
-from phyradgs_cl.report.pictures.preview import Preview, check_preview, write_preview
-from phyradgs_cl.report.pictures.volume_viewer import view_volume
-from phyradgs_cl.report.run import Run, load_run
+import lazy_loader
 
-__all__ = [
-    "Preview",
-    "Run",
-    "check_preview",
-    "load_run",
-    "report_page",
-    "view_volume",
-    "write_preview",
-    "write_report",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

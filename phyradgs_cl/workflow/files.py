@@ -1,25 +1,17 @@
 """Files by what they are: scans, references and volumes, and what each says of itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
+from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers import foreign_volume, load_volume, recognise
-from phyradgs_cl.io import (
-    file_kind,
-    read_scan,
-    read_volume,
-    scan_summary,
-    volume_summary,
-)
+from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 from phyradgs_cl.io.hdf5.source import open_hdf5
 
@@ -58,7 +50,7 @@ def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
 def _is_foreign_scan(path: Path) -> bool:
     """Whether ``import`` knows the format; an NXtomo file is ours if it says what its frames are."""
     try:
-        if recognise(path) != "nxtomo":
+        if importers.recognise(path) != "nxtomo":
             return True
         with open_hdf5(path) as source:
             data = [source.find(f"{entry}/instrument/detector/data") for entry in source.root_groups()]
@@ -77,20 +69,19 @@ def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
 def load_result(path: Path) -> tuple[np.ndarray, Grid | None, dict[str, object]]:
     """A volume file of any format: values (z, y, x), its grid if it has one, and our own files' provenance."""
     with expecting(path, "volume", "plain-volume"):
-        if foreign_volume(path) is None and file_kind(path) == "volume":
+        if importers.foreign_volume(path) is None and file_kind(path) == "volume":
             stored = read_volume(path)
             return stored.volume, stored.grid, stored.provenance
-        return *load_volume(path), {}
+        return *importers.load_volume(path), {}
 
 
 def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
     """The reference in a scan, or a volume file of any format; bare values have no grid."""
-    if foreign_volume(path) is None and file_kind(path) == "scan":
+    if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
-            raise InputError(
-                f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth"
-            )
+            expected = "a scan with a known truth"
+            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
         return scan.reference, scan.grid
     volume, grid, _ = load_result(path)
     return volume, grid
@@ -98,7 +89,7 @@ def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
 
 def summary(path: Path) -> dict[str, object]:
     """Facts about a scan or volume file for people."""
-    if (form := foreign_volume(path)) is not None:
+    if (form := importers.foreign_volume(path)) is not None:
         return {"kind": f"volume ({form})", **_voxel_facts(path)}
     with expecting(path, "scan", "volume", "plain-volume"):
         kind = file_kind(path)
@@ -114,7 +105,7 @@ def summary(path: Path) -> dict[str, object]:
 
 
 def _voxel_facts(path: Path) -> dict[str, object]:
-    volume, grid = load_volume(path)
+    volume, grid = importers.load_volume(path)
     where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
     return {"shape": volume.shape, **where, "minimum": float(volume.min()), "maximum": float(volume.max())}
 

@@ -10,7 +10,7 @@ from corpus import imports
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import checkpoint_path, write_checkpoint
-from phyradgs_cl.io.hashing import sha256_of
+from phyradgs_cl.io.sha256 import sha256_of
 from phyradgs_cl.reconstructors import Progress, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import run_settings

@@ -9,7 +9,7 @@ from tolerances import FLOAT64, RAMP
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.fdk import FDK_PRESETS, FdkOptions, fdk_volume
+from phyradgs_cl.reconstructors.fdk import METHOD, FdkOptions, fdk_volume
 from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter, ramp_spectrum
 
 FROM_SHARP_TO_SMOOTH = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
@@ -70,8 +70,8 @@ def test_noise_falls_from_window_to_window(rt) -> None:
 
 
 def test_windows_are_presets_and_options() -> None:
-    assert list(FDK_PRESETS) == list(WINDOWS) == FROM_SHARP_TO_SMOOTH
-    assert next(iter(FDK_PRESETS.values())) == FdkOptions()
-    assert all(options.window == name for name, options in FDK_PRESETS.items())
+    assert list(METHOD.presets) == list(WINDOWS) == FROM_SHARP_TO_SMOOTH
+    assert next(iter(METHOD.presets.values())) == FdkOptions()
+    assert all(options.window == name for name, options in METHOD.presets.items())
     with pytest.raises(InputError, match=r"boxcar.*'hann'"):
         FdkOptions("boxcar")

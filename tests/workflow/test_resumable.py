@@ -13,7 +13,7 @@ from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import ReconstructionJob
-from phyradgs_cl.workflow.resumable import go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import go_on, is_whole
 
 
 class Report:

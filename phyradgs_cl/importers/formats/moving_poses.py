@@ -1,7 +1,5 @@
 """Poses that no circle describes: tables of them over time, row 0 the lowest, with a plain geometry to go by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -46,11 +44,8 @@ def turn_of(pose: np.ndarray) -> Turned:
 
 
 def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, culprit: str) -> PoseTable:
-    """A pose table that covers every frame's window.
-
-    ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to frame 3, and beyond the
-    ends it goes on as it went. A gantry at rest gets a table whose value at each frame's middle is that frame's pose.
-    """
+    """A pose table that covers every frame's window. ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is
+    halfway from frame 2 to 3; a gantry at rest has each frame's pose at its middle."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         poses = pose_at(np.arange(len(at_s), dtype=np.float64))

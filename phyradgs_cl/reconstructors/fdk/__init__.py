@@ -25,6 +25,8 @@ from phyradgs_cl.reconstructors.fdk.views import (
     warn_if_incomplete,
     widened,
 )
+from phyradgs_cl.reconstructors.method import Method
+from phyradgs_cl.reconstructors.preprocess import unmasked_frames
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.runtime import Runtime
 
@@ -50,9 +52,6 @@ class FdkOptions:
         check_motion(self.motion, self.MOTIONS)
 
 
-FDK_PRESETS = {window: FdkOptions(window) for window in WINDOWS}  # the first is the default
-
-
 def fdk(
     scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
 ) -> Reconstruction:
@@ -65,6 +64,9 @@ def fdk(
     volume = fdk_volume(rt, frames, pose, scan.grid, window=options.window, axis=axis)
     facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
+
+
+METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, is_resumable=False)
 
 
 def fdk_volume(
@@ -127,20 +129,3 @@ def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
     """FDK (z, y, x) in 1/mm at the mid-window poses: what other methods start from, or measure themselves by."""
     pose = np.concatenate([Static().cells(scan, f).pose for f in range(scan.frames)])
     return fdk_volume(rt, unmasked_frames(scan), pose, scan.grid)
-
-
-def unmasked_frames(scan: Scan) -> np.ndarray:
-    """The scan's line integrals with masked pixels filled in, for methods that cannot leave pixels out."""
-    if scan.pixel_mask is None:
-        return scan.projections
-    return fill_masked(scan.projections, np.broadcast_to(scan.pixel_mask != 0, scan.projections.shape))
-
-
-def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Frames (F, v, u) with masked pixels linearly interpolated along their row (0 in a row without any)."""
-    filled = frames.copy()
-    for f, v in zip(*np.nonzero(mask.any(axis=-1)), strict=True):
-        bad = mask[f, v]
-        good = np.flatnonzero(~bad)
-        filled[f, v, bad] = np.interp(np.flatnonzero(bad), good, filled[f, v, good]) if good.size else 0.0
-    return filled

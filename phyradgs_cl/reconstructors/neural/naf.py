@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.neural import NeuralOptions
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.neural.run import reconstruct_neural
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.runtime import Runtime
@@ -41,3 +42,6 @@ def naf(
 ) -> Reconstruction:
     """The volume (nz, ny, nx) in 1/mm of a neural field; the seed draws first parameters, frames, pixels and samples."""
     return reconstruct_neural(scan, options, rt, seed, report, "naf", resume)
+
+
+METHOD = Method(naf, NAF_PRESETS)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.neural import LineOptions
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.neural.naf import NAF_PUBLISHED
 from phyradgs_cl.reconstructors.neural.run import reconstruct_neural
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
@@ -29,3 +30,6 @@ def sax_nerf(
 ) -> Reconstruction:
     """The volume (nz, ny, nx) in 1/mm of a neural field; the seed draws first parameters, frames, pixels and samples."""
     return reconstruct_neural(scan, options, rt, seed, report, "sax-nerf", resume)
+
+
+METHOD = Method(sax_nerf, SAX_PRESETS)

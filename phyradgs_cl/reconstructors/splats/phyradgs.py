@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.reconstructors.splats.method import reconstruct_splats
-from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.options import PRESETS, SplatOptions
 from phyradgs_cl.runtime import Runtime
 
 
@@ -20,3 +21,6 @@ def phyradgs(
 ) -> Reconstruction:
     """Reconstructs a scan with M×N micro-views per frame; ``options.motion`` static is the paper's "w/o ST"."""
     return reconstruct_splats(scan, options, rt, seed, report, "phyradgs", resume)
+
+
+METHOD = Method(phyradgs, PRESETS, is_shared=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.reconstructors.splats.method import reconstruct_splats
-from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.options import R2_PUBLISHED, SplatOptions
 from phyradgs_cl.runtime import Runtime
 
 
@@ -22,3 +23,6 @@ def r2(
 ) -> Reconstruction:
     """Reconstructs a scan with R2-Gaussian's splat; micro-views as motion are the paper's "R2 w/ ST"."""
     return reconstruct_splats(scan, replace(options, affine=True), rt, seed, report, "r2", resume)
+
+
+METHOD = Method(r2, {"published": R2_PUBLISHED}, is_shared=True)

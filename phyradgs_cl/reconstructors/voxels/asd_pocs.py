@@ -13,6 +13,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -69,6 +70,9 @@ def asd_pocs(
 
     volumes = 8 + kept_columns(scan, options)
     return run_iterations("asd-pocs", make, scan, options, rt, report, resume, volumes=volumes, frames=2)
+
+
+METHOD = Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True)
 
 
 class AsdPocs:

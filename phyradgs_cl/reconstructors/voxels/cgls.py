@@ -10,6 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -64,6 +65,11 @@ def _noise(system: System) -> float:
     valid = None if system.valid is None else np.broadcast_to(system.space.numpy(system.valid) != 0, measured.shape)
     pixels = measured.size if valid is None else np.count_nonzero(valid)
     return float(noise_level(measured, valid) * np.sqrt(pixels))
+
+
+METHOD = Method(
+    cgls, {"default": CglsOptions()}, is_shared=True, stops_itself=lambda options: options.noise_stop > 0
+)
 
 
 class Cgls:

@@ -15,6 +15,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -63,6 +64,9 @@ def fista_tv(
         return FistaTv(system, options, TvProx(rt, scan.grid.shape, axis_weights(scan.grid)))
 
     return run_iterations("fista-tv", make, scan, options, rt, report, resume, volumes=12, frames=3)
+
+
+METHOD = Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True)
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -105,6 +106,10 @@ def kept_columns(scan: Scan, options: SartOptions) -> int:
 
 def _most_kept(volume_shape: Sequence[int]) -> int:
     return max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1)
+
+
+METHOD = Method(sart, {"default": SartOptions()}, is_shared=True)
+OS_METHOD = Method(os_sart, {"default": OS_SART}, is_shared=True)
 
 
 class Sart:

@@ -8,6 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -46,6 +47,9 @@ def sirt(
     return run_iterations(
         "sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume, volumes=4, frames=1
     )
+
+
+METHOD = Method(sirt, {"default": SirtOptions()}, is_shared=True)
 
 
 class Sirt:

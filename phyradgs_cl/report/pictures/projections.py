@@ -1,7 +1,5 @@
 """Which frames a page shows beside those of its volume."""
 
-from __future__ import annotations
-
 from phyradgs_cl.reconstructors.frame_pairs import FramePair, frame_pairs
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.report.run import Run

@@ -1,0 +1,7 @@
+from .options import ImportOptions as ImportOptions
+from .recognise import recognise as recognise
+from .scan import FORMATS as FORMATS
+from .scan import import_scan as import_scan
+from .volumes import foreign_volume as foreign_volume
+from .volumes import load_attenuation as load_attenuation
+from .volumes import load_volume as load_volume
