@@ -26,8 +26,15 @@ from phyradgs_cl.acquisition import (
     TimeCells,
     Trajectory,
 )
-from phyradgs_cl.api.bridges import as_linear_operator, as_torch
-from phyradgs_cl.api.projectors import Projector, ray_operator
+from phyradgs_cl.api.bridges import as_torch
+from phyradgs_cl.api.operators import LinearOperator, Operator
+from phyradgs_cl.api.projectors import (
+    initial_gaussians,
+    ray_operator,
+    splat_operator,
+    voxel_operator,
+    voxelise,
+)
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
 from phyradgs_cl.api.scans import fly_scan, static_scan
 from phyradgs_cl.errors import InputError, PhyradgsError
@@ -46,13 +53,14 @@ __all__ = [
     "Grid",
     "InputError",
     "LineMiddles",
+    "LinearOperator",
     "MicroViews",
     "Motion",
+    "Operator",
     "PerRow",
     "PhyradgsError",
     "PoseTable",
     "Progress",
-    "Projector",
     "Reconstruction",
     "Scan",
     "Shutter",
@@ -61,10 +69,10 @@ __all__ = [
     "StaticStart",
     "TimeCells",
     "Trajectory",
-    "as_linear_operator",
     "as_torch",
     "compare",
     "fly_scan",
+    "initial_gaussians",
     "load_scan",
     "load_volume",
     "ray_operator",
@@ -72,5 +80,8 @@ __all__ = [
     "save_scan",
     "save_volume",
     "simulate",
+    "splat_operator",
     "static_scan",
+    "voxel_operator",
+    "voxelise",
 ]

@@ -52,7 +52,7 @@ def save_scan(path: str | Path, scan: Scan) -> None:
     path: the HDF5 file; one that exists is replaced. scan: a trajectory of your own is sampled into a table of poses.
     Raises InputError for what is no scan, or one that the format cannot express, OutputError where nothing can be written.
     """
-    _check_scan(scan)
+    check_scan(scan)
     write_scan(_checked_path(path), scan)
 
 
@@ -170,14 +170,15 @@ def _checked_path(path: object) -> Path:
     return Path(path)
 
 
-def _check_scan(scan: object) -> None:
+def check_scan(scan: object) -> None:
+    """InputError for what is no Scan."""
     if not isinstance(scan, Scan):
         remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
         raise InputError("scan", checks.shown(scan), "a Scan", remedy)
 
 
 def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object, seed: int) -> None:
-    _check_scan(scan)
+    check_scan(scan)
     if not (grid is None or isinstance(grid, Grid)):
         raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
     if not (isinstance(report, bool) or callable(report)):

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyopencl
+import pyopencl.array
 import pytest
 
 from phyradgs_cl import api
@@ -21,18 +24,22 @@ from phyradgs_cl.api import (
     Gaussians,
     Grid,
     InputError,
+    LinearOperator,
     MicroViews,
+    Operator,
     PerRow,
     PoseTable,
-    Projector,
     Reconstruction,
     Scan,
     Shutter,
     SpeedRamp,
     TimeCells,
     fly_scan,
+    ray_operator,
     reconstruct,
+    splat_operator,
     static_scan,
+    voxel_operator,
 )
 
 CONE = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
@@ -80,6 +87,25 @@ def fly(
 
 
 GOOD = fly()
+FLAT = np.zeros((11, 2))
+
+
+@cache
+def rays() -> LinearOperator:
+    return ray_operator(GOOD)
+
+
+@cache
+def splats() -> Operator:
+    return splat_operator(GOOD)
+
+
+def on_device(other_context: bool = False) -> pyopencl.array.Array:
+    """A volume that the device of ``rays`` holds, but not on its queue."""
+    context = pyopencl.Context([rays().rt.device.handle]) if other_context else rays().queue.context
+    return pyopencl.array.zeros(pyopencl.CommandQueue(context), rays().domain_shape, np.float32)
+
+
 VOLUME = Reconstruction(np.zeros((4, 4, 4), np.float32), Grid.cube(4, 2.0))
 CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "fly_scan": [
@@ -247,9 +273,55 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         ),
     ],
     "compare": [(lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3))), "shape")],
-    "ray_operator": [(lambda: api.ray_operator(GOOD, "exact"), "still cells")],
-    "Projector": [(lambda: Projector(GOOD).project_rows(np.zeros((10, 3))), r"rows: .*\(11, any\)")],
-    "as_linear_operator": [(lambda: api.as_linear_operator(3), "operator: found int")],
+    "ray_operator": [
+        (lambda: ray_operator(GOOD, "exact"), "--motion: found Exact.*PerRow"),
+        (lambda: ray_operator("scan.h5"), "scan: found 'scan.h5'; expected a Scan; read a file with load_scan"),
+        (lambda: ray_operator(GOOD, Half()), "motion Half: found line weights that sum to 0.5"),
+    ],
+    "splat_operator": [
+        (lambda: splat_operator(GOOD, "quick"), "motion: found 'quick'.*micro-views"),
+        (lambda: splat_operator(GOOD, cutoff_sigma=-1), "cutoff_sigma"),
+        (lambda: splat_operator(GOOD, Frames()), "motion Frames: found a ndarray"),
+        (lambda: splats()(np.zeros((10, 3))), r"rows: .*\(11, any\)"),
+        (lambda: splats()(FLAT), "rows: found a scale"),
+        (lambda: splats()(FLAT * np.nan), "rows: found .*NaN"),
+        (lambda: splats().frames([1]).T(FRAMES[:1]), "T: .*call the operator first"),
+        (lambda: splats().intensity.of_densities(Gaussians.from_rows(FLAT + 1)), "of_densities: .*linear"),
+    ],
+    "voxel_operator": [
+        (lambda: voxel_operator(GOOD.grid, cutoff_sigma=-1), "cutoff_sigma"),
+        (lambda: voxel_operator(16), "grid: found 16; expected a Grid"),
+        (lambda: voxel_operator(GOOD.grid).frames([0]), "frames: .*from something to frames"),
+    ],
+    "voxelise": [
+        (lambda: api.voxelise(FLAT, GOOD.grid), "gaussians: .*from_rows"),
+        (lambda: api.voxelise(Gaussians.from_rows(FLAT + 1), (8, 8, 8)), "grid: found"),
+    ],
+    "initial_gaussians": [
+        (lambda: api.initial_gaussians(GOOD, -1), "count .*found -1"),
+        (lambda: api.initial_gaussians(FRAMES), "scan: found .*expected a Scan"),
+        (lambda: api.initial_gaussians(GOOD, seed=-1), "seed: found -1"),
+    ],
+    "Operator": [
+        (lambda: rays().frames([4]), r"frames: found \[4\].*0 to 3"),
+        (lambda: rays().frames([0.5]), r"frames: found \[0.5\]"),
+        (lambda: rays().frames(2), "frames: found 2"),
+        (lambda: splats().frames([]), "frames: found"),
+        (lambda: rays().T.frames([0]), "frames: .*from something to frames"),
+        (lambda: rays().intensity.intensity, "intensity: .*line integrals"),
+        (lambda: splats().intensity.intensity, "intensity: .*line integrals"),
+        (lambda: rays().to_device("x"), "values: found str"),
+        (lambda: rays().T(FRAMES[:1]), r"frames: found shape \(1, 6, 8\)"),
+    ],
+    "LinearOperator": [
+        (lambda: rays()(FRAMES), r"volume: found shape \(4, 6, 8\)"),
+        (lambda: rays()("volume"), "volume: found str .*real numbers"),
+        (lambda: rays()(np.zeros(rays().domain_shape, complex)), "volume: .*complex"),
+        (lambda: rays()(on_device(other_context=True)), "volume: .*another OpenCL context.*to_device"),
+        (lambda: rays()(on_device()), "volume: .*another queue"),
+        (lambda: rays()(rays().to_device(0).astype(float)), "volume: .*float64"),
+        (lambda: rays()(rays().to_device(np.zeros((8, 6, 4))).transpose((2, 1, 0))), "volume: .*C order"),
+    ],
     "as_torch": [(lambda: api.as_torch(3), "torch|operator")],
 }
 # what is raised, reported or only described: there is nothing to give it

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable
-from phyradgs_cl.api import Gaussians, Projector, Scan, load_scan, reconstruct, save_scan
+from phyradgs_cl.api import Gaussians, Scan, load_scan, reconstruct, save_scan, splat_operator
 from phyradgs_cl.errors import InputError
 
 RNG = np.random.default_rng(5)
@@ -44,7 +44,7 @@ def drawn_pixels(scan: Scan, rt) -> np.ndarray:
     found = []
     for point in POINTS:
         dot = Gaussians(point[None], np.full((1, 3), 2.5), np.array([[1.0, 0, 0, 0]]), np.ones(1))
-        frames = Projector(scan, "static", cutoff_sigma=0.0, device=rt)(dot).astype(np.float64)
+        frames = splat_operator(scan, "static", cutoff_sigma=0.0, device=rt)(dot).astype(np.float64)
         grid = np.indices(frames.shape[1:])
         found.append(np.einsum("fvu,kvu->fk", frames, grid) / frames.sum(axis=(1, 2))[:, None])
     return np.stack(found, 1)

@@ -26,7 +26,14 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Protocol, Scan, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import DeviceCells, SplatProjector, voxelise
+from phyradgs_cl.operators import (
+    DensityOperator,
+    DeviceCells,
+    SplatOperator,
+    SplatProjector,
+    VoxelOperator,
+    voxelise,
+)
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
@@ -37,7 +44,7 @@ GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
-VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing")
+VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
@@ -78,6 +85,19 @@ def splats(rt: Runtime, model: str, options: str) -> None:
     projector.project_adjoint(cloud(3), DeviceCells.upload(rt, table), np.ones(SHAPE[::-1], np.float32))
 
 
+def operators(rt: Runtime) -> None:
+    """Splats from and to plain arrays, as the Python API has them."""
+    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
+    frames = SplatOperator(rt, SHAPE, [micro_view_cells(orbit, shutter, f, 0.0, SHAPE[1], 2, 2) for f in (0, 1)], 0.7)
+    point = frames.rows.enter(rt.upload(cloud(3), np.float32))
+    frames.back(point, frames.forward(point))
+    densities = DensityOperator(frames, point)
+    densities.adjoint(densities.forward(rt.upload(np.ones(3, np.float32))))
+    voxels = VoxelOperator(rt, GRID)
+    point = voxels.rows.enter(rt.upload(cloud(3), np.float32))
+    voxels.back(point, voxels.forward(point))
+
+
 def nothing(rt: Runtime) -> None:
     orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "rows", 1)
     cells = DeviceCells.upload(rt, exact_cells(orbit, shutter, 0, 0.0, SHAPE[0], 2))
@@ -109,7 +129,7 @@ def method(rt: Runtime, name: str, motion: str) -> None:
 
 
 def cases() -> dict[str, Callable[[Runtime], None]]:
-    found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing}
+    found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing, "operators": operators}
     for model in MODELS:
         for options in OPTIONS:
             found[f"splats {model} {options}"] = partial(splats, model=model, options=options)

@@ -40,7 +40,7 @@ class Options:
 
 def back(scan, options: Options, rt):
     """Plain backprojection."""
-    return options.gain * ray_operator(scan, options.motion, device=rt).adjoint(scan.projections)
+    return options.gain * ray_operator(scan, options.motion, device=rt).T(scan.projections)
 '''
 
 
@@ -96,7 +96,7 @@ def test_a_function_is_run_with_its_options_and_what_it_takes(rt, scan) -> None:
 
 def test_an_array_is_a_result_and_options_need_no_class(rt, scan) -> None:
     def back(scan, options, rt):
-        return ray_operator(scan, options.motion, device=rt).adjoint(scan.projections)
+        return ray_operator(scan, options.motion, device=rt).T(scan.projections)
 
     still, moving = (reconstruct(scan, back, motion=motion, device=rt) for motion in ("static", "per-row"))
     assert still.volume.dtype == np.float32 and np.any(still.volume != moving.volume)

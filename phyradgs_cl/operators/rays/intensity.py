@@ -159,5 +159,6 @@ class IntensityOperator:
         """Weights (F, lines) of each layer on the device, which keeps them."""
         if not self._line_weights:
             shape = (self.frames_shape[0], -1)
-            self._line_weights = [self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights]
+            # in place: a copy of me that stays at a volume has them too
+            self._line_weights.extend(self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights)
         return self._line_weights
