@@ -10,8 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from phyradgs_cl import signals
-from phyradgs_cl.commands.console import complain, give_up_stdout, say, usage_text
-from phyradgs_cl.commands.help_panels import PanelledCommand
+from phyradgs_cl.commands.console import PanelledCommand, complain, give_up_stdout, say, usage_text
 from phyradgs_cl.commands.ranks import takes_part
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
 

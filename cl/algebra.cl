@@ -147,15 +147,16 @@ __kernel void dot_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* the second level, by one group: the sum of all parts */
-__kernel void dot_whole(__global const sum_t *parts, const int count, __local sum_t *scratch, __global sum_t *whole)
+/* the second level, by one group: the sum of all parts, onto what is there if asked */
+__kernel void dot_whole(
+    __global const sum_t *parts, const int count, const int add, __local sum_t *scratch, __global sum_t *whole)
 {
     sum_t own = SUM_OF(0.0f);
     for (int k = (int)get_local_id(0); k < count; k += (int)get_local_size(0))
         own = sum_add(own, parts[k]);
     TREE(scratch, own, sum_add)
     if (get_local_id(0) == 0)
-        whole[0] = own;
+        whole[0] = add ? sum_add(whole[0], own) : own;
 }
 
 /* of each group: the largest x, or |x|; the second level is the same, of a short array */

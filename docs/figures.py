@@ -4,7 +4,10 @@ shutter.png        exposure and readout of one frame, and its cut into strips an
 exact_splat.png    a wide Gaussian's line integrals: the exact splat and the affine one against quadrature
 time_sampling.png  what the simulator's time samples and the micro-views leave of a fine average
 
-Everything is computed on the spot in float64; no OpenCL device is needed.
+scan_plot.png      what ``scan.plot`` draws
+result_plot.png    what ``result.plot`` draws
+
+The first three are computed on the spot in float64 and need no OpenCL device.
 """
 
 from __future__ import annotations
@@ -18,13 +21,16 @@ from matplotlib.patches import Arc, Polygon
 
 from phyradgs_cl.acquisition import ConeGeometry, TimeCells, make_protocol
 from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.api import reconstruct, simulate
+from phyradgs_cl.drawing import CURVE as SAMPLE
+from phyradgs_cl.drawing import EDGE, EXPOSED
+from phyradgs_cl.drawing import RESTING as FROZEN
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.simulation import AnalyticSource, default_time_samples
 
 IMAGES = Path(__file__).resolve().parent / "images"
-EXPOSED, EDGE, SAMPLE, FROZEN = "#f3d37a", "#8a6d1a", "#b3261e", "#2b5c8a"
 
 
 def save(figure: Figure, name: str) -> None:
@@ -196,10 +202,20 @@ def sampling_figure() -> None:
         print(f"  M={m}: " + ", ".join(f"N={n} {e:.3%}" for n, e in zip(samples, values, strict=False)))
 
 
+# --- the plots of the Python API ----------------------------------------------------------------------
+
+
+def api_figures() -> None:
+    scan = simulate("foot", size=48, detector=72, noise="tigre")
+    save(scan.plot(3), "scan_plot.png")
+    save(reconstruct(scan, "fista-tv", motion="per-row", iterations=60).plot(scan, frame=3), "result_plot.png")
+
+
 def main() -> None:
     shutter_figure()
     splat_figure()
     sampling_figure()
+    api_figures()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes docs/reference/cli.md and docs/reference/api.md from the code: python docs/make_reference.py
+"""Writes the pages in docs/reference from the code and examples/: python docs/make_reference.py
 
 tests/test_docs.py fails when what is committed is not what this writes.
 """
@@ -56,9 +56,23 @@ def api_page() -> str:
     return "\n".join(text)
 
 
+def examples_page() -> str:
+    """The scripts in examples/ as they are."""
+    text = [
+        NOTE,
+        "# Examples\n",
+        "Scripts that run as they stand (`python examples/NAME.py`), each in less than a minute on two cores.\n",
+    ]
+    for path in sorted((FOLDER.parent.parent / "examples").glob("*.py")):
+        script = path.read_text(encoding="utf-8")
+        text += [f"## {path.stem}\n", f"```python\n{script}```\n"]
+    return "\n".join(text)
+
+
 def _entry(name: str, thing: object, heading: str) -> Iterator[str]:
     yield f"{heading}{name}\n"
     signature = str(inspect.signature(thing)).replace("'", "")  # type: ignore[arg-type]
+    signature = re.sub(r"\bphyradgs_cl\.[a-z_.]*", "", signature).replace("numpy.", "np.")  # as the code writes them
     signature = re.sub(r"<function (\w+) at 0x\w+>", r"\1", signature)  # where it lies changes from run to run
     yield f"```python\n{name}{signature}\n```\n"
     yield f"```text\n{inspect.getdoc(thing) or ''}\n```\n"
@@ -71,7 +85,7 @@ def _entry(name: str, thing: object, heading: str) -> Iterator[str]:
 
 def main() -> None:
     FOLDER.mkdir(exist_ok=True)
-    for name, page in (("cli.md", cli_page()), ("api.md", api_page())):
+    for name, page in (("cli.md", cli_page()), ("api.md", api_page()), ("examples.md", examples_page())):
         (FOLDER / name).write_text(page, encoding="utf-8")
 
 

@@ -1,7 +1,5 @@
 """phyradgs-cl: OpenCL tomography for fly-scanning cone-beam CT."""
 
-from __future__ import annotations
-
 __all__ = ["__version__"]
 
 

@@ -1,7 +1,5 @@
 """Entry point: answers signals, loads the command line (cli.py, inside the package or beside it) and runs it."""
 
-from __future__ import annotations
-
 import sys
 
 from phyradgs_cl import signals
@@ -14,7 +12,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 
-def load_cli() -> ModuleType:
+def load_cli() -> "ModuleType":
     """The module cli.py, wherever this installation keeps it."""
     import importlib.util
 

@@ -1,14 +1,12 @@
 """Checks for the public doors: each raises InputError with the culprit's name, or returns nothing."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.errors import InputError
 
@@ -64,6 +62,33 @@ def shape(culprit: str, array: ArrayLike, expected: Sequence[int | None]) -> Non
     if not fits:
         wanted = ", ".join("any" if e is None else str(e) for e in expected)
         raise InputError(culprit, f"shape {found}", f"shape ({wanted})")
+
+
+def numbers(culprit: str, value: ArrayLike, expected: Sequence[int | None] | None = None) -> NDArray[np.float64]:
+    """``value`` as float64; InputError unless it is real, finite and, where ``expected`` is given, of that shape."""
+    array = real_array(culprit, value)
+    if expected is not None:
+        shape(culprit, array, expected)
+    finite(culprit, array)
+    return array.astype(np.float64)
+
+
+def real_array(culprit: str, value: ArrayLike) -> np.ndarray:
+    """``value`` as an array of its own real type; InputError for what holds anything else than real numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # NumPy's words for it are long
+        raise InputError(culprit, "lists of unequal length", "an array of numbers") from error
+    if array.dtype.kind not in "iuf":
+        raise InputError(culprit, shown(value), "numbers")
+    return array
+
+
+def whole(culprit: str, value: float, lowest: int, highest: int) -> None:
+    """Raise InputError unless the scalar `value` is a whole number between two bounds, both included."""
+    within(culprit, value, lowest, highest)
+    if value != int(value):
+        raise InputError(culprit, shown(value), f"a whole number from {lowest} to {highest}")
 
 
 def package(name: str, use: str, install: str) -> ModuleType:

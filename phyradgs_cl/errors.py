@@ -1,10 +1,7 @@
-"""The package's exceptions: each names the culprit, what was found, what was expected and what to do.
+"""The package's exceptions: each names the culprit, what was found, what was expected and what to do, in one line.
 
-One line of text comes out of ``str()``, so that the command line can print it as it is. The exit statuses are told apart by
-scripts and listed in docs/trouble.md; 1 is Python's own, for a defect of this program.
+Exit statuses are told apart by scripts (docs/trouble.md); 1 is Python's own, for a defect of this program.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,17 +10,9 @@ from phyradgs_cl.text import plain_text
 
 
 class PhyradgsError(Exception):
-    """Base of every error that this package raises on purpose.
-
-    Args:
-        culprit: what is wrong: an option, a file with its HDF5 path, a device.
-        found: the value or state met there.
-        expected: what would have been right.
-        remedy: what the user can do about it, as an imperative.
-
-    Attributes:
-        exit_code: status that the command line ends with.
-    """
+    """Base of every error that this package raises on purpose. culprit: what is wrong: an option, a file with its HDF5
+    path, a device; found: the value or state met there; expected: what would have been right; remedy: what to do about it,
+    as an imperative. ``exit_code``: the command line's status."""
 
     exit_code = 2
 
@@ -47,8 +36,6 @@ class InputError(PhyradgsError):
 
 
 class NumericalError(PhyradgsError):
-    """NaN or infinity arose in a computation."""
-
     exit_code = 3
 
 
@@ -64,7 +51,7 @@ class DeviceError(PhyradgsError):
     exit_code = 5
 
 
-class NoSuchDeviceError(DeviceError):
+class NoSuchDeviceError(InputError, DeviceError):
     """The device that was asked for is not there: as wrong an option as any other."""
 
     exit_code = 2

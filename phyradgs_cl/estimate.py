@@ -1,10 +1,7 @@
 """What a reconstruction will take: short runs of the real thing, timed, and the rest by proportion.
 
-A cloud of Gaussians grows under density control, and its footprints with it: an iteration late in a run costs half as much
-again as the first ones. The trial therefore goes through the whole schedule in few iterations.
+A cloud of Gaussians grows under density control, so the trial goes through the whole schedule in few iterations.
 """
-
-from __future__ import annotations
 
 import os
 import resource
@@ -21,7 +18,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.io import sha256_of, write_volume
 from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import METHODS, InputOptions, Reconstruction, reconstruct
+from phyradgs_cl.reconstructors import InputOptions, Reconstruction, method_of, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
@@ -40,9 +37,8 @@ _FEWEST_BETWEEN = 5  # iterations from one round of density control to the next,
 class Estimate:
     """seconds, host_bytes and device_bytes of a whole run; the trial's own iterations and seconds.
 
-    around_s: what ``seconds`` has beside the method: reading, comparing with a reference, writing.
-    host_bytes: the process's largest resident memory, which on a CPU device holds the device's buffers too;
-    device_bytes: the most that is held in buffers at one time.
+    around_s: what ``seconds`` has beside the method: reading, comparing, writing. host_bytes: the process's largest resident
+    memory, on a CPU device its buffers too; device_bytes: the most that is held in buffers at one time.
     """
 
     seconds: float
@@ -76,21 +72,18 @@ def estimate(
     before: InputOptions | None = None,
     around: Callable[[Reconstruction], float] | None = None,
 ) -> Estimate:
-    """Runs ``method`` for a few iterations (FDK as a whole) and says what ``options`` would take.
-
-    ``around``: seconds of what a run does beside the method, from a result of it. The first trial builds kernels, or
-    reads them from the driver's cache, as the run will.
-    """
+    """Runs ``method`` for a few iterations (FDK as a whole) and says what ``options`` would take. ``around``: seconds
+    of what a run does beside the method, from a result of it. The first trial builds kernels, as the run will."""
     started = time.perf_counter()
     trials = _Trials(scan, method, options, rt, before)
     total = getattr(options, "iterations", None)
-    if total is None or not METHODS[method].is_resumable:
+    if total is None or not method_of(method).is_resumable:
         whole_s, each_s, total = trials.run(None), 0.0, 0
     elif isinstance(options, SplatOptions):
         whole_s, each_s = _of_schedule(trials, options, *_SPLAT_TRIALS)
     else:
         whole_s, each_s = _of_alike(trials, total, *_ITERATIVE_TRIALS)
-        if whole_s <= _AS_WELL_RUN_S and METHODS[method].stops_itself(options):
+        if whole_s <= _AS_WELL_RUN_S and method_of(method).stops_itself(options):
             whole_s = trials.run(total)  # only a run tells when
     around_s = around(trials.last) if around else 0.0
     spent_s, held = time.perf_counter() - started, peak_host_bytes()
@@ -100,10 +93,8 @@ def estimate(
 
 
 class _Trials:
-    """Short runs of one reconstruction; ``last`` is the latest and longest, ``iterations`` how many they had in all.
-
-    ``device_bytes``: of the last alone, since clouds grow most in the shortest.
-    """
+    """Short runs of one reconstruction; ``last`` is the latest and longest, ``iterations`` how many they had in all;
+    ``device_bytes`` of the last alone, since clouds grow most in the shortest."""
 
     def __init__(
         self, scan: Scan, method: str, options: Any, rt: Runtime, before: InputOptions | None
@@ -154,9 +145,9 @@ def shortened(options: Any, iterations: int) -> Any:
 def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) -> tuple[float, float]:
     """(seconds of a whole run, seconds of one of its iterations), of a run that changes on its way.
 
-    ``few`` iterations, repeated, tell what a run takes beside its iterations; ``more`` go through all of its schedule. Those
-    have as many rounds of density control as the whole run, so that what these take is kept apart. A cloud that grows does
-    so faster in a short run, where gradients are larger: then a longer one, up to a fifth of the whole, says more.
+    ``few`` iterations, repeated, tell what a run takes beside them; ``more`` go through all of its schedule, with as many
+    rounds of density control as the whole run. A cloud that grows does so faster in a short run, where gradients are
+    larger: then a longer one, up to a fifth of the whole, says more.
     """
     total = options.iterations
     first_s = trials.run(min(few, total))
@@ -176,13 +167,9 @@ def _of_schedule(trials: _Trials, options: SplatOptions, few: int, more: int) ->
         through_s = min(through_s, trials.run_beside_control(more))
     rounds = trials.last.facts["density_control_rounds"]
     each_s = max(through_s - again_s, 0.0) / (more - few)
-    control_s = trials.control_s * _rounds(options) / max(rounds, 1)
+    due = sum(options.control.is_due(i, total) for i in range(1, total + 1))
+    control_s = trials.control_s * due / max(rounds, 1)
     return first_s + (total - few) * each_s + control_s, each_s + control_s / total
-
-
-def _rounds(options: SplatOptions) -> int:
-    """Rounds of density control in a run."""
-    return sum(options.control.is_due(i, options.iterations) for i in range(1, options.iterations + 1))
 
 
 def _of_alike(trials: _Trials, total: int, few: int, more: int) -> tuple[float, float]:
@@ -224,10 +211,7 @@ def seconds_since_start() -> float:
 
 
 def peak_host_bytes() -> int:
-    """The largest resident memory of this process so far.
-
-    In Linux the system's call would also tell that of the process which started this one.
-    """
+    """The largest resident memory of this process so far (in Linux the system's call would add that of its parent)."""
     if held := in_use_bytes("VmHWM:"):
         return held
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

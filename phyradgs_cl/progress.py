@@ -1,6 +1,4 @@
-"""How far a command is, on stderr: one line rewritten on a terminal, a line every ten seconds elsewhere."""
-
-from __future__ import annotations
+"""How far a run is, on stderr: one line rewritten on a terminal or in a notebook, a line every ten seconds elsewhere."""
 
 import sys
 import time
@@ -14,31 +12,40 @@ _OVER = "\r\x1b[K"  # what stands in the line
 _TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0
 
 
+def has_reader() -> bool:
+    """Whether a line that is rewritten finds eyes: on a terminal, or in a notebook's cell."""
+    return sys.stderr is not None and (sys.stderr.isatty() or _in_notebook())
+
+
+def _in_notebook() -> bool:
+    return type(sys.stderr).__module__.startswith("ipykernel")
+
+
 class Ticker:
     """Counts ``noun``s done; says rate and time left. As a context it ends the line that it rewrites."""
 
     def __init__(self, noun: str) -> None:
         self.noun = noun
-        self.is_terminal = sys.stderr is not None and sys.stderr.isatty()
+        self.is_terminal = has_reader()
+        self._width = 0  # of the line in a notebook, which knows no sequence that clears one
         self.started = self.last = time.monotonic()
         self.first: int | None = None
         self.is_open = self.is_counting = False
 
-    def __enter__(self) -> Ticker:
+    def __enter__(self) -> "Ticker":
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.is_open:
-            _say("" if self.is_counting else _OVER, ends_line=self.is_counting)
+            _say("" if self.is_counting else self._over(""), ends_line=self.is_counting)
 
     def stage(self, text: str) -> None:
         """Says at once, on a terminal, what is under way before there is something to count."""
         if self.is_terminal:
-            _say(f"{_OVER}{text}", ends_line=False)
+            _say(self._over(text), ends_line=False)
             self.is_open, self.is_counting = True, False
 
     def progress(self, p: Progress) -> None:
-        """The report of a reconstruction."""
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
@@ -52,8 +59,15 @@ class Ticker:
             return
         self.last = now
         line = f"{self.noun} {done}/{total}{more}{self._rate(done, total, now)}"
-        _say(f"{_OVER}{line}" if self.is_terminal else line, ends_line=not self.is_terminal)
+        _say(self._over(line) if self.is_terminal else line, ends_line=not self.is_terminal)
         self.is_open = self.is_counting = self.is_terminal
+
+    def _over(self, line: str) -> str:
+        """``line`` in the place of the one that stands."""
+        if not _in_notebook():
+            return f"{_OVER}{line}"
+        before, self._width = self._width, len(line)
+        return f"\r{line.ljust(before)}"
 
     def _rate(self, done: int, total: int, now: float) -> str:
         since_first = done - (self.first or 0)

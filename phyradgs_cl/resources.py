@@ -1,17 +1,13 @@
 """Where the files beside the package are: inside it in a wheel, beside it in a checkout."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent
 
 
 def resource(name: str) -> Path:
-    """The path of ``cl``, ``data`` or ``cli.py``: the copy inside the package if there is one, else the one beside it.
-
-    Raises FileNotFoundError when neither exists, which means a broken installation.
-    """
+    """The path of ``cl``, ``data`` or ``cli.py``: the copy inside the package if there is one, else the one beside it;
+    FileNotFoundError for neither."""
     for folder in (_PACKAGE, _PACKAGE.parent):
         if (folder / name).exists():
             return folder / name

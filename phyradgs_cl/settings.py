@@ -1,7 +1,5 @@
 """What a run is asked to do: the configuration file, the command line that wins over it, and words into values."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -28,11 +26,9 @@ LARGEST_SEED = 2**63
 
 @dataclass(frozen=True)
 class RunSettings:
-    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, not yet checked.
-
-    ``before``: what is done to the scan's frames first, whatever the method. ``origins``: where the values that are not
-    named options come from, as errors are to name it. ``memory``: a limit of the device's, bytes or text as 2GiB.
-    """
+    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, unchecked. ``before``:
+    what is done to the frames first. ``origins``: where values that are no named options come from, for errors.
+    ``memory``: the device's limit, bytes or text as 2GiB."""
 
     method: str
     preset: str | None
@@ -61,11 +57,8 @@ class RunSettings:
 def run_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> RunSettings:
-    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None.
-
-    All of them lie over the preset, which is where a method's options begin. They are checked here, so that an error
-    can say where a wrong value stands.
-    """
+    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None;
+    all over the preset. They are checked here, so that an error can say where a wrong value stands."""
     settings = read_config(config)
     origins = {key: f"config {config}: {key}" for key in settings}
     for text in assignments:
@@ -114,9 +107,7 @@ def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
 
 def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
-    if path is None:
-        return {}
-    return read_toml(path, f"{option} {path}")
+    return {} if path is None else read_toml(path, f"{option} {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:

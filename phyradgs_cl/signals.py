@@ -1,12 +1,9 @@
 """Ctrl-C and SIGTERM in a process of the command line: one line on stderr and an end, whatever is running.
 
-An exception raised by a signal's handler may surface in any library, which may swallow it or complain about it. So
-nothing is raised here: the process removes its half-written files and ends. Work that is worth keeping makes signals wait
-(reconstructors/interrupt.py). Nothing is imported that takes time, nor ``signal``, which builds enums round ``_signal``:
-this is to be in force as early as can be.
+An exception from a signal's handler may surface in any library. So nothing is raised: the process removes its
+half-written files and ends. Work worth keeping makes signals wait (reconstructors/interrupt.py). Nothing that takes
+time is imported, nor ``signal``, which builds enums round ``_signal``: this is to be in force as early as can be.
 """
-
-from __future__ import annotations
 
 import _signal as signal
 import os
@@ -37,7 +34,7 @@ class InterruptedAfterwards(KeyboardInterrupt):
     """Ctrl-C that came during work which was finished all the same."""
 
 
-def answer(caught: int, frame: FrameType | None) -> None:
+def answer(caught: int, frame: "FrameType | None") -> None:
     """The handler: notes a signal that has to wait; else ends this process, or raises where it is not the command line's."""
     global number, asked_s
     number, now_s = caught, time.monotonic()
@@ -50,7 +47,6 @@ def answer(caught: int, frame: FrameType | None) -> None:
 
 
 def _end(caught: int) -> None:
-    """Says ``farewell`` and ends with 128 + the signal's number."""
     for path in tuple(unfinished):
         remove(path)
     try:
@@ -72,10 +68,7 @@ def remove(path: str) -> None:
 
 
 def handle(caught: int) -> None:
-    """Sets the handler.
-
-    System calls go on after it: a compiler inside an OpenCL driver would take a reading that is cut short for an error.
-    """
+    """Sets the handler. System calls go on after it: a compiler inside a driver would take a short reading for an error."""
     signal.signal(caught, answer)
     if hasattr(signal, "siginterrupt"):
         signal.siginterrupt(caught, False)
@@ -102,7 +95,6 @@ def start_afresh() -> None:
 
 
 def say_at_the_end(text: str) -> None:
-    """Sets what the line will say."""
     global farewell
     farewell = text
 

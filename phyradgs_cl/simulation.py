@@ -1,7 +1,5 @@
 """Simulation: a phantom or volume and an acquisition to frames, each line over its own time window."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
@@ -11,7 +9,7 @@ from typing import Protocol as Interface
 import numpy as np
 
 from phyradgs_cl import __version__, checks
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, make_protocol, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
@@ -44,9 +42,9 @@ log = logging.getLogger(__name__)
 class SimulationOptions:
     """How to simulate. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    time_samples: midpoint samples per line in its own exposure; 0 chooses them so that the edge of the volume
-    moves at most half a voxel of ``grid`` between two of them (see docs/mathematics.md for the error).
-    dose: photons of a pixel without object, on a line that sees the whole pulse. lag: λ of detector/lag.py.
+    time_samples: midpoint samples per line in its own exposure; 0: the volume's edge moves at most half a voxel of ``grid``
+    between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
+    lag: λ of detector/lag.py.
     """
 
     protocol: Protocol = Protocol()
@@ -74,6 +72,10 @@ class SimulationOptions:
         checks.within("--seed", self.seed, 0, 2**63)
 
 
+OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
+"""What ``scanner_options`` takes."""
+
+
 def scanner_for(
     name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None
 ) -> Scanner:
@@ -90,17 +92,13 @@ def scanner_for(
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the default.
-
-    Raises:
-        InputError: no such option; a value out of range.
-    """
-    own = {key: getattr(scanner, key) for key in ("readout_axis", "readout_direction", "lag")}
-    own |= {key: getattr(scanner, key) for key in ("readout_ratio", "pulse")}
+    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the
+    default. InputError: no such option; a value out of range."""
+    usual = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse")
+    own = {key: getattr(scanner, key) for key in usual}
     chosen = {**own, **{key: value for key, value in given.items() if value is not None}}
-    known = ({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
-    if unknown := sorted(set(chosen) - known):
-        expected = f"one of {', '.join(sorted(known))}"
+    if unknown := sorted(set(chosen) - OPTION_NAMES):
+        expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
     timing = {key: chosen.pop(key) for key in _TIMING if key in chosen}
     return SimulationOptions(protocol=make_protocol(protocol, **timing), **chosen)
@@ -118,10 +116,8 @@ def simulated_scan(
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
     """What a scanner records of a phantom, by its name, or of a volume, called ``name``; the truth is its reference.
-
-    size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples: rays
-    along each side of a pixel. Warns of an inverse crime.
-    """
+    size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples:
+    rays along each side of a pixel. Warns of an inverse crime."""
     if size is not None:
         checks.within("--size", size, SMALLEST_PHANTOM if isinstance(of, str) else 1, LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -151,10 +147,7 @@ def simulate(
     title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
-    """A scan of whatever ``source`` projects, noise included.
-
-    reference (nz, ny, nx) is stored with the scan, scaled along when ``peak`` is given.
-    """
+    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by ``peak``."""
     rng = np.random.default_rng(options.seed)
     protocol = options.protocol
     shutter = protocol.shutter(options.readout_axis, options.readout_direction)
@@ -178,14 +171,15 @@ def simulate(
     for frame, cells in enumerate(tables):
         frames[frame] = source.frame(cells, options.detector_model, factor)
         if not np.all(np.isfinite(frames[frame])):
-            raise NumericalError(
-                f"frame {frame}", "line integrals that are not finite", "a smaller geometry or attenuation"
-            )
+            found, expected = "line integrals that are not finite", "a smaller geometry or attenuation"
+            raise NumericalError(f"frame {frame}", found, expected)
         report(frame + 1, protocol.views)
     if frames.max() <= 0:
         log.warning("no ray meets anything that attenuates: all %d frames are empty", protocol.views)
+    share = shutter.readout.spread(shutter.lit_share(lines))
+    recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
-        projections=_recorded(frames, options, shutter, rng),
+        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # lines without light are masked
         geometry=geometry,
         trajectory=trajectory,
         shutter=shutter,
@@ -235,13 +229,9 @@ class AnalyticSource:
         for start, stop, members in line_groups(cells):
             pixels = pixel_centres(cells.pose[members], self._geometry.detector_shape)
             target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
-            source = cells.pose[members][:, None, None, :3]
-            p = factor * self._phantom.line_integrals(source, target)
+            p = factor * self._phantom.line_integrals(cells.pose[members][:, None, None, :3], target)
             mean = average(p, cells.weight[members], model)
-            if by_row:
-                frame[start:stop] = mean
-            else:
-                frame[:, start:stop] = mean
+            frame[(slice(start, stop),) if by_row else (slice(None), slice(start, stop))] = mean
         return frame.astype(np.float32)
 
 
@@ -271,10 +261,8 @@ def _on_panel(
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx).
-
-    source_shape: voxels (z, y, x) that are projected, where the source is a volume from outside.
-    """
+    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx). source_shape:
+    voxels (z, y, x) that are projected, where the source is a volume from outside."""
 
     source: FrameSource
     grid: Grid
@@ -287,13 +275,9 @@ class Scene:
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
-        log.warning(
-            "%s: %s voxels are projected and a grid of %s is to be reconstructed: discretisation errors will not show "
-            "(inverse crime); take a smaller --size or a finer volume",
-            self.title,
-            "×".join(map(str, shape)),
-            "×".join(map(str, self.grid.shape)),
-        )
+        text = "%s: %s voxels are projected and a grid of %s is to be reconstructed: discretisation errors will not show "
+        told = text + "(inverse crime); take a smaller --size or a finer volume"
+        log.warning(told, self.title, *("×".join(map(str, counts)) for counts in (shape, self.grid.shape)))
 
 
 def phantom_scene(
@@ -306,11 +290,9 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom by name in the box of the scanner, to be reconstructed with ``size`` voxels per side.
-
-    Closed forms are integrated exactly; procedural phantoms are drawn at twice ``size`` and projected at that
-    resolution, and the truth is their block mean. Pixels see ``pixel_samples``² rays over their area.
-    """
+    """A phantom in the scanner's box, with ``size`` voxels per side. Closed forms are integrated exactly;
+    procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
+    ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(name, half_size_mm, 2 * size, seed)
     if isinstance(phantom, EllipsoidPhantom):
@@ -319,17 +301,12 @@ def phantom_scene(
         return Scene(source, grid, phantom.voxelise(grid, 4), f"phantom {name}")
     fine = Grid.cube(2 * size, 2 * half_size_mm)
     if not (np.allclose(box.size_mm, fine.size_mm) and np.allclose(box.offset_mm, 0)):
-        log.warning(
-            "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
-            "are not used",
-            name,
-            2 * half_size_mm,
-        )
+        text = "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
+        log.warning(text + "are not used", name, 2 * half_size_mm)
     volume = phantom.voxelise(fine)
     source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
-    return Scene(
-        source, Grid.cube(size, 2 * half_size_mm), block_mean(volume, (size,) * 3), f"phantom {name}"
-    )
+    truth = block_mean(volume, (size,) * 3)
+    return Scene(source, Grid.cube(size, 2 * half_size_mm), truth, f"phantom {name}")
 
 
 def volume_scene(
@@ -342,12 +319,8 @@ def volume_scene(
     axis: str,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A volume, called ``name``, projected at its own resolution.
-
-    A bare array is fitted into the scanner's box, its values being attenuation per half of the longest side (so
-    that line integrals do not depend on the scanner's size); one with a grid keeps it and 1/mm. Pixels see
-    ``pixel_samples``² rays over their area.
-    """
+    """A volume, called ``name``, projected at its own resolution by ``pixel_samples``² rays per pixel. A bare array is
+    fitted into the scanner's box, its values attenuation per half of the longest side; one with a grid keeps it and 1/mm."""
     volume, fine = loaded.volume, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
@@ -364,13 +337,11 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
         return volume.astype(np.float32)
     from skimage.transform import resize_local_mean  # slow to import
 
-    return resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True).astype(
-        np.float32
-    )
+    mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
+    return mean.astype(np.float32)
 
 
 def _resized(grid: Grid, count: int) -> Grid:
-    """The same box with ``count`` voxels along its longest side."""
     if count < 1:
         raise InputError("--size", str(count), "at least 1 voxel")
     shape = [max(1, round(n * count / max(grid.shape))) for n in grid.shape]
@@ -385,20 +356,10 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
-def _recorded(
-    frames: np.ndarray, options: SimulationOptions, shutter: Shutter, rng: np.random.Generator
-) -> np.ndarray:
-    """What the panel shows of frames (F, v, u): light, noise and lag; lines without light are 0 (and masked)."""
-    share = shutter.lit_share(shutter.lines(frames.shape[1:]))
-    share = shutter.readout.spread(share)
-    recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
-    return recorded if np.all(share > 0) else recorded * (share > 0)
-
-
 def _with_noise(
     frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """TIGRE's counts are no real intensities, so there the lag comes first; photons are mixed by the panel itself."""
+    """What the panel shows of frames (F, v, u): TIGRE's counts are no real intensities, so there the lag comes first."""
     if options.noise == "beer":
         return beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:

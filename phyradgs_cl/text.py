@@ -1,10 +1,10 @@
 """Text from strangers: made fit for terminals, pages and files, and compared with what is known."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
 
 # Controls but tab and line feed, which would move a terminal's cursor or end a string; half a surrogate pair, by which
 # Python stands for a byte of a name that is not UTF-8, and which nothing encodes.
@@ -20,3 +20,17 @@ def near_miss(name: object, known: Iterable[str], otherwise: str) -> str:
     """What to do about a name that is not known: take the one that it nearly is, or ``otherwise``."""
     close = difflib.get_close_matches(str(name)[:200], list(known), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
+
+
+def short_repr(thing: Any) -> str:
+    """A dataclass with the fields that are not as they are by themselves; of arrays the shape."""
+    shown = []
+    for field in fields(thing):
+        value = getattr(thing, field.name)
+        if not field.repr:
+            continue
+        if hasattr(value, "shape"):
+            shown.append(f"{field.name}=array{tuple(value.shape)}")
+        elif value != field.default:
+            shown.append(f"{field.name}={value!r}")
+    return f"{type(thing).__name__}({', '.join(shown)})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -22,9 +22,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thre
 from quick import is_quick  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
-from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
+from phyradgs_cl.acquisition import ConeGeometry, make_protocol  # noqa: E402
 from phyradgs_cl.acquisition.cells import TimeCells  # noqa: E402
+from phyradgs_cl.fields import Grid  # noqa: E402
+from phyradgs_cl.io import write_scan  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate  # noqa: E402
 
 Cloud = Callable[..., np.ndarray]
 
@@ -75,6 +78,21 @@ def cli() -> ModuleType:
     return load_cli()
 
 
+@pytest.fixture
+def refused(cli, capfd) -> Callable[..., str]:
+    """(words of a command, what its line must have..., status) → the one line in which it is refused."""
+
+    def refuse(words: Sequence[object], *parts: str, status: int = 2) -> str:
+        capfd.readouterr()
+        assert cli.run([str(word) for word in words]) == status, words
+        line = capfd.readouterr().err
+        assert line.startswith("phyradgs: ") and line.count("\n") == 1, (words, line)
+        assert all(part in line for part in parts), (words, line)
+        return line
+
+    return refuse
+
+
 @pytest.fixture(scope="session")
 def simulated(cli, tmp_path_factory) -> Callable[..., Path]:
     """(words of ``phyradgs simulate``...) → the scan, made once and not to be written to."""
@@ -86,6 +104,17 @@ def simulated(cli, tmp_path_factory) -> Callable[..., Path]:
         return path
 
     return make
+
+
+@pytest.fixture(scope="session")
+def tiny_scan(rt: Runtime, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan of 10³ voxels with its truth, for runs of a moment."""
+    geometry = ConeGeometry(5.0, 7.0, (12, 12), (1 / 3, 1 / 3))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(10, 2.0), 10, "rows", 0)
+    options = SimulationOptions(protocol=make_protocol("rapid", views=4), time_samples=2)
+    path = tmp_path_factory.mktemp("tiny") / "tiny.h5"
+    write_scan(path, simulate(scene.source, geometry, scene.grid, options, reference=scene.reference))
+    return path
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -39,12 +41,10 @@ def test_scaling(tmp_path) -> None:
 
 def test_iteration(tmp_path) -> None:
     facts = facts_of(tmp_path, "iteration.py")
+    stages = ("prepare", "binning", "forward", "loss", "backward", "tv", "adam", "gaps")
     for found in facts["ms"].values():
-        stages = [
-            found[name]
-            for name in ("prepare", "binning", "forward", "loss", "backward", "tv", "adam", "gaps")
-        ]
-        assert sum(stages) + found["other kernels"] == pytest.approx(found["iteration"], rel=0.01)
+        whole = sum(found[name] for name in (*stages, "other kernels"))
+        assert whole == pytest.approx(found["iteration"], rel=0.01)
         assert found["other kernels"] < 0.05 * found["iteration"]
 
 
@@ -65,20 +65,20 @@ def test_a_device_agrees_with_itself_to_the_bit(tmp_path) -> None:
     assert len(found["differences"]) > 30 and not any(found["differences"].values())
 
 
-def test_time_to_a_psnr_is_resumed(tmp_path) -> None:
-    import h5py
-    import numpy as np
-
+def test_time_to_a_psnr_and_bias_of_balls_are_resumed(tmp_path) -> None:
     x = np.linspace(-1, 1, 32)
-    ball = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < 0.5).astype(np.float32)
     with h5py.File(tmp_path / "ball_32.h5", "w") as file:
-        file["volume"] = ball
-    lines = tmp_path / "lines.jsonl"
-    words = (str(tmp_path), str(lines), "--quick", "--names", "ball")
-    assert "| ball | 16 | exact |" in run("time_to_psnr.py", *words)
-    first = lines.read_text()
-    run("time_to_psnr.py", *words)
-    assert lines.read_text() == first and first.count("\n") == 2
+        file["volume"] = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < 0.5).astype(np.float32)
+    for name, words, row, count in (
+        ("time_to_psnr.py", "{tmp} {lines} --quick --names ball", "| ball | 16 | exact |", 2),
+        ("bead_bias.py", "{lines} --size XS --trials stop-and-shoot", "| stop-and-shoot | fista-tv |", 1),
+    ):
+        lines = tmp_path / f"{name}.jsonl"
+        asked = [word.format(tmp=tmp_path, lines=lines) for word in words.split()]
+        assert row in run(name, *asked)
+        first = lines.read_text()
+        run(name, *asked)
+        assert lines.read_text() == first and first.count("\n") == count
 
 
 def test_estimates_are_checked(tmp_path) -> None:
@@ -86,15 +86,6 @@ def test_estimates_are_checked(tmp_path) -> None:
     (line,) = facts["runs"]
     assert line["ratio"]["device_bytes"] == pytest.approx(1, rel=0.3)
     assert line["happened"]["host_bytes"] > 10_000_000
-
-
-def test_bias_of_balls_is_resumed(tmp_path) -> None:
-    lines = tmp_path / "lines.jsonl"
-    words = (str(lines), "--size", "XS", "--trials", "stop-and-shoot")
-    assert "| stop-and-shoot | fista-tv |" in run("bead_bias.py", *words)
-    first = lines.read_text()
-    run("bead_bias.py", *words)
-    assert lines.read_text() == first and first.count("\n") == 1
 
 
 def test_startup(tmp_path) -> None:

@@ -12,13 +12,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import pytest
 import typer
 import yaml
 
 from phyradgs_cl import __version__, api
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -38,50 +37,34 @@ def option_names(options: Any, prefix: str = "") -> Iterator[str]:
             yield prefix + field.name
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_option_is_described(method) -> None:
-    text = (DOCS / "methods.md").read_text(encoding="utf-8")
-    missing = [name for name in option_names(method_options(method)) if f"`{name}`" not in text]
-    assert not missing, f"docs/methods.md does not describe {missing} of {method}"
-    assert f"`{method}`" in text
-
-
-def test_every_preset_is_named() -> None:
+def test_every_option_and_preset_is_described() -> None:
     text = (DOCS / "methods.md").read_text(encoding="utf-8")
     for method, entry in METHODS.items():
-        for preset in entry.presets:
-            assert f"`{preset}`" in text, f"{method}: {preset}"
+        names = (method, *entry.presets, *option_names(method_options(method)))
+        missing = [name for name in names if f"`{name}`" not in text]
+        assert not missing, f"docs/methods.md does not describe {missing} of {method}"
 
 
-@pytest.fixture
-def small_scan(rt) -> Scan:
+def test_the_worked_example_of_a_method_works(rt, monkeypatch) -> None:
     geometry = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
     scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, "rows", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid", views=8, exposure_deg=45.0))
-    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
-
-
-def test_the_worked_example_of_a_method_works(rt, small_scan, monkeypatch) -> None:
-    text = (DOCS / "methods.md").read_text(encoding="utf-8")
-    source = next(b for b in re.findall(r"```python\n(.*?)```", text, re.S) if "class Landweber:" in b)
+    protocol = SimulationOptions(protocol=make_protocol("rapid", views=8, exposure_deg=45.0))
+    scan = simulate(scene.source, geometry, scene.grid, protocol, reference=scene.reference)
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "methods.md").read_text(encoding="utf-8"), re.S)
+    source = next(b for b in blocks if "class Landweber:" in b)
     module = ModuleType("landweber_of_the_docs")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     exec(compile(source, "docs/methods.md", "exec"), module.__dict__)
     monkeypatch.setitem(METHODS, "landweber", module.METHOD)
+    changes = {"iterations": 40, "step": 1.5}
     static, fly = (
-        reconstruct(
-            small_scan,
-            "landweber",
-            rt,
-            method_options("landweber", None, {"motion": motion, "iterations": 40, "step": 1.5}),
-        )
+        reconstruct(scan, "landweber", rt, method_options("landweber", None, {"motion": motion, **changes}))
         for motion in ("static", "per-row")
     )
     residuals = [line["residual"] for line in fly.record]
     assert residuals[-1] < 0.5 * residuals[0]
-    assert np.linalg.norm(fly.volume - small_scan.reference) < np.linalg.norm(
-        static.volume - small_scan.reference
-    )
+    errors = [np.linalg.norm(found.volume - scan.reference) for found in (fly, static)]
+    assert errors[0] < errors[1]
 
 
 def test_the_reference_names_every_command_option_and_public_name() -> None:
@@ -103,13 +86,8 @@ def test_the_site_builds_without_a_broken_link(tmp_path) -> None:
     """Strictly: a link, an anchor or a page that is nowhere ends the build."""
     root = DOCS.parent
     arguments = ["build", "--strict", "--config-file", str(root / "mkdocs.yml")]  # --quiet hides warnings from --strict
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", *arguments, "--site-dir", str(tmp_path / "site")],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=root,
-    )
+    command = [sys.executable, "-m", "mkdocs", *arguments, "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site" / "mathematics" / "index.html").read_text(encoding="utf-8")
     assert page.count("<math") > 150 and "$$" not in page

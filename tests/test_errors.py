@@ -7,50 +7,27 @@ import pickle
 import numpy as np
 import pytest
 
-from phyradgs_cl import checks
-from phyradgs_cl.errors import (
-    DeviceError,
-    InputError,
-    NoSuchDeviceError,
-    NumericalError,
-    OutOfMemoryError,
-    OutputError,
-    PhyradgsError,
-)
+from phyradgs_cl import checks, errors
+from phyradgs_cl.errors import InputError, NumericalError, PhyradgsError
 
 
 def test_message_names_culprit_found_expected_and_remedy_on_one_line() -> None:
     error = InputError("scan.h5:/entry/data", "shape\n(3, 4)", "three axes", "store (F, v, u)")
     assert str(error) == "scan.h5:/entry/data: found shape (3, 4); expected three axes; store (F, v, u)"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
+    for arguments, text in (
         (("dose",), "dose"),
         (("dose", "-1"), "dose: found -1"),
         (("dose", "", "a number"), "dose: expected a number"),
         (("dose", "", "", "give one"), "dose: give one"),
-    ],
-)
-def test_missing_parts_leave_no_trace(arguments: tuple[str, ...], text: str) -> None:
-    assert str(PhyradgsError(*arguments)) == text
+    ):
+        assert str(PhyradgsError(*arguments)) == text  # missing parts leave no trace
 
 
-@pytest.mark.parametrize(
-    "kind", [InputError, OutputError, DeviceError, NumericalError, OutOfMemoryError, NoSuchDeviceError]
-)
-def test_every_error_is_a_phyradgs_error_with_its_exit_code(kind: type[PhyradgsError]) -> None:
-    assert issubclass(kind, PhyradgsError)
-    codes = {
-        InputError: 2,
-        NumericalError: 3,
-        OutputError: 4,
-        DeviceError: 5,
-        OutOfMemoryError: 6,
-        NoSuchDeviceError: 2,
-    }
-    assert kind.exit_code == codes[kind]
+def test_every_error_is_a_phyradgs_error_with_its_exit_code() -> None:
+    names = {"Input": 2, "NoSuchDevice": 2, "Numerical": 3, "Output": 4, "Device": 5, "OutOfMemory": 6}
+    for name, code in names.items():
+        kind = getattr(errors, f"{name}Error")
+        assert issubclass(kind, PhyradgsError) and kind.exit_code == code, name
 
 
 def test_errors_survive_pickling_as_worker_processes_need() -> None:
@@ -59,24 +36,15 @@ def test_errors_survive_pickling_as_worker_processes_need() -> None:
     assert (type(copy), str(copy), copy.remedy) == (NumericalError, str(error), error.remedy)
 
 
-@pytest.mark.parametrize("value", [0, -1, 0.0, float("nan"), float("inf"), "3", None, True, np.float32(-2)])
-def test_positive_rejects(value: object) -> None:
-    with pytest.raises(InputError, match=r"^size: found .*above 0$"):
-        checks.positive("size", value)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("value", [1, 1e-300, np.float32(2), np.int64(5)])
-def test_positive_accepts(value: float) -> None:
-    checks.positive("size", value)
-
-
-def test_at_least_includes_its_minimum() -> None:
+def test_positive_at_least_and_one_of() -> None:
+    for value in (0, -1, 0.0, float("nan"), float("inf"), "3", None, True, np.float32(-2)):
+        with pytest.raises(InputError, match=r"^size: found .*above 0$"):
+            checks.positive("size", value)  # type: ignore[arg-type]
+    for value in (1, 1e-300, np.float32(2), np.int64(5)):
+        checks.positive("size", value)
     checks.at_least("count", 3, 3)
     with pytest.raises(InputError, match=r"count: found 2.99; expected a finite number, at least 3"):
         checks.at_least("count", 2.99, 3)
-
-
-def test_one_of_lists_the_choices() -> None:
     checks.one_of("model", "log", ("log", "intensity"))
     with pytest.raises(InputError, match="found 'lgo'; expected one of 'log', 'intensity'"):
         checks.one_of("model", "lgo", ("log", "intensity"))

@@ -42,13 +42,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_this_installation_finds_its_resources() -> None:
     assert len(tracked("cl", "*.cl")) > 10
-    for name in NEEDED:
-        assert resource(name.split("/")[0]).exists()
-    assert (resource("cl") / "splat_forward.cl").is_file()
-    assert (resource("data") / "demo.toml").is_file()
-
-
-def test_a_missing_resource_is_named() -> None:
+    for name in (*NEEDED, "cl/splat_forward.cl", "data/demo.toml"):
+        folder, _, rest = name.partition("/")
+        assert (resource(folder) / rest).is_file(), name
     with pytest.raises(FileNotFoundError, match="nothing-here is missing"):
         resource("nothing-here")
 
@@ -56,24 +52,16 @@ def test_a_missing_resource_is_named() -> None:
 def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
+        by_name = {name.rsplit("/", 1)[-1]: name for name in names if ".dist-info/" in name}
+        assert "phyradgs = phyradgs_cl.__main__:main" in archive.read(by_name["entry_points.txt"]).decode()
+        assert "Apache License" in archive.read(by_name["LICENSE"]).decode()
     assert {f"phyradgs_cl/{name}" for name in NEEDED} <= names
     for kind in ("*.py", "*.pyi", "py.typed"):
         modules = {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "phyradgs_cl").rglob(kind)}
         assert modules and modules <= names
-    outside = [n for n in names if not n.startswith(("phyradgs_cl/", "phyradgs_cl-"))]
-    assert not outside, "the wheel would install more than one package"
-    assert not [n for n in names if "__pycache__" in n]
-
-
-def test_the_wheel_is_small(wheel: Path) -> None:
+    assert all(name.startswith(("phyradgs_cl/", "phyradgs_cl-")) for name in names), "more than one package"
+    assert not [name for name in names if "__pycache__" in name]
     assert wheel.stat().st_size < MOST_BYTES
-
-
-def test_the_wheel_has_a_script_and_a_licence(wheel: Path) -> None:
-    with zipfile.ZipFile(wheel) as archive:
-        by_name = {name.rsplit("/", 1)[-1]: name for name in archive.namelist() if ".dist-info/" in name}
-        assert "phyradgs = phyradgs_cl.__main__:main" in archive.read(by_name["entry_points.txt"]).decode()
-        assert "Apache License" in archive.read(by_name["LICENSE"]).decode()
 
 
 def test_the_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> None:
@@ -87,12 +75,9 @@ def test_the_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> N
         (["-c", "from phyradgs_cl.runtime.source import kernel_source as s; print(s('rays'))"], "__kernel"),
         (["-m", "phyradgs_cl", "--help"], "reconstruct"),
     ):
-        command = [sys.executable, *arguments]
-        done = subprocess.run(
-            command, cwd=elsewhere, env=environment, capture_output=True, text=True, timeout=120
-        )
-        assert done.returncode == 0, done.stderr
-        assert expected in done.stdout
+        where = {"cwd": elsewhere, "env": environment, "timeout": 120}
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, **where)
+        assert done.returncode == 0 and expected in done.stdout, done.stderr
 
 
 def test_the_sdist_can_build_the_wheel(tmp_path: Path) -> None:

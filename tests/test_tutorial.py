@@ -23,7 +23,7 @@ SMALLER = {
     r"--detector \d+": f"--detector {PIXELS}",
     r"--iterations \d+": "--iterations 20",
     r"iterations = \d+": "iterations = 20",
-    r'"iterations": \d+': '"iterations": 20',
+    r"iterations=\d+": "iterations=20",
     r"96j": "32j",
     r"Grid\.cube\(64": "Grid.cube(16",
     r"\[64, 64, 64\]": "[16, 16, 16]",

@@ -69,9 +69,7 @@ DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.
 
 # --- rays through a neural field ---------------------------------------------------------------------------------
 RAY_SAMPLES = 1e-3  # goal; of the peak (smooth fields, one draw) or of the norm (sharp edge, mean of draws)
-RAY_SAMPLES_SHARP = (
-    0.05  # of the norm, one draw: a step inside an interval is counted or not (0.02; 0.03 per sample)
-)
+RAY_SAMPLES_SHARP = 0.05  # of the norm, one draw: a step in an interval counts or not (0.02; 0.03 a sample)
 
 # --- FDK -----------------------------------------------------------------------------------------------------
 BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1
@@ -119,9 +117,7 @@ GAIN_LAW = 1e-2
 CLOUD_VOLUME = 2e-3  # a voxel at the cutoff's edge (0.1 % of a peak) may fall on the other side
 
 # --- iterative methods ---------------------------------------------------------------------------------------
-ITERATIVE_TWIN = (
-    1e-4  # of the largest voxel: a few passes in float32 against float64 with the explicit matrix
-)
+ITERATIVE_TWIN = 1e-4  # of the largest voxel: a few passes in float32 against float64 with the matrix
 KRYLOV = 1e-3  # relative, of CGLS against LSQR: float32 directions lose orthogonality
 CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum
 

@@ -26,29 +26,8 @@ from phyradgs_cl.acquisition.trajectory import (
 )
 
 __all__ = [
-    "MOTIONS",
-    "PROTOCOLS",
-    "CircularOrbit",
-    "ConeGeometry",
-    "ConstantSpeed",
-    "EncoderTable",
-    "Exact",
-    "FrameSweeps",
-    "LineMiddles",
-    "MicroViews",
-    "Motion",
-    "PerRow",
-    "PoseTable",
-    "Protocol",
-    "Saturation",
-    "Scan",
-    "Shutter",
-    "SpeedRamp",
-    "Static",
-    "StaticStart",
-    "TimeCells",
-    "Trajectory",
-    "make_protocol",
-    "pixel_centres",
-    "transpose_pose",
-]
+    "MOTIONS", "PROTOCOLS", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable",
+    "Exact", "FrameSweeps", "LineMiddles", "MicroViews", "Motion", "PerRow", "PoseTable",
+    "Protocol", "Saturation", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells",
+    "Trajectory", "make_protocol", "pixel_centres", "transpose_pose"
+]  # fmt: skip

@@ -1,10 +1,8 @@
-"""Time cells: one table of (pose, lines, weight) that drives every operator.
+"""Time cells: one table of (pose, lines, weight) that drives every operator, built by the motion models.
 
-A frame is a sum over cells: pixel lines [line_start, line_stop) of the merged frame receive ``weight``
-times the projection from the cell's pose. Weights of a line sum to 1. The builders are the motion models.
+A frame is a sum over cells: pixel lines [line_start, line_stop) of the merged frame receive ``weight`` times the
+projection from the cell's pose. Weights of a line sum to 1.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,15 +25,14 @@ _MOST_SEGMENTS = 1000
 
 @dataclass(frozen=True, eq=False)
 class TimeCells:
-    """The cells of one frame.
+    """The cells of one frame, sorted by line_start, so that those that serve a line are neighbours.
 
-    pose (C, 12) mm, in the detector's own rows and columns whatever the readout axis; time_s (C,);
-    line_start, line_stop (C,) along the readout ``axis`` of ``lines`` lines; weight (C,).
-    Cells are sorted by line_start, so that the cells that serve a line are neighbours.
+    pose (C, 12) mm, in the detector's own rows and columns whatever the readout axis; time_s (C,); line_start, line_stop
+    (C,) along the readout ``axis`` of ``lines`` lines; weight (C,).
 
-    Cells with motion are segments of the frame: ``end_poses`` (C, 2, 12) at their two ends, and ``line_times``
-    (C, 3, lines), which say of every line the middle and half the length of its window's part in the segment, in units of
-    the segment's length from its mid-time, and the share of its window that this part is. ``weight`` is 1 then.
+    Cells with motion are segments of the frame: ``end_poses`` (C, 2, 12), and ``line_times`` (C, 3, lines): middle and
+    half length of every line's window in the segment, in units of the segment's length from its mid-time, and the share
+    of its window that this is. ``weight`` is 1 then. A method raises InputError for cells of one's own that do not fit.
     """
 
     pose: np.ndarray
@@ -50,6 +47,7 @@ class TimeCells:
 
     @property
     def count(self) -> int:
+        """How many cells C there are."""
         return len(self.weight)
 
     def line_weights(self) -> np.ndarray:
@@ -76,12 +74,12 @@ class TimeCells:
         """Whether a line has more than one cell."""
         return bool(self.layer_numbers.any())
 
-    def scaled(self, factor: float) -> TimeCells:
+    def scaled(self, factor: float) -> "TimeCells":
         """The same cells with all lengths multiplied by ``factor``."""
         ends = None if self.end_poses is None else self.end_poses * factor
         return replace(self, pose=self.pose * factor, end_poses=ends)
 
-    def finer(self, factor: int) -> TimeCells:
+    def finer(self, factor: int) -> "TimeCells":
         """The same still cells for a panel with pixels cut into ``factor`` by ``factor``; cut lines share their times."""
         pose = self.pose.copy()
         pose[:, 6:] /= factor
@@ -89,7 +87,7 @@ class TimeCells:
         lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
         return replace(self, pose=pose, **lines)
 
-    def still(self) -> TimeCells:
+    def still(self) -> "TimeCells":
         """These cells, for operators without motion within a cell; InputError where there is some."""
         if self.is_moving:
             remedy = "take --motion per-row"
@@ -97,10 +95,8 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Poses (lines, 12) in the middle of each line's exposure, of the cell that is nearest to it; (1, 12) of one cell.
-
-        Raises InputError for a line without a cell.
-        """
+        """Poses (lines, 12) in mid-exposure of each line, of the nearest cell; (1, 12) of one cell. InputError
+        for a line without a cell."""
         if self.count == 1:
             return self.pose
         lengths = self.line_stop - self.line_start
@@ -171,11 +167,8 @@ def micro_view_cells(
     strips: int,
     sub_intervals: int,
 ) -> TimeCells:
-    """M strips × N sub-intervals, t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
-
-    With a pulsed beam the N sub-intervals share the lit part of the strip's window. Strips without a line
-    (M larger than the number of lines) are left out.
-    """
+    """M strips × N sub-intervals, t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2). With a pulsed beam the N share
+    the lit part of the strip's window. Strips without a line (M above the number of lines) are left out."""
     if strips < 1 or sub_intervals < 1:
         raise InputError("strips × sub-intervals", f"{strips} × {sub_intervals}", "two counts of at least 1")
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
@@ -189,18 +182,15 @@ def micro_view_cells(
             last.append(np.full(sub_intervals, line_stop))
     times = np.concatenate(time_s)
     weight = np.full(times.size, 1.0 / sub_intervals)
-    return _table(
-        trajectory, shutter, frame, times, np.concatenate(first), np.concatenate(last), weight, lines
-    )
+    ranges = np.concatenate(first), np.concatenate(last)
+    return _table(trajectory, shutter, frame, times, *ranges, weight, lines)
 
 
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:
-    """Every line at ``samples`` times of its own exposure, by the midpoint rule.
-
-    The rule's error falls with samples⁻² for fields that are smooth along the motion of one step.
-    """
+    """Every line at ``samples`` times of its own exposure, by the midpoint rule: its error falls with samples⁻² for
+    fields that are smooth along the motion of one step."""
     if samples < 1:
         raise InputError("time samples", str(samples), "at least 1")
     opens_s, closes_s = shutter.line_windows_s(lines).T
@@ -214,11 +204,8 @@ def per_line_cells(
 def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
-    """K equal segments of the frame's lit span, in each of which every line integrates over its own window.
-
-    ``segments`` is K. Splats move from a segment's first pose to its last; see docs/mathematics.md. A gantry at rest,
-    or a frame that takes no time, gives the one cell of ``static_cells``.
-    """
+    """``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md) and every line
+    integrates over its own window. A gantry at rest, or no time, gives the cell of ``static_cells``."""
     if segments < 1:
         raise InputError("segments", str(segments), "at least 1")
     first_s, last_s = shutter.lit_span_s
@@ -230,31 +217,19 @@ def exact_cells(
     kept = np.flatnonzero(served.any(axis=1))
     middle_s = start_s + (edges_s[:-1] + edges_s[1:])[kept] / 2
     line_start = served[kept].argmax(axis=1)
-    line_stop = lines - served[kept, ::-1].argmax(axis=1)
     order = np.argsort(line_start, kind="stable")
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[kept][order]
-    pose, end_poses = trajectory.pose(frame, middle_s[order]), trajectory.pose(frame, ends_s)
-    if np.all(end_poses == pose[0]) and np.all(pose == pose[0]):
+    ends = line_start, lines - served[kept, ::-1].argmax(axis=1)
+    table = _table(trajectory, shutter, frame, middle_s, *ends, np.ones(kept.size), lines)
+    end_poses = trajectory.pose(frame, ends_s)
+    if np.all(end_poses == table.pose[0]) and np.all(table.pose == table.pose[0]):
         return static_cells(trajectory, shutter, frame, start_s, lines)
-    return TimeCells(
-        pose=pose,
-        time_s=middle_s[order],
-        line_start=line_start[order].astype(np.int32),
-        line_stop=line_stop[order].astype(np.int32),
-        weight=np.ones(order.size),
-        lines=lines,
-        axis=shutter.axis,
-        end_poses=end_poses,
-        line_times=times[kept][order],
-    )
+    return replace(table, end_poses=end_poses, line_times=times[kept][order])
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """``TimeCells.line_times`` (K, 3, lines) from the lines' windows (lines, 2) and the segments' edges (K + 1,).
-
-    A line that would reach only a little way into a segment stays in the one beside it, which is then left a little
-    late (or entered early): fewer footprints for a path that is straight for a little longer.
-    """
+    """``TimeCells.line_times`` (K, 3, lines) from the lines' windows (lines, 2) and the segments' edges (K + 1,). A
+    line that would reach only a little way into a segment stays in the one beside it, for fewer footprints."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments from the first light
@@ -288,21 +263,17 @@ def segments_for(
 ) -> int:
     """How many segments keep the error of straight paths and constant conics below ``time_error`` (relative, RMS).
 
-    Both grow with the square of the angle by which the view turns in a segment; the factor is measured
-    (benchmarks/time_exact.py), for Gaussians of 0.5 to 4 % of the half-width. The fastest part of the frame counts.
-
-    intensity_peak: largest line integral where a detector averages intensities, 0 where line integrals. In a segment the
-    mean line integral stands for all; what that leaves, half their variance, grows with the peak and falls with the square
-    of the segments. Up to a peak of 4 it stays below the rest of the error.
+    Both grow with the square of the view's turn in a segment; the factor is measured (benchmarks/time_exact.py), for
+    Gaussians of 0.5 to 4 % of the half-width. intensity_peak: largest line integral where a detector averages intensities,
+    else 0: half their variance in a segment is left, which up to a peak of 4 stays below the rest of the error.
     """
     first_s, last_s = shutter.lit_span_s
     time_s = start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1)
     pose = trajectory.pose(frame, time_s)
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
     contrast = np.sqrt(max(1.0, intensity_peak / _HARMLESS_PEAK))
-    return int(
-        np.clip(np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error)), 1, _MOST_SEGMENTS)
-    )
+    count = np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error))
+    return int(np.clip(count, 1, _MOST_SEGMENTS))
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
@@ -311,11 +282,8 @@ def _turns_rad(pose: np.ndarray) -> np.ndarray:
     normal = np.cross(u_hat, pose[:, 9:12])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
-    steps = [
-        2 * np.arcsin(np.linalg.norm(np.diff(x, axis=0), axis=1).clip(0, 2) / 2)
-        for x in (u_hat, normal, source)
-    ]
-    largest: np.ndarray = np.max(steps, axis=0)
+    chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
+    largest: np.ndarray = np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0)
     return largest
 
 

@@ -1,7 +1,5 @@
 """What a circular scan sees, and grids that see less."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -11,21 +9,21 @@ from phyradgs_cl.fields import Grid
 
 
 def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
-    """Half sides (z, y, x) of the box about the origin that the cones of a full turn fill.
-
-    Its radius is the distance from the axis to the cone's edge ray, DSO·sin(atan(half width/DSD)), and its height that of
-    the cone behind the axis at that radius. A panel that is shifted counts with its far edge.
-    """
-    half_height_mm, half_width_mm = (
-        count * pitch / 2 + abs(offset)
-        for count, pitch, offset in zip(
-            geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True
-        )
-    )
+    """Half sides (z, y, x) of the box about the origin that the cones of a full turn fill: radius DSO·sin(atan(half
+    width/DSD)), the far edge of a shifted panel, and the cone's height behind the axis at that radius."""
+    sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
+    half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
     half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = geometry.source_to_axis_mm * math.sin(half_fan_rad)
     behind_mm = geometry.source_to_axis_mm + radius_mm
     return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
+
+
+def default_grid(geometry: ConeGeometry) -> Grid:
+    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
+    side_mm = 2 * field_of_view_mm(geometry)[1]
+    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
+    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)
 
 
 def misses(grid: Grid, geometry: ConeGeometry) -> bool:

@@ -1,15 +1,14 @@
 """Cone-beam geometry: where source and detector stand at a gantry angle.
 
-A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from one
-column to the next (û·du) and from one row to the next (v̂·dv). Operators take poses, never angles.
+A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
+and from row to row (v̂·dv). Operators take poses, never angles.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
 POSE_LENGTH = 12
@@ -17,10 +16,11 @@ POSE_LENGTH = 12
 
 @dataclass(frozen=True)
 class ConeGeometry:
-    """A circular cone-beam orbit about +z with a flat panel.
+    """A circular cone-beam orbit about +z with a flat panel, in mm.
 
-    ``detector_shape`` counts (rows, columns), ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm``
-    (along v, along u) shifts the panel's centre away from the central ray.
+    ``source_to_axis_mm`` and ``source_to_detector_mm`` are along the central ray, ``detector_shape`` counts (rows, columns),
+    ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm`` (along v, along u) shifts the panel's centre away from that ray.
+    Raises InputError for lengths and counts that are not above 0.
     """
 
     source_to_axis_mm: float
@@ -30,21 +30,13 @@ class ConeGeometry:
     detector_offset_mm: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        dso, dsd = float(self.source_to_axis_mm), float(self.source_to_detector_mm)
-        if not (np.isfinite(dso) and dso > 0):
-            raise InputError("source_to_axis_mm", str(dso), "a positive length in mm")
-        if not (np.isfinite(dsd) and dsd > 0):
-            raise InputError("source_to_detector_mm", str(dsd), "a positive length in mm")
-        if len(self.detector_shape) != 2 or min(self.detector_shape) < 1:
-            raise InputError(
-                "detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1"
-            )
-        if len(self.pixel_size_mm) != 2 or not all(np.isfinite(d) and d > 0 for d in self.pixel_size_mm):
-            raise InputError("pixel_size_mm", str(self.pixel_size_mm), "two positive lengths in mm (v, u)")
-        if len(self.detector_offset_mm) != 2 or not np.all(np.isfinite(self.detector_offset_mm)):
-            raise InputError(
-                "detector_offset_mm", str(self.detector_offset_mm), "two finite lengths in mm (v, u)"
-            )
+        for name in ("source_to_axis_mm", "source_to_detector_mm"):
+            _positive_mm(name, getattr(self, name), ())
+        counts = checks.numbers("detector_shape", self.detector_shape, (2,))
+        if (counts < 1).any() or (counts != np.floor(counts)).any():
+            raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
+        _positive_mm("pixel_size_mm", self.pixel_size_mm, (2,))
+        checks.numbers("detector_offset_mm", self.detector_offset_mm, (2,))
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
         """Poses (..., 12) float64 at gantry angles (...) (design: source at (DSO cos θ, DSO sin θ, 0))."""
@@ -62,7 +54,7 @@ class ConeGeometry:
         )
         return np.concatenate([self.source_to_axis_mm * radial, first_pixel, du * u_hat, dv * v_hat], -1)
 
-    def scaled(self, factor: float) -> ConeGeometry:
+    def scaled(self, factor: float) -> "ConeGeometry":
         """The same geometry with every length multiplied by ``factor``."""
         dv, du = self.pixel_size_mm
         off_v, off_u = self.detector_offset_mm
@@ -74,7 +66,7 @@ class ConeGeometry:
             detector_offset_mm=(off_v * factor, off_u * factor),
         )
 
-    def finer(self, factor: int) -> ConeGeometry:
+    def finer(self, factor: int) -> "ConeGeometry":
         """The same panel with every pixel cut into ``factor`` by ``factor``."""
         rows, columns = self.detector_shape
         dv, du = self.pixel_size_mm
@@ -88,12 +80,36 @@ class ConeGeometry:
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
+def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
+    """InputError unless ``value`` is a positive length, or (v, u) of them."""
+    if (checks.numbers(name, value, shape) <= 0).any():  # type: ignore[arg-type]
+        expected = "two positive lengths in mm (v, u)" if shape else "a positive length in mm"
+        raise InputError(name, checks.shown(value), expected)
+
+
 def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarray:
     """World coordinates (..., nv, nu, 3) of all pixel centres of poses (..., 12)."""
     nv, nu = detector_shape
     pose = np.asarray(pose, dtype=np.float64)[..., None, None, :]
     columns, rows = np.arange(nu)[None, :, None], np.arange(nv)[:, None, None]
     return pose[..., 3:6] + columns * pose[..., 6:9] + rows * pose[..., 9:12]
+
+
+def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
+    """The circular geometry nearest to poses (F, 12), by mean distances and offsets; sizes are taken from it.
+
+    The detector's distance is that of its plane, its offset that of its middle from the source's foot on the plane.
+    """
+    source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
+    pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
+    u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
+    centre = first + (panel[1] - 1) / 2 * step_u + (panel[0] - 1) / 2 * step_v
+    normal = np.cross(u_hat, v_hat)
+    ray = centre - source
+    offset_v, offset_u, away = (np.einsum("ij,ij->i", ray, axis) for axis in (v_hat, u_hat, normal))
+    to_axis = np.linalg.norm(source[:, :2], axis=1)
+    means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
+    return ConeGeometry(means[0], means[1], panel, (means[2], means[3]), (means[4], means[5]))
 
 
 def transpose_pose(pose: np.ndarray) -> np.ndarray:

@@ -1,23 +1,26 @@
 """Motion models: how a reconstruction turns a frame of a scan into time cells.
 
-A model is a small frozen class with ``cells(scan, frame)``; a class of your own works in every method (docs/methods.md). A
-scan that is not a fly-scan has one pose per frame in every model here.
+A model is a frozen class with ``cells(scan, frame)``; one of your own works in every method (docs/methods.md). A scan
+that is not a fly-scan has one pose per frame in all of these.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 from typing import Protocol as Interface
 
+import numpy as np
+
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
+
+_WHOLE = 1e-3  # how far a line's weights may be from 1, where they are somebody else's
 
 
 class Motion(Interface):
@@ -29,7 +32,6 @@ class Motion(Interface):
 
 
 def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int]:
-    """What the builders of cells begin with."""
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 
@@ -40,6 +42,7 @@ class Static:
     name: str = field(default="static", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: one, at mid-window."""
         return cells.static_cells(*_place(scan, frame))
 
 
@@ -50,22 +53,24 @@ class StaticStart:
     name: str = field(default="static-start", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: one, at the frame's opening."""
         return cells.static_start_cells(*_place(scan, frame))
 
 
 @dataclass(frozen=True)
 class MicroViews:
-    """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper."""
+    """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper. Raises InputError for counts below 1."""
 
     name: str = field(default="micro-views", init=False, repr=False)
     strips: int = 8
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
-        checks.within("strips", self.strips, 1, 10_000)
-        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("strips", self.strips, 1, 10_000)
+        checks.whole("sub-intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: strips × sub-intervals of them."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.micro_view_cells(*_place(scan, frame), self.strips, self.sub_intervals)
@@ -73,15 +78,16 @@ class MicroViews:
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line at its own ``sub_intervals`` exact times; what the simulator uses."""
+    """Every line at its own ``sub_intervals`` exact times, as in the simulator. Raises InputError for a count below 1."""
 
     name: str = field(default="per-row", init=False, repr=False)
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
-        checks.within("sub-intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("sub-intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: sub-intervals for every line."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.per_line_cells(*_place(scan, frame), self.sub_intervals)
@@ -94,6 +100,7 @@ class LineMiddles:
     name: str = field(default="per-row", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: one for every line."""
         return PerRow(1).cells(scan, frame)
 
 
@@ -101,8 +108,8 @@ class LineMiddles:
 class Exact:
     """``segments`` of a frame, in which splats move while every line integrates over its own window.
 
-    0 segments chooses the number so that the error stays below ``time_error`` (relative), which also bounds the rules that
-    average over time.
+    0 segments chooses the number so that the error stays below ``time_error`` (dimensionless: a share of a frame's RMS),
+    which also bounds the rules that average over time. Raises InputError for numbers out of range.
     """
 
     name: str = field(default="exact", init=False, repr=False)
@@ -110,11 +117,11 @@ class Exact:
     time_error: float = 0.005
 
     def __post_init__(self) -> None:
-        checks.within("--segments (0 chooses from the time error)", self.segments, 0, 1000)
+        checks.whole("--segments (0 chooses from the time error)", self.segments, 0, 1000)
         checks.within("--time-error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """intensity_peak: as for ``segments_for``."""
+        """The ``TimeCells`` of one frame of a scan: its segments. intensity_peak: as for ``segments_for``."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -146,10 +153,8 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """The inverse of ``motion_facts``; None for a model that is not ours. Fields of other models are passed over.
-
-    Raises InputError and TypeError for values that a model does not take.
-    """
+    """The inverse of ``motion_facts``; None for a model that is not ours, whose fields are passed over. InputError and
+    TypeError for values that a model does not take."""
     name = facts.get("name")
     for model in MODELS:
         own = [f.name for f in fields(model) if f.init]
@@ -160,7 +165,30 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
     """InputError unless a model is of a class in ``taken``, or somebody's own."""
+    if isinstance(motion, type) and hasattr(motion, "cells"):
+        raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):
         raise InputError("--motion", checks.shown(motion), "a model with cells(scan, frame)")
     if isinstance(motion, MODELS) and type(motion) not in {type(own) for own in taken}:
         raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")
+
+
+def check_own_motion(motion: object, scan: Scan) -> None:
+    """InputError where a model of somebody's own gives no cells for a scan's first frame, or cells that do not fit its
+    lines.
+    """
+    if motion is None or isinstance(motion, MODELS):
+        return
+    culprit, made = f"motion {type(motion).__name__}", motion.cells(scan, 0)  # type: ignore[attr-defined]
+    if not isinstance(made, TimeCells):
+        raise InputError(culprit, f"a {type(made).__name__} from cells(scan, frame)", "TimeCells")
+    if (made.lines, made.axis) != (scan.lines, scan.shutter.axis):
+        found, expected = f"cells for {made.lines} {made.axis}", f"{scan.lines} {scan.shutter.axis}"
+        raise InputError(culprit, found, expected)
+    checks.shape(f"{culprit}: pose", made.pose, (made.count, POSE_LENGTH))
+    for name in ("time_s", "line_start", "line_stop"):
+        checks.shape(f"{culprit}: {name}", getattr(made, name), (made.count,))
+    weights = made.line_weights()
+    worst = float(weights[np.argmax(np.abs(weights - 1))])
+    if abs(worst - 1) > _WHOLE:
+        raise InputError(culprit, f"line weights that sum to {worst:.6g}", "1 for every line", "divide them by their sum")

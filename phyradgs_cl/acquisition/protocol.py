@@ -1,7 +1,5 @@
 """Scan protocols: how many frames, how long an arc each exposes, how the panel reads out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,11 +14,9 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True)
 class Protocol:
-    """A full turn of ``views`` frames, each exposing ``exposure_deg`` (paper, section 3.1).
-
-    The gantry turns at constant speed, so an exposure of 1 s fixes it; ``readout_ratio`` is T_ro/T_exp.
-    ``pulse``: when the beam is on, as (start after the frame's start, length) in shares of the exposure; None always.
-    """
+    """``views`` frames of a turn at constant speed, each exposing ``exposure_deg`` in 1 s (paper, section 3.1);
+    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on (start, length) in shares of the exposure; None
+    always."""
 
     views: int = 25
     exposure_deg: float = 14.4
@@ -42,9 +38,7 @@ class Protocol:
         last = 1 + self.readout_ratio
         fits = np.isfinite(start) and np.isfinite(length) and start < last and start + length > 0
         if not (fits and length > 0):
-            expected = (
-                f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
-            )
+            expected = f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
             raise InputError("pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
 
     @property
@@ -69,11 +63,8 @@ class Protocol:
     def orbit(
         self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
-        """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan.
-
-        Jitter is a smooth wander of the true gantry about constant speed, recorded by the encoder
-        (standard deviation ``jitter_deg``, one knot per frame).
-        """
+        """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan. Jitter is a smooth
+        wander of the gantry (standard deviation ``jitter_deg``, one knot per frame), recorded by the encoder."""
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)
         if not self.is_fly:
@@ -93,10 +84,8 @@ class Protocol:
         end_s = start_s[-1] + self.shutter().span_s
         speed_rad_per_s = np.deg2rad(self.exposure_deg) / self.exposure_s
         knot_s = np.linspace(0.0, end_s, self.views + 1)
-        wander = np.interp(
-            np.linspace(0, end_s, 16 * self.views + 1), knot_s, rng.normal(0, jitter_rad, knot_s.size)
-        )
-        time_s = np.linspace(0.0, end_s, wander.size)
+        time_s = np.linspace(0.0, end_s, 16 * self.views + 1)
+        wander = np.interp(time_s, knot_s, rng.normal(0, jitter_rad, knot_s.size))
         return EncoderTable(time_s, np.deg2rad(self.start_deg) + speed_rad_per_s * time_s + wander)
 
 

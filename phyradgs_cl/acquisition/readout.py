@@ -1,7 +1,5 @@
 """Lines first: operators see a frame with the readout's lines as its rows, whatever they are on the detector."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from phyradgs_cl.acquisition.field_of_view import field_of_view_mm, misses
-from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition.field_of_view import default_grid, field_of_view_mm, misses
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
+from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
+from phyradgs_cl.text import near_miss
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DETECTOR_MODELS = ("log", "intensity")
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
 
 
@@ -25,16 +35,20 @@ class Saturation:
     share: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scan:
     """One cone-beam scan in line integrals.
 
-    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read
-    line; pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``.
-    lag: share λ of the recorded intensity that comes from the frames before (detector/lag.py), still in the
-    projections. Lines that a pulsed beam misses are added to the mask, so that no method has to look for them.
-    ``saturation`` is None where nobody looked at raw counts.
-    ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says.
+    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read line;
+    pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``. lag: share λ of
+    the recorded intensity that comes from the frames before (detector/lag.py), still in the projections. Lines that a
+    pulsed beam misses are added to the mask, so that no method has to look for them. ``saturation`` is None where nobody
+    looked at raw counts. ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says. ``geometry`` and
+    ``grid`` are in mm, ``shutter`` in s; ``trajectory``: anything with ``pose(frame, time_s)``, a class of your own too.
+    Row 0 is the lowest. detector_model: what an exposure averages, "log" (line integrals) or "intensity". title and
+    provenance go into files.
+
+    Raises InputError for shapes that do not fit each other, and for line integrals that are no finite numbers.
     """
 
     projections: np.ndarray
@@ -53,23 +67,106 @@ class Scan:
     saturation: Saturation | None = None
 
     def __post_init__(self) -> None:
+        for name, kind in {"geometry": ConeGeometry, "shutter": Shutter, "grid": Grid}.items():
+            if not isinstance(getattr(self, name), kind):
+                raise InputError(name, checks.shown(getattr(self, name)), f"a {kind.__name__}")
+        if not callable(getattr(self.trajectory, "pose", None)):
+            raise InputError("trajectory", checks.shown(self.trajectory), "anything with pose(frame, time_s)")
+        object.__setattr__(self, "projections", _line_integrals(self.projections))
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
         if self.projections.shape != expected:
-            raise InputError(
-                "projections", f"shape {self.projections.shape}", f"(frames, rows, columns) = {expected}"
-            )
+            found = f"shape {self.projections.shape}"
+            raise InputError("projections", found, f"(frames, rows, columns) = {expected}")
         if frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
-        if np.shape(self.frame_start_s) != (frames,):
-            raise InputError("frame_start_s", f"shape {np.shape(self.frame_start_s)}", f"({frames},)")
+        object.__setattr__(self, "frame_start_s", checks.numbers("frame_start_s", self.frame_start_s, (frames,)))
         if self.detector_model not in DETECTOR_MODELS:
             raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
-        if not 0 <= self.lag <= LARGEST_LAG:
-            raise InputError("lag", f"{self.lag:g}", f"a share from 0 to {LARGEST_LAG}")
+        checks.within("lag", self.lag, 0, LARGEST_LAG)
         if self.reference is not None and self.reference.shape != self.grid.shape:
             raise InputError("reference", f"shape {self.reference.shape}", f"the grid's {self.grid.shape}")
+        if self.pixel_mask is not None and np.shape(self.pixel_mask) not in (expected, expected[1:]):
+            raise InputError("pixel_mask", f"shape {np.shape(self.pixel_mask)}", f"{expected[1:]} or {expected}")
         self._mask_dark_lines()
+
+    def __repr__(self) -> str:
+        rows, columns = self.geometry.detector_shape
+        voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
+        shutter = self.shutter
+        times = f"exposure {shutter.exposure_s:g} s, readout {shutter.readout_s:g} s along {shutter.axis}"
+        taken = f"fly-scan, {times}" if self.is_fly else "stop-and-shoot"
+        return f"Scan({self.title!r}, {self.frames} frames of {rows} × {columns}, {taken}, grid {voxels} in {sides} mm)"
+
+    @classmethod
+    def from_poses(cls, frames: ArrayLike, poses: ArrayLike, grid: Grid | None = None, **others: Any) -> Scan:
+        """A stop-and-shoot scan with a pose of its own for every frame.
+
+        frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next
+        column, step to the next row, x y z each. grid: the cube that a full turn sees when None. others: fields of ``Scan``:
+        detector_model, pixel_mask, reference, title, lag, provenance.
+
+        Raises InputError for shapes that do not fit, and a panel that the source does not face.
+        """
+        values = _line_integrals(frames)
+        checks.shape("frames", values, (None, None, None))
+        table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
+        if (np.linalg.norm(np.cross(table[:, 6:9], table[:, 9:12]), axis=1) <= 0).any():
+            raise InputError("poses", "parallel pixel steps", "steps along columns and rows that span a panel")
+        panel = (values.shape[1], values.shape[2])
+        geometry = plain_geometry(table, panel)
+        shutter, start_s = Shutter(0.0), np.arange(len(values), dtype=np.float64)
+        trajectory = resting_trajectory(geometry, table, start_s)
+        check_others(others)
+        return cls(values, geometry, trajectory, shutter, start_s, grid or default_grid(geometry), False, **others)
+
+    @classmethod
+    def from_astra(cls, frames: ArrayLike, vectors: ArrayLike, grid: Grid | None = None, **others: Any) -> Scan:
+        """A stop-and-shoot scan with the vectors of an ASTRA geometry ``cone_vec``.
+
+        frames (F, rows, columns): line integrals; ASTRA's own order is (rows, F, columns), so ``sinogram.swapaxes(0, 1)``.
+        vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. grid, others: as for
+        ``from_poses``. ``astra_vectors`` is the way back. Raises InputError for shapes that do not fit.
+        """
+        values, table = _line_integrals(frames), np.asarray(vectors)
+        checks.shape("vectors", table, (None, POSE_LENGTH))
+        if values.ndim == 3 and len(values) != len(table) == values.shape[1]:
+            remedy = "ASTRA's order is (rows, frames, columns): give frames.swapaxes(0, 1)"
+            raise InputError("frames", f"shape {values.shape}", f"({len(table)}, rows, columns)", remedy)
+        checks.shape("frames", values, (len(table), None, None))
+        return cls.from_poses(values, poses_of_astra(table, (values.shape[1], values.shape[2])), grid, **others)
+
+    @classmethod
+    def from_tigre(cls, geo: Any, angles: ArrayLike, frames: ArrayLike, **others: Any) -> Scan:
+        """A stop-and-shoot scan with a TIGRE geometry; TIGRE itself is not needed.
+
+        geo: anything with TIGRE's attributes in mm: DSD, DSO, nDetector, dDetector (v, u), nVoxel, dVoxel (z, y, x), and
+        where there are any offDetector (v, u), offOrigin (z, y, x), COR, each for all frames or one for every frame.
+        angles (F,) in radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
+
+        Raises InputError for parallel beams, a turned panel, and attributes that are missing or do not fit.
+        """
+        poses, panel, grid = poses_of_tigre(geo, angles)
+        checks.shape("frames", frames, (len(poses), *panel))
+        return cls.from_poses(frames, poses, grid, **others)
+
+    def astra_vectors(self) -> np.ndarray:
+        """ASTRA's ``cone_vec`` (F, 12) in mm, each frame at the middle of its lit window; ``from_astra`` is the way back.
+
+        ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``; its volume is ours (z, y, x).
+        """
+        times_s = self.frame_start_s + self.shutter.middle_s
+        poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
+        return astra_of_poses(poses, self.geometry.detector_shape)
+
+    def plot(self, frame: int = 0) -> Figure:
+        """A figure of one frame (rows, columns) and of when its lines open and close, in degrees of the gantry too.
+
+        Raises InputError for a frame that there is not.
+        """
+        from phyradgs_cl.acquisition.plot import plot_frame
+
+        return plot_frame(self, frame)
 
     def _mask_dark_lines(self) -> None:
         dark = self.shutter.lit_share(self.lines) == 0
@@ -81,7 +178,14 @@ class Scan:
 
     @property
     def frames(self) -> int:
+        """How many frames F there are."""
         return len(self.projections)
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Which pixels may be used, bool (F, nv, nu): a view."""
+        unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
+        return np.broadcast_to(unmasked, self.projections.shape)
 
     @property
     def lines(self) -> int:
@@ -95,7 +199,8 @@ class Scan:
         reference = self.reference
         if reference is not None:
             first = grid.start_in(self.grid)
-            reference = None if first is None else _part(reference, first, grid.shape)
+            parts = None if first is None else [slice(s, s + n) for s, n in zip(first, grid.shape, strict=True)]
+            reference = None if parts is None else reference[tuple(parts)]
         return replace(self, grid=grid, reference=reference)
 
     def with_grid(self, choice: GridChoice) -> Scan:
@@ -110,14 +215,26 @@ class Scan:
     def check_timing(self) -> None:
         """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
 
-        Raises InputError for that, and for an exposure too short for the scan's times.
+        Raises InputError for that, for poses that are none, and for an exposure too short for the scan's times.
         """
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
-            self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
+            checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
 
-def _part(volume: np.ndarray, first: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    z, y, x = (slice(start, start + count) for start, count in zip(first, shape, strict=True))
-    return volume[z, y, x]
+def check_others(others: Iterable[str]) -> None:
+    """InputError for a keyword that is none of the fields of a scan that whoever has frames may add."""
+    for name in others:
+        if name not in _OTHERS:
+            raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
+
+
+def _line_integrals(frames: ArrayLike) -> np.ndarray:
+    """Frames as float32; InputError for what is no finite number."""
+    values = checks.real_array("projections", frames)
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32, copy=False)
+    if not all(np.isfinite(frame).all() for frame in values):  # by frame, which needs little memory
+        checks.finite("projections", values)
+    return values

@@ -1,11 +1,10 @@
 """The shutter: when each detector line opens and closes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 
@@ -18,10 +17,10 @@ _DARK = 1e-9  # of the longest lit window: less is what rounding leaves of a lin
 class Shutter:
     """Exposure and readout of one frame (paper, section 2.1).
 
-    Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``.
-    ``axis`` says what is read out at one time; ``direction`` +1 reads index 0 first, −1 last. A readout of
-    zero is a global shutter. ``pulse_s`` (start after the frame's start, length) is when the beam is on, None
-    always: a line sees the part of its window that lies in the pulse, and some lines may see nothing.
+    Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``; a readout of 0 is a
+    global shutter. ``axis``: what is read out at one time; ``direction`` +1 reads index 0 first, −1 last. ``pulse_s``
+    (start after the frame's start, length): when the beam is on, None always; lines see their window's part in it.
+    Times are in s. Raises InputError for times below 0, other words, and a pulse that meets no frame.
     """
 
     exposure_s: float
@@ -31,21 +30,18 @@ class Shutter:
     pulse_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
-            raise InputError("exposure_s", str(self.exposure_s), "a time of at least 0 s")
-        if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
-            raise InputError("readout_s", str(self.readout_s), "a time of at least 0 s")
+        checks.at_least("exposure_s", self.exposure_s, 0)
+        checks.at_least("readout_s", self.readout_s, 0)
         if self.axis not in AXES:
             raise InputError("readout axis", repr(self.axis), "'rows' or 'columns'")
         if self.direction not in (1, -1):
-            raise InputError(
-                "readout direction", str(self.direction), "1 (index 0 first) or -1 (index 0 last)"
-            )
+            expected = "1 (index 0 first) or -1 (index 0 last)"
+            raise InputError("readout direction", str(self.direction), expected)
         if self.pulse_s is not None:
-            self._check_pulse(*self.pulse_s)
+            self._check_pulse(*checks.numbers("pulse_s", self.pulse_s, (2,)).tolist())
 
     def _check_pulse(self, start_s: float, length_s: float) -> None:
-        if not (np.isfinite(start_s) and np.isfinite(length_s) and length_s > 0):
+        if length_s <= 0:
             found = f"start {start_s} s, length {length_s} s"
             raise InputError("pulse_s", found, "a finite start and a length above 0 s")
         if start_s >= self.span_s or start_s + length_s <= 0:
@@ -84,18 +80,15 @@ class Shutter:
         return first_s + (last_s - first_s) / 2
 
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
-        """Times (...) after the frame's start, those without beam moved to the nearest moment with beam.
-
-        The two ends of a window become those of its part in the pulse; of a window that the pulse misses they
-        become one moment, so that it has a place in time though it has no length.
-        """
+        """Times (...) after the frame's start, those without beam moved to the nearest moment with beam: the ends of a
+        window become those of its part in the pulse, and one moment where the pulse misses it."""
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
         return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
-        """How many lines a (rows, columns) detector has along the readout axis."""
+        """How many lines a panel of (rows, columns) has along the readout axis."""
         return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:
@@ -104,10 +97,8 @@ class Shutter:
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """(lines, 2): when light begins and ends on every line index, in seconds after the frame's start.
-
-        Without a pulse that is from opening to closing; a line that the pulse misses has two equal times.
-        """
+        """(lines, 2): when light begins and ends on every line index, in seconds after the frame's start; from opening
+        to closing without a pulse, and equal times for a line that the pulse misses."""
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
@@ -123,10 +114,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Line ranges [start, stop) of the strips, in the order in which they are read; may be empty.
-
-        Line r (in reading order) belongs to strip floor(r·M/H).
-        """
+        """[start, stop) of the strips, as they are read; may be empty. Line r (in reading order) is in floor(r·M/H)."""
         edges = [-(-strip * lines // strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

@@ -2,89 +2,114 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Protocol
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.text import short_repr
 
 _LEAST_SPAN_S = 1e-6  # of a frame that takes no time
 _MOST_SAMPLES = 1024  # per frame
+_SAME_PLACE = 1e-9  # of the longest distance: what float64 leaves of an orbit
 
 
 class Trajectory(Protocol):
-    """Anything that knows where the gantry is: poses (..., 12) of a frame at times (...) in seconds."""
+    """Anything that knows where the gantry is: poses (..., 12) in mm of a frame at times (...) in seconds.
 
-    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray: ...
+    A class of your own with this method works in every method; ``save_scan`` samples it into a table.
+    """
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Poses (..., 12) in mm of frame number ``frame`` at times (...) s.
+
+        A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each.
+        """
+        ...
 
 
 class Kinematics(Protocol):
     """Anything that knows the gantry's angles (...) of a frame at times (...) in seconds."""
 
-    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray: ...
+    def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Angles (...) in rad of frame number ``frame`` at times (...) s, counterclockwise seen from above."""
+        ...
 
 
 @dataclass(frozen=True)
 class ConstantSpeed:
-    """θ(t) = θ0 + ω t."""
+    """θ(t) = θ0 + ω t: ``angle_start_rad`` at time 0 and ``speed_rad_per_s``. Raises InputError for what is not finite."""
 
     angle_start_rad: float
     speed_rad_per_s: float
 
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Angles (...) in rad at times (...) s, the same in every frame."""
         return self.angle_start_rad + self.speed_rad_per_s * np.asarray(time_s, np.float64)
 
 
 @dataclass(frozen=True)
 class SpeedRamp:
-    """θ(t) = θ0 + ω t + ½ a t²: a gantry that is still speeding up or braking."""
+    """θ(t) = θ0 + ω t + ½ a t²: a gantry that is still speeding up or braking.
+
+    ``angle_start_rad`` and ``speed_rad_per_s`` at time 0, ``acceleration_rad_per_s2`` always. Raises InputError for what
+    is not finite.
+    """
 
     angle_start_rad: float
     speed_rad_per_s: float
     acceleration_rad_per_s2: float
 
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Angles (...) in rad at times (...) s, the same in every frame."""
         t = np.asarray(time_s, np.float64)
         return self.angle_start_rad + self.speed_rad_per_s * t + 0.5 * self.acceleration_rad_per_s2 * t * t
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
-    """Measured θ(t): linear between samples ``time_s`` (T,) and ``angle_rad_table`` (T,), never beyond."""
+    """Measured θ(t): linear between samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, never beyond.
+
+    Raises InputError for times that do not increase, and when it is asked for a time that it does not cover.
+    """
 
     time_s: np.ndarray
     angle_rad_table: NDArray[np.float64]
     culprit: str = "encoder table"
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
-        time_s = np.asarray(self.time_s, np.float64)
-        table = np.asarray(self.angle_rad_table, np.float64)
-        if time_s.ndim != 1 or time_s.size < 2 or table.shape != time_s.shape:
-            found = f"shapes {time_s.shape} and {table.shape}"
-            raise InputError(self.culprit, found, "two equal 1D arrays of at least 2 samples")
-        if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
-            raise InputError(self.culprit, "NaN or infinity", "finite times and angles")
-        if np.any(np.diff(time_s) <= 0):
-            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        wanted = "two equal 1D arrays of at least 2 samples"
+        time_s, table = _checked_table(self.culprit, self.time_s, self.angle_rad_table, (), "angles", wanted)
         object.__setattr__(self, "time_s", time_s)
         object.__setattr__(self, "angle_rad_table", table)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Angles (...) in rad at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.culprit, frame, t, self.time_s)
         return np.interp(t, self.time_s, self.angle_rad_table)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FrameSweeps:
     """Each frame's own constant speed, from its angle when the exposure starts to that when it ends.
 
-    Continued past the exposure through the readout; equal angles are a gantry at rest (stop-and-shoot).
-    All arrays are (F,).
+    Continued past the exposure through the readout; equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,)
+    in s, when the first line opens; ``exposure_s`` of a line; ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad.
+    Raises InputError for arrays of unequal length, and what is not finite.
     """
 
     start_s: np.ndarray
@@ -92,7 +117,16 @@ class FrameSweeps:
     angle_start_rad: np.ndarray
     angle_end_rad: np.ndarray
 
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        checks.at_least("exposure_s", self.exposure_s, 0)
+        frames = np.size(self.start_s)
+        for name in ("start_s", "angle_start_rad", "angle_end_rad"):
+            object.__setattr__(self, name, checks.numbers(name, getattr(self, name), (frames,)))
+
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Angles (...) in rad of frame number ``frame`` at times (...) s."""
         t = np.asarray(time_s, np.float64)
         first, last = float(self.angle_start_rad[frame]), float(self.angle_end_rad[frame])
         if self.exposure_s <= 0:
@@ -102,24 +136,37 @@ class FrameSweeps:
 
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
-    """A circular geometry whose gantry turns as its kinematics say."""
+    """A circular ``geometry`` in mm whose gantry turns as its ``kinematics`` say: anything with angle_rad(frame, time_s).
+
+    Raises InputError for what is neither.
+    """
 
     geometry: ConeGeometry
     kinematics: Kinematics
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.geometry, ConeGeometry):
+            raise InputError("geometry", checks.shown(self.geometry), "a ConeGeometry")
+        if not callable(getattr(self.kinematics, "angle_rad", None)):
+            raise InputError("kinematics", checks.shown(self.kinematics), "anything with angle_rad(frame, time_s)")
+
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Poses (..., 12) in mm of frame number ``frame`` at times (...) s."""
         return self.geometry.pose(self.kinematics.angle_rad(frame, time_s))
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Angles (...) in rad of frame number ``frame`` at times (...) s."""
         return self.kinematics.angle_rad(frame, time_s)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PoseTable:
-    """An arbitrary trajectory: poses (T, 12) at times (T,) s, a rigid body between them.
+    """An arbitrary trajectory: poses ``table`` (T, 12) in mm at ``time_s`` (T,) in s, a rigid body between them.
 
+    A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each.
     Rotations go by slerp and everything else is linear in the body's own frame: interpolating the 12
     numbers in the world would shrink an orbit (by 1 mm at 1 m over 5°).
+    Raises InputError for times that do not increase, steps that span no panel, and times beyond the table.
     """
 
     time_s: np.ndarray
@@ -127,16 +174,11 @@ class PoseTable:
     culprit: str = "pose table"
     _frames: np.ndarray = field(init=False, repr=False)
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
-        time_s = np.asarray(self.time_s, np.float64)
-        table = np.asarray(self.table, np.float64)
-        if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, POSE_LENGTH):
-            found = f"shapes {time_s.shape} and {table.shape}"
-            raise InputError(self.culprit, found, "times (T,) and poses (T, 12), T at least 2")
-        if not (np.all(np.isfinite(time_s)) and np.all(np.isfinite(table))):
-            raise InputError(self.culprit, "NaN or infinity", "finite times and poses")
-        if np.any(np.diff(time_s) <= 0):
-            raise InputError(self.culprit, "times that do not increase", "strictly increasing times in s")
+        expected, row = "times (T,) and poses (T, 12), T at least 2", (POSE_LENGTH,)
+        time_s, table = _checked_table(self.culprit, self.time_s, self.table, row, "poses", expected)
         normal = np.cross(table[:, 6:9], table[:, 9:12])
         if np.any(np.linalg.norm(normal, axis=1) <= 0):
             raise InputError(self.culprit, "parallel pixel steps", "û·du and v̂·dv that span a plane")
@@ -145,6 +187,7 @@ class PoseTable:
         object.__setattr__(self, "_frames", _body_frames(table))
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.culprit, frame, t, self.time_s)
         in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
@@ -156,21 +199,38 @@ class PoseTable:
         return turned.reshape(*t.shape, POSE_LENGTH)
 
 
-def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) + ``span_s``.
-
-    Raises InputError where a fine table still does not follow it, as where frames that overlap in time are elsewhere at the
-    same moment.
+def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, culprit: str = "poses") -> PoseTable:
+    """A gantry that stops for every frame, as a table: poses (F, 12), each held for a span about its frame's middle (F,)
+    in s.
     """
+    half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
+    time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
+    return PoseTable(time_s, np.repeat(poses, 2, axis=0), culprit)
+
+
+def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
+    """A gantry that stops for every frame: a circular orbit where its poses (F, 12) are those of ``geometry``, else a
+    table.
+    """
+    angle_rad = np.arctan2(poses[:, 1], poses[:, 0])
+    if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * geometry.source_to_detector_mm):
+        return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
+    return resting_poses(poses, middle_s, 0.0)
+
+
+def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
+    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) +
+    ``span_s``; InputError where a fine table does not, as where frames overlap in time and are elsewhere."""
     apart = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
-        poses = np.concatenate([trajectory.pose(f, t) for f, t in enumerate(times)])
+        poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
         made = PoseTable(time_s, poses[at], "trajectory")
-        between = (times[:, :-1] + times[:, 1:]) / 2
-        gaps = (np.abs(made.pose(f, t) - trajectory.pose(f, t)).max() for f, t in enumerate(between))
+        between = (time_s[:-1] + time_s[1:]) / 2  # of all samples: those of a frame that overlaps are in between too
+        inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
+        gaps = (np.abs(made.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
         worst_mm = max(gaps)
         if worst_mm <= error_mm:
             return made
@@ -178,6 +238,29 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             found = f"poses that {apart} samples per frame miss by {worst_mm:.3g} mm"
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", "give it as a PoseTable")
         apart = 2 * apart - 1
+
+
+def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
+    """Poses (T, 12) of a trajectory at times (T,) s; InputError for one of somebody's own that gives no such numbers."""
+    culprit = f"trajectory {type(trajectory).__name__}"
+    return checks.numbers(culprit, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
+
+
+def _check_finite(kinematics: ConstantSpeed | SpeedRamp) -> None:
+    for one in fields(kinematics):
+        checks.numbers(one.name, getattr(kinematics, one.name), ())
+
+
+def _checked_table(
+    culprit: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rising times (T,) and finite rows (T, *row), float64."""
+    time_s, table = checks.numbers(f"{culprit} times", times), checks.numbers(f"{culprit} {what}", rows)
+    if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
+        raise InputError(culprit, f"shapes {time_s.shape} and {table.shape}", expected)
+    if np.any(np.diff(time_s) <= 0):
+        raise InputError(culprit, "times that do not increase", "strictly increasing times in s")
+    return time_s, table
 
 
 def _body_frames(table: np.ndarray) -> np.ndarray:
@@ -192,9 +275,6 @@ def _check_covered(culprit: str, frame: int, t: np.ndarray, table_s: np.ndarray)
     """A measured table is never extrapolated; a nanosecond of slack absorbs rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
-        raise InputError(
-            culprit,
-            f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s",
-            f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)",
-            "extend the table or drop the frame",
-        )
+        found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"
+        expected = f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)"
+        raise InputError(culprit, found, expected, "extend the table or drop the frame")

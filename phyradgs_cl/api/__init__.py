@@ -6,30 +6,73 @@
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime.
 """
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan, Static, StaticStart
-from phyradgs_cl.api.bridges import as_linear_operator, as_torch
-from phyradgs_cl.api.projectors import Projector, ray_operator
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    EncoderTable,
+    Exact,
+    FrameSweeps,
+    LineMiddles,
+    MicroViews,
+    Motion,
+    PerRow,
+    PoseTable,
+    Scan,
+    Shutter,
+    SpeedRamp,
+    Static,
+    StaticStart,
+    TimeCells,
+    Trajectory,
+)
+from phyradgs_cl.api.bridges import as_torch
+from phyradgs_cl.api.operators import LinearOperator, Operator
+from phyradgs_cl.api.projectors import (
+    initial_gaussians,
+    ray_operator,
+    splat_operator,
+    voxel_operator,
+    voxelise,
+)
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
+from phyradgs_cl.api.scans import fly_scan, static_scan
+from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import Reconstruction
+from phyradgs_cl.reconstructors import Progress, Reconstruction
 
 __all__ = [
+    "CircularOrbit",
+    "ConeGeometry",
+    "ConstantSpeed",
+    "EncoderTable",
     "Exact",
+    "FrameSweeps",
     "Gaussians",
     "Grid",
+    "InputError",
     "LineMiddles",
+    "LinearOperator",
     "MicroViews",
     "Motion",
+    "Operator",
     "PerRow",
-    "Projector",
+    "PhyradgsError",
+    "PoseTable",
+    "Progress",
     "Reconstruction",
     "Scan",
+    "Shutter",
+    "SpeedRamp",
     "Static",
     "StaticStart",
-    "as_linear_operator",
+    "TimeCells",
+    "Trajectory",
     "as_torch",
     "compare",
+    "fly_scan",
+    "initial_gaussians",
     "load_scan",
     "load_volume",
     "ray_operator",
@@ -37,4 +80,8 @@ __all__ = [
     "save_scan",
     "save_volume",
     "simulate",
+    "splat_operator",
+    "static_scan",
+    "voxel_operator",
+    "voxelise",
 ]

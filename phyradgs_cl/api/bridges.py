@@ -1,110 +1,60 @@
-"""Operators for scipy and PyTorch."""
+"""Operators for PyTorch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
-from typing import Protocol as Interface
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator
 
-from phyradgs_cl.api.projectors import Projector
+from phyradgs_cl import checks
+from phyradgs_cl.api.operators import LinearOperator, Operator
 from phyradgs_cl.errors import InputError
 
 
-class Linear(Interface):
-    """What can be handed to scipy or torch: A and Aᵀ between arrays of two shapes."""
+def as_torch(operator: Operator) -> Callable[..., Any]:
+    """The operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])`` of some.
 
-    frames_shape: tuple[int, ...]
+    x (domain_shape) may lie on any device and have any floating type; y (range_shape) has the same. The work is done in
+    float32 on the operator's device; tensors of float32 on the host are read and made where they are, by DLPack. Linear
+    operators can be differentiated any number of times, others once, and ``backward`` renders nothing again.
 
-    def forward(self, volume: np.ndarray) -> np.ndarray: ...
-
-    def adjoint(self, frames: np.ndarray) -> np.ndarray: ...
-
-
-def as_linear_operator(operator: Linear) -> LinearOperator:
-    """A ``RayOperator`` (or ``Projector.of_densities``) for scipy: flat float32 vectors, matvec and rmatvec."""
-    domain, frames = _shapes(operator)
-
-    def matvec(x: np.ndarray) -> np.ndarray:
-        return operator.forward(np.asarray(x, np.float32).reshape(domain)).ravel()
-
-    def rmatvec(y: np.ndarray) -> np.ndarray:
-        return operator.adjoint(np.asarray(y, np.float32).reshape(frames)).ravel()
-
-    shape = (int(np.prod(frames)), int(np.prod(domain)))
-    return LinearOperator(shape, matvec=matvec, rmatvec=rmatvec, dtype=np.float32)
-
-
-def as_torch(operator: Linear | Projector) -> Callable[[Any], Any]:
-    """The operator as a function of tensors that PyTorch can differentiate, computed in float32.
-
-    Of a linear operator: volumes to frames, differentiable any number of times. Of a ``Projector``: parameter rows (11, G)
-    to frames, differentiable once. Tensors may lie on any device; the work is done on ours.
-
-    Raises InputError where PyTorch is not installed, or the operator has no transpose.
+    Raises InputError where PyTorch is not installed, for what is no operator, and as the operator does.
     """
-    try:
-        import torch
-    except ImportError as error:
-        raise InputError("as_torch", "no PyTorch", "the package torch", "pip install torch") from error
+    torch: Any = checks.package("torch", "for as_torch", "torch")
+    if not isinstance(operator, Operator):
+        expected = "what ray_operator, splat_operator or voxel_operator gives"
+        raise InputError("operator", type(operator).__name__, expected)
 
-    def array(
-        tensor: Any,
-    ) -> np.ndarray:  # DLpack, because torch and numpy need not know each other's versions
+    def array(tensor: Any) -> np.ndarray:  # DLPack: torch and numpy need not know each other's versions
         return np.from_dlpack(tensor.detach().to("cpu", torch.float32).contiguous())
 
     def tensor(values: np.ndarray, like: Any) -> Any:
-        return torch.from_dlpack(np.array(values, np.float32)).to(like.device, like.dtype)
+        return torch.from_dlpack(values).to(like.device, like.dtype)
 
-    if isinstance(operator, Projector):
-        return _splat_function(torch, operator, array, tensor)
-    _shapes(operator)
-    return _linear_function(torch, operator, array, tensor)
-
-
-def _linear_function(torch: Any, operator: Linear, array: Any, tensor: Any) -> Callable[[Any], Any]:
-    class Forward(torch.autograd.Function):
+    class Linear(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, volume: Any) -> Any:
-            return tensor(operator.forward(array(volume)), volume)
+        def forward(ctx: Any, x: Any, of: LinearOperator) -> Any:
+            ctx.of = of
+            return tensor(of(array(x)), x)
 
         @staticmethod
-        def backward(ctx: Any, by_frames: Any) -> Any:
-            return Adjoint.apply(by_frames)
+        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
+            return Linear.apply(by_y, ctx.of.T), None
 
-    class Adjoint(torch.autograd.Function):
+    class Curved(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, frames: Any) -> Any:
-            return tensor(operator.adjoint(array(frames)), frames)
-
-        @staticmethod
-        def backward(ctx: Any, by_volume: Any) -> Any:
-            return Forward.apply(by_volume)
-
-    return Forward.apply
-
-
-def _splat_function(torch: Any, projector: Projector, array: Any, tensor: Any) -> Callable[[Any], Any]:
-    class Splat(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx: Any, rows: Any) -> Any:
-            ctx.save_for_backward(rows)
-            return tensor(projector.project_rows(array(rows)), rows)
+        def forward(ctx: Any, x: Any, of: Operator) -> Any:
+            y, ctx.back = of.vjp(array(x))
+            return tensor(y, x)
 
         @staticmethod
         @torch.autograd.function.once_differentiable
-        def backward(ctx: Any, by_frames: Any) -> Any:
-            (rows,) = ctx.saved_tensors
-            return tensor(projector.rows_gradient(array(rows), array(by_frames)), rows)
+        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
+            return tensor(ctx.back(array(by_y)), by_y), None
 
-    return Splat.apply
+    def function(x: Any, frames: Sequence[int] | None = None) -> Any:
+        of = operator if frames is None else operator.frames(frames)
+        return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
 
-
-def _shapes(operator: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """What a linear operator takes and gives."""
-    if not all(hasattr(operator, name) for name in ("volume_shape", "frames_shape", "forward", "adjoint")):
-        expected = "a RayOperator, or what Projector.of_densities gives"
-        raise InputError("operator", type(operator).__name__, expected)
-    return tuple(operator.volume_shape), tuple(operator.frames_shape)
+    return function

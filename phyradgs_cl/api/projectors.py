@@ -1,113 +1,257 @@
-"""The paper's projector, and the voxels' one, of a whole scan."""
+"""Operators of whole scans: voxels or Gaussians to frames, and Gaussians to voxels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.motion import motion_of
+from phyradgs_cl.acquisition import Exact, Motion, Scan
+from phyradgs_cl.acquisition.motion import STILL, check_motion, check_own_motion, motion_of
+from phyradgs_cl.api.arrays import Values, computed, placed
 from phyradgs_cl.api.devices import Device, runtime_of
+from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
+from phyradgs_cl.api.runs import check_scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
-from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, ROWS, SCALE
-from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, RayOperator, SplatProjector
+from phyradgs_cl.fields.gaussians import QUATERNION, ROWS, SCALE
+from phyradgs_cl.operators import (
+    DEFAULT_CUTOFF_SIGMA,
+    DensityOperator,
+    IntensityOperator,
+    RayOperator,
+    SplatOperator,
+    VoxelOperator,
+)
+from phyradgs_cl.operators import voxelise as voxelise_rows
 from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
+from phyradgs_cl.reconstructors.splats.frames import tables_of
+from phyradgs_cl.reconstructors.splats.method import first_cloud
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+_FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 
 def ray_operator(
     scan: Scan, motion: str | Motion = "per-row", *, grid: Grid | None = None, device: Device = None
-) -> RayOperator:
-    """Joseph's projector of a scan and its exact transpose: volumes (nz, ny, nx) to frames (F, rows, columns).
+) -> LinearOperator:
+    """Joseph's projector of a scan and its exact transpose: volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns).
 
-    motion: how frames see the moving gantry (docs/methods.md, but ``exact``). grid: the scan's own when None.
+    motion: how frames see the moving gantry (docs/methods.md, but ``exact``), or a model of your own. grid: the voxels,
+    the scan's own when None. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors
+    that average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
+
+    Raises InputError for what is no Scan or Grid, and for a motion that there is not or that moves within a cell.
     """
-    tables = [motion_of(motion).cells(scan, frame).still() for frame in range(scan.frames)]
-    return RayOperator(runtime_of(device), grid or scan.grid, scan.geometry.detector_shape, tables)
+    model, voxels = _checked(scan, motion, STILL), scan.grid if grid is None else _a_grid(grid)
+    rt = runtime_of(device)
+    tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
+    return _rays(RayOperator(rt, voxels, scan.geometry.detector_shape, tables))
 
 
-class Projector:
-    """The paper's projector Φ: Gaussians to the frames of a scan, exactly integrated, and its gradients.
+def _rays(engine: RayOperator) -> LinearOperator:
+    return LinearOperator(
+        engine.rt,
+        (_VOLUME, engine.volume_shape),
+        (_FRAMES, engine.frames_shape),
+        engine.forward,
+        engine.adjoint,
+        frames=lambda chosen: _rays(engine.subset(chosen)),
+        intensity=lambda: _intensities(
+            engine.rt, IntensityOperator(engine.rt, engine.grid, engine.detector_shape, engine.tables)
+        ),
+    )
 
-    motion: any model of docs/methods.md that splats have. frames: which of the scan's, None for all. Averages line integrals
-    over an exposure. Parameter rows (11, G) are mean x y z and three scales in mm, quaternion w x y z, density in 1/mm.
-    """
 
-    def __init__(
-        self,
-        scan: Scan,
-        motion: str | Motion = "micro-views",
-        *,
-        frames: Sequence[int] | None = None,
-        cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
-        affine: bool = False,
-        device: Device = None,
-    ) -> None:
-        rt, model = runtime_of(device), motion_of(motion)
-        chosen = range(scan.frames) if frames is None else frames
-        self._length_mm = scan.grid.half_longest_mm  # the kernels' float32 likes lengths of order 1
-        tables = [model.cells(scan, f).scaled(1 / self._length_mm) for f in chosen]
-        self._cells = [DeviceCells.upload(rt, table) for table in tables]
-        self._readout, detector_shape = scan.shutter.readout, scan.geometry.detector_shape
-        self.frames_shape = (len(self._cells), *detector_shape)
-        shape = self._readout.shape(detector_shape)
-        self._splat = SplatProjector(
-            rt, *shape, affine=affine, cutoff_sigma=cutoff_sigma, time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR)
+def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
+    def at(volume: Values) -> tuple[Values, Map]:
+        here, there = copy(engine), isinstance(volume, DeviceArray)  # a copy, whose derivative stays at this volume
+        return _own(rt, here.expected, volume, engine.frames_shape), partial(
+            computed, rt, there, lambda frames: _own(rt, here.adjoint, frames, engine.volume_shape)
         )
 
-    def __call__(self, gaussians: Gaussians) -> np.ndarray:
-        """Line integrals (F, rows, columns) float32 of a cloud in mm."""
-        return self.project_rows(gaussians.rows())
-
-    def project_rows(self, rows: np.ndarray) -> np.ndarray:
-        """The same of parameter rows (11, G); quaternions of any length."""
-        inside, _ = self._internal(rows)
-        frames = [self._splat.project(inside, cells) for cells in self._cells]
-        return np.stack([self._readout.frames(frame) for frame in frames]) * np.float32(self._length_mm)
-
-    def rows_gradient(self, rows: np.ndarray, by_frames: np.ndarray) -> np.ndarray:
-        """dL/drows (11, G) of rows (11, G) and dL/dframes (F, rows, columns)."""
-        inside, norms = self._internal(rows)
-        checks.shape("by_frames", by_frames, self.frames_shape)
-        total = np.zeros(inside.shape)
-        for cells, by_frame in zip(self._cells, by_frames, strict=True):
-            by_line = np.ascontiguousarray(self._readout.frames(by_frame), np.float32)
-            total += self._splat.project_adjoint(inside, cells, by_line * np.float32(self._length_mm))
-        total[MEAN] /= self._length_mm
-        total[SCALE] /= self._length_mm
-        total[QUATERNION] /= norms
-        return total.astype(np.float32)
-
-    def of_densities(self, gaussians: Gaussians) -> DensityOperator:
-        """The part that is linear: densities (G,) of this cloud to frames."""
-        return DensityOperator(self, gaussians)
-
-    def _internal(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows in internal lengths with unit quaternions, and the quaternions' norms (G,)."""
-        checks.shape("rows", rows, (ROWS, None))
-        inside = np.array(rows, np.float64)
-        norms = np.linalg.norm(inside[QUATERNION], axis=0)
-        inside[MEAN] /= self._length_mm
-        inside[SCALE] /= self._length_mm
-        inside[QUATERNION] /= norms
-        return inside, norms
+    domain, frames = (_VOLUME, engine.volume_shape), (_FRAMES, engine.frames_shape)
+    return Operator(rt, domain, frames, at, frames=lambda chosen: _intensities(rt, engine.subset(chosen)))
 
 
-class DensityOperator:
-    """A ``Projector`` of Gaussians that stay where they are: linear in their densities (G,) in 1/mm."""
+def _own(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
+    """``function(values)`` in its own memory: the engine's is used again when its arrays, if not their views, are gone."""
+    return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
-    def __init__(self, projector: Projector, gaussians: Gaussians) -> None:
-        self._projector, self._rows = projector, gaussians.rows()
-        self.volume_shape, self.frames_shape = (gaussians.count,), projector.frames_shape
 
-    def forward(self, density: np.ndarray) -> np.ndarray:
-        """Densities (G,) to frames (F, rows, columns)."""
-        checks.shape("density", density, self.volume_shape)
-        rows = self._rows.copy()
-        rows[DENSITY] = density
-        return self._projector.project_rows(rows)
+def splat_operator(
+    scan: Scan,
+    motion: str | Motion = "exact",
+    *,
+    affine: bool = False,
+    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+    pixel_footprint: bool = False,
+    device: Device = None,
+) -> SplatProjection:
+    """The paper's projector Φ of a scan: ``Gaussians``, or their parameter rows (11, G), to frames (F, rows, columns).
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
-        """Frames (F, rows, columns) to densities (G,)."""
-        return self._projector.rows_gradient(self._rows, frames)[DENSITY]
+    Rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: any model of
+    docs/methods.md that splats have. affine: R2-Gaussian's approximation. cutoff_sigma: Mahalanobis radius where a
+    Gaussian ends, 0 never. pixel_footprint: pixels average over their area. device: what ``--device`` takes, or a
+    Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames. PhyRadGS, Eq. 3.
+
+    Raises InputError for what is no Scan, for a motion that there is not, and a cutoff out of range.
+    """
+    model = _checked(scan, motion, (*STILL, Exact()))
+    _check_cutoff(cutoff_sigma)
+    rt = runtime_of(device)
+
+    def engine(detector: str, chosen: Sequence[int]) -> SplatOperator:
+        tables, merges = tables_of(scan, model, detector)
+        return SplatOperator(
+            rt,
+            scan.geometry.detector_shape,
+            [tables[f] for f in chosen],
+            scan.grid.half_longest_mm,
+            intensity=merges,
+            affine=affine,
+            cutoff_sigma=cutoff_sigma,
+            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR),
+            pixel_footprint=pixel_footprint,
+        )
+
+    everything = range(scan.frames)
+    return SplatProjection(engine("log", everything), everything, partial(engine, "intensity"))
+
+
+class GaussianOperator(Operator):
+    """An ``Operator`` whose x are Gaussians, or their parameter rows (11, G)."""
+
+    def __init__(self, engine: SplatOperator | VoxelOperator, range_: tuple[str, Shape], **parts: Any) -> None:
+        self._engine = engine
+        super().__init__(engine.rt, (_ROWS, (ROWS, None)), range_, self._seen, **parts)
+
+    def _seen(self, rows: Values) -> tuple[Values, Map]:
+        rt, engine = self.rt, self._engine
+        point = engine.rows.enter(placed(rt, rows, True))
+        y = placed(rt, engine.forward(point), isinstance(rows, DeviceArray))
+        return y, partial(computed, rt, True, partial(engine.back, point))
+
+    def _entered(self, side: tuple[str, Shape], values: Any) -> Values:
+        given = values.rows() if isinstance(values, Gaussians) else values
+        array = super()._entered(side, given)
+        if isinstance(array, np.ndarray) and side is self._domain:
+            _check_rows(array)
+        return array
+
+
+class SplatProjection(GaussianOperator):
+    """What ``splat_operator`` gives: an ``Operator`` from Gaussians to frames."""
+
+    def __init__(
+        self, engine: SplatOperator, chosen: Sequence[int], intensity: Callable[[Sequence[int]], SplatOperator] | None
+    ) -> None:
+        """Of the ``chosen`` frames of a scan; ``intensity`` makes the engine that averages photons in such frames."""
+        self._splats = engine
+        super().__init__(
+            engine,
+            (_FRAMES, engine.frames_shape),
+            frames=lambda few: SplatProjection(engine.subset(few), [chosen[f] for f in few], intensity),
+            intensity=None if intensity is None else partial(_averaging, intensity, chosen),
+        )
+
+    def of_densities(self, gaussians: Gaussians) -> LinearOperator:
+        """The part that is linear: densities (G,) in 1/mm of this cloud to frames; not under ``intensity``."""
+        rt, engine, rows = self.rt, self._splats, self._entered(self._domain, gaussians)
+        if engine.is_layered:
+            raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
+        linear = DensityOperator(engine, engine.rows.enter(placed(rt, rows, True)))
+        return _densities(rt, linear, rows.shape[1], engine.frames_shape)
+
+
+def _averaging(engine: Callable[[Sequence[int]], SplatOperator], chosen: Sequence[int]) -> SplatProjection:
+    return SplatProjection(engine(chosen), chosen, None)
+
+
+def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: Shape) -> LinearOperator:
+    return LinearOperator(
+        rt,
+        (_DENSITY, (count,)),
+        (_FRAMES, frames_shape),
+        partial(computed, rt, True, engine.forward),
+        partial(computed, rt, True, engine.adjoint),
+        frames=lambda few: _densities(rt, engine.subset(few), count, (len(few), *frames_shape[1:])),
+    )
+
+
+def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
+    """Gaussians, or parameter rows (11, G) as ``splat_operator`` takes them, to a volume (nz, ny, nx) in 1/mm on ``grid``.
+
+    The field is evaluated at the voxels' centres in mm, and the device holds all of them. cutoff_sigma, device: as there.
+
+    Raises InputError for what is no Grid, and a cutoff out of range.
+    """
+    _check_cutoff(cutoff_sigma)
+    engine = VoxelOperator(runtime_of(device), _a_grid(grid), cutoff_sigma=cutoff_sigma)
+    return GaussianOperator(engine, (_VOLUME, grid.shape))
+
+
+def voxelise(
+    gaussians: Gaussians, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None
+) -> np.ndarray:
+    """The field of a cloud at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
+
+    gaussians: in mm and 1/mm. grid: of any size, the device holds a brick at a time; ``voxel_operator`` has the gradient.
+    cutoff_sigma: Mahalanobis radius where a Gaussian ends, 0 never. device: what ``--device`` takes, or a Runtime.
+
+    Raises InputError for what is no cloud or Grid, and a cutoff out of range.
+    """
+    _check_cutoff(cutoff_sigma)
+    length_mm = _a_grid(grid).half_longest_mm  # the kernels' float32 likes lengths of order 1
+    if not isinstance(gaussians, Gaussians):
+        raise InputError("gaussians", type(gaussians).__name__, "Gaussians", "of rows (11, G): Gaussians.from_rows(rows)")
+    rows = gaussians.scaled(1 / length_mm, 1.0).rows()
+    return voxelise_rows(runtime_of(device), rows, grid.scaled(1 / length_mm), cutoff_sigma=cutoff_sigma)
+
+
+def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Device = None) -> Gaussians:
+    """The cloud in mm and 1/mm with which ``phyradgs`` begins: ``count`` Gaussians drawn from an FDK volume.
+
+    count: 0 chooses it from the scan's grid; fewer come back where too few voxels attenuate. seed: of the draw. The
+    result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
+
+    Raises InputError for what is no Scan, and a count or a seed below 0.
+    """
+    check_scan(scan)
+    checks.whole("count (0 chooses it from the grid)", count, 0, 100_000_000)
+    checks.whole("seed", seed, 0, 2**63)
+    options = SplatOptions(gaussians=count)
+    scale, population, _ = first_cloud(runtime_of(device), scan, options, seed)
+    rows = options.activation(scan.grid.scaled(1 / scale.length_mm)).apply(population.raw.astype(np.float64))
+    return Gaussians.from_rows(rows).scaled(scale.length_mm, scale.density_per_mm)
+
+
+def _checked(scan: Scan, motion: str | Motion, taken: tuple[Motion, ...]) -> Motion:
+    """The model of a motion that fits the scan."""
+    check_scan(scan)
+    model = motion_of(motion)
+    check_motion(model, taken)
+    check_own_motion(model, scan)
+    return model
+
+
+def _a_grid(grid: Grid) -> Grid:
+    if not isinstance(grid, Grid):
+        raise InputError("grid", checks.shown(grid), "a Grid")
+    return grid
+
+
+def _check_cutoff(cutoff_sigma: float) -> None:
+    checks.within("cutoff_sigma (0 cuts nothing off)", cutoff_sigma, 0, 100)
+
+
+def _check_rows(rows: np.ndarray) -> None:
+    """What would become NaN without a word."""
+    checks.finite(_ROWS, rows)
+    if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
+        raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")

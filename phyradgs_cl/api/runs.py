@@ -2,44 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl import __version__
+import numpy as np
+
+from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import read_scan, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
+from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
     InputOptions,
     ProgressReport,
     Reconstruction,
+    State,
     ignore_progress,
     input_options,
+    interrupted,
+    method_name,
+    method_of,
     method_options,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
+from phyradgs_cl.reconstructors.interrupt import keep_finished_work
+from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 
 def load_scan(path: str | Path) -> Scan:
-    """A scan file as line integrals; InputError names what is wrong by its HDF5 path."""
-    return read_scan(path, counts_to_attenuation)
+    """A scan file (docs/formats.md) as a ``Scan``: line integrals (F, rows, columns), lengths in mm, times in s.
+
+    path: the HDF5 file. Raises InputError, which names what is wrong by its HDF5 path.
+    """
+    return read_scan(_checked_path(path), counts_to_attenuation)
 
 
 def save_scan(path: str | Path, scan: Scan) -> None:
-    """Writes a scan file, whole or not at all."""
-    write_scan(path, scan)
+    """Writes a scan file, whole or not at all: line integrals (F, rows, columns), lengths in mm, times in s.
+
+    path: the HDF5 file; one that exists is replaced. scan: a trajectory of your own is sampled into a table of poses.
+    Raises InputError for what is no scan, or one that the format cannot express, OutputError where nothing can be written.
+    """
+    check_scan(scan)
+    write_scan(_checked_path(path), scan)
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record and facts."""
-    stored = read_volume(path)
+    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record and facts.
+
+    path: the HDF5 file. Raises InputError, which names what is wrong by its HDF5 path.
+    """
+    stored = read_volume(_checked_path(path))
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
     return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts)
@@ -48,9 +70,16 @@ def load_volume(path: str | Path) -> Reconstruction:
 def save_volume(
     path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None
 ) -> None:
-    """Writes a volume file, whole or not at all; ``metrics`` as from ``compare`` are kept with it."""
+    """Writes a volume file, whole or not at all: volume (nz, ny, nx) in 1/mm, lengths in mm.
+
+    path: the HDF5 file; one that exists is replaced. result: what to write. metrics: as from ``compare``, kept with it.
+    Raises InputError for what is no result, OutputError where nothing can be written.
+    """
+    if not isinstance(result, Reconstruction):
+        remedy = "for an array, Reconstruction(volume, grid)"
+        raise InputError("result", checks.shown(result), "a Reconstruction", remedy)
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    write_volume(path, result.volume, result.grid, facts, result.gaussians, metrics)
+    write_volume(_checked_path(path), result.volume, result.grid, facts, result.gaussians, metrics)
 
 
 def simulate(
@@ -65,10 +94,12 @@ def simulate(
 ) -> Scan:
     """A fly-scan (or, with ``protocol="static"``, a stop-and-shoot scan) of a phantom, with its truth as reference.
 
-    phantom: a name, or the path of a volume file (docs/formats.md). size: voxels along the longest side of grid and
-    reference.
-    detector: columns, rows in proportion. options: those of ``phyradgs simulate`` with underscores (views,
-    exposure_deg, readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
+    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm.
+    scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
+    size: voxels along the longest side of grid and reference. detector: columns, rows in proportion.
+    device: what ``--device`` takes, or a Runtime.
+    options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
+    readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
     Raises InputError for what there is not, or what is out of range.
     """
@@ -81,28 +112,110 @@ def simulate(
 
 def reconstruct(
     scan: Scan,
-    method: str = "phyradgs",
+    method: str | Callable[..., Reconstruction | np.ndarray] = "phyradgs",
     *,
     preset: str | None = None,
     grid: Grid | None = None,
     seed: int = 0,
-    report: ProgressReport = ignore_progress,
+    report: ProgressReport | bool = True,
+    resume: Reconstruction | None = None,
+    on_interrupt: str = "raise",
     device: Device = None,
     **options: Any,
 ) -> Reconstruction:
-    """The volume of a scan, by any method of docs/methods.md; ``options`` are the method's own, by name.
+    """The volume (nz, ny, nx) of a scan in 1/mm, by any method of docs/methods.md, and of splats the Gaussians in mm.
 
-    ``grid``: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
+    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md).
+    options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested
+    ones are dicts (``control={"every": 50}``). preset: where they start from.
+    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
     (docs/methods.md#the-grid).
+    seed: of what is drawn at random; the same seed on the same device gives the same bits.
+    report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
+    notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
+    resume: the partial result of an interrupted run of the same scan and options, to go on from.
+    on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" a
+    KeyboardInterrupt whose attribute ``partial`` is the result so far, or None; "return" that result.
+    device: what ``--device`` takes, or a Runtime.
 
-    ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model; nested options are dicts
-    (``control={"every": 50}``). The result has the volume (nz, ny, nx) in 1/mm and, of splats, the Gaussians in mm.
-
-    Raises InputError for options that the method does not have, NumericalError where numbers overflow.
+    Raises:
+        InputError: options that the method does not have, or what is no scan, method, grid or partial result.
+        NumericalError: numbers overflow.
+        KeyboardInterrupt: see ``on_interrupt``.
     """
+    _check_reconstruct(scan, grid, report, on_interrupt, seed)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
     given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)
-    return run_method(scan, method, runtime_of(device), chosen, seed=seed, report=report, before=before)
+    more = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
+    result: Reconstruction | None = None
+    try:
+        with _reporting(report) as tell, keep_finished_work():
+            result = run_method(
+                scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more
+            )
+    except KeyboardInterrupt as error:
+        if result is None or on_interrupt == "raise":
+            raise interrupted(result) from (error if result is None else None)
+    if on_interrupt == "raise" and result.facts.get("interrupted_at") is not None:
+        raise interrupted(result)
+    return result
+
+
+def _checked_path(path: object) -> Path:
+    if not isinstance(path, str | Path) or not str(path):
+        raise InputError("path", checks.shown(path), "the name of a file")
+    return Path(path)
+
+
+def check_scan(scan: object) -> None:
+    """InputError for what is no Scan."""
+    if not isinstance(scan, Scan):
+        remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
+        raise InputError("scan", checks.shown(scan), "a Scan", remedy)
+
+
+def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object, seed: int) -> None:
+    check_scan(scan)
+    if not (grid is None or isinstance(grid, Grid)):
+        raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
+    if not (isinstance(report, bool) or callable(report)):
+        raise InputError("report", checks.shown(report), "a function, True or False")
+    checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
+    checks.whole("seed", seed, 0, 2**63)
+
+
+@contextmanager
+def _reporting(report: ProgressReport | bool) -> Iterator[ProgressReport]:
+    """The report that is meant; the line is ended with the body."""
+    if not isinstance(report, bool):
+        yield report
+    elif not (report and has_reader()):
+        yield ignore_progress
+    else:
+        with Ticker("iteration") as ticker:
+            ticker.stage("building kernels")
+            yield ticker.progress
+
+
+def _state_of(partial: object, method: object, options: Any) -> State:
+    """How to go on from a result that was interrupted, of the same method and options."""
+    if not isinstance(partial, Reconstruction) or partial.state is None:
+        found = (
+            checks.shown(partial)
+            if not isinstance(partial, Reconstruction)
+            else "a result that is complete, or from a file"
+        )
+        raise InputError("resume", found, "the partial result of an interrupted run")
+    if not method_of(method).is_resumable:
+        raise InputError(
+            "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
+        )
+    found_facts = partial.facts.get("method"), partial.facts.get("options")
+    if found_facts != (method_name(method), option_facts(options)):
+        raise InputError(
+            "resume", "another method, or other options", "those of the run that was interrupted"
+        )
+    return partial.state

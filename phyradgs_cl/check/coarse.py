@@ -1,7 +1,5 @@
 """A scan made small enough to be reconstructed many times: fewer frames, blocks of pixels, coarse voxels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -33,11 +31,8 @@ FINE = Level(32, 1.0)
 
 
 def coarse(scan: Scan, level: Level) -> Scan:
-    """The scan with at most 60 frames, spread evenly, its pixels averaged in blocks, and a grid to match.
-
-    Rows and columns that fill no whole block are left out at the far end. Every block of lines opens when its lines open
-    on average. The reference is dropped.
-    """
+    """The scan with at most 60 frames, spread evenly, its pixels averaged in blocks, and a grid to match; no reference. Rows
+    and columns that fill no block are left out at the far end; a block of lines opens when its lines do on average."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / level.columns), shape[0], max(1, shape[1] // _KEPT_COLUMNS))
     small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), _SMOOTH * block), block)
@@ -52,7 +47,7 @@ def smooth(scan: Scan, pixels: float) -> Scan:
     p = np.asarray(scan.projections, np.float32)
     if scan.pixel_mask is None:
         return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
-    valid = np.broadcast_to(np.asarray(scan.pixel_mask) == 0, p.shape).astype(np.float32)
+    valid = scan.valid.astype(np.float32)
     weight = gaussian_filter(valid, sigma, truncate=3)
     mean = gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6)
     return replace(scan, projections=mean)
@@ -84,10 +79,9 @@ def binned(scan: Scan, block: int) -> Scan:
     rows, columns = (n // block for n in scan.geometry.detector_shape)
     if block == 1:
         return replace(scan, reference=None)
-    valid = np.ones(scan.geometry.detector_shape, bool) if scan.pixel_mask is None else scan.pixel_mask == 0
     shape = (scan.frames, rows, block, columns, block)
     inside = (slice(None), slice(rows * block), slice(columns * block))
-    weight = np.broadcast_to(valid, scan.projections.shape)[inside].reshape(shape)
+    weight = scan.valid[inside].reshape(shape)
     values = np.asarray(scan.projections)[inside].reshape(shape)
     share = weight.mean((2, 4))
     mean = (values * weight).mean((2, 4)) / np.where(share > 0, share, 1.0)
@@ -106,10 +100,8 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: ConeGeometry, voxels: float) -> Grid:
-    """The same box and a voxel around it, in cubes (nearly) that are a pixel at the axis over ``voxels`` wide.
-
-    They are never finer than the scan's own.
-    """
+    """The same box and a voxel around it, in cubes (nearly) of a pixel at the axis over ``voxels`` wide, never
+    finer than the scan's own."""
     pixel_mm = min(geometry.pixel_size_mm) / geometry.magnification
     wanted_mm = max(pixel_mm / voxels, max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     shape = [max(1, math.ceil(side / wanted_mm - 1e-6)) for side in grid.size_mm]

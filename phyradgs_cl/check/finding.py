@@ -1,7 +1,5 @@
 """What a check found: one answer per question, with the number it rests on."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
@@ -10,12 +8,9 @@ FEWEST_COLUMNS = 8  # four gave false alarms, five did not
 
 @dataclass(frozen=True)
 class Finding:
-    """The answer to one question.
-
-    verdict: ``ok``, ``suspicious`` or ``cannot tell``. value: what was measured, in ``unit``; threshold: where it
-    becomes suspicious, in the same unit. text: what was found, advice: what to do about it (empty where nothing is).
-    uncertainty: standard deviation of ``value``, where it is an estimate.
-    """
+    """The answer to one question: ``ok``, ``suspicious`` or ``cannot tell``. value: what was measured, in ``unit``,
+    with its standard deviation ``uncertainty`` where it is an estimate; threshold: from where it is suspicious. text:
+    what was found, advice: what to do about it."""
 
     question: str
     verdict: str

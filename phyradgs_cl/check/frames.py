@@ -1,11 +1,9 @@
 """Frames that stand out by themselves, before anything is reconstructed: black, bright, or the one before again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped
 
 _NORMAL_MAD = 1.4826
 _DEVIATIONS = 12.0
@@ -21,9 +19,7 @@ def odd_ones(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
     weight = np.broadcast_to(valid, p.shape)
     level = (p * weight).sum((1, 2), dtype=np.float64) / np.maximum(weight.sum((1, 2)), 1)
-    wide = np.r_[level[2:0:-1], level, level[-2:-4:-1]]
-    around = np.median(np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]]), axis=0)
-    apart = level - around
+    apart = level - np.median(_around(level), axis=0)
     usual = _NORMAL_MAD * float(np.median(np.abs(apart - np.median(apart))))
     least = max(_DEVIATIONS * usual, _LEAST * abs(float(np.median(level))))
     return [int(f) for f in np.flatnonzero(np.abs(apart) > least)]
@@ -35,8 +31,11 @@ def alike(scan: Scan) -> list[int]:
     if len(p) < _FEWEST:
         return []
     apart = np.array([float(np.square(b - a, dtype=np.float64).mean()) ** 0.5 for a, b in zip(p[:-1], p[1:], strict=True)])
-    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
-    moved = np.abs(wrapped(np.diff(azimuth_rad(np.concatenate(starts))))) > 1e-6
-    wide = np.r_[apart[2:0:-1], apart, apart[-2:-4:-1]]
-    around = np.min(np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]]), axis=0)
-    return [int(f) + 1 for f in np.flatnonzero(moved & (apart < _TWICE * around))]
+    moved = np.abs(wrapped(np.diff(start_azimuths_rad(scan)))) > 1e-6
+    return [int(f) + 1 for f in np.flatnonzero(moved & (apart < _TWICE * np.min(_around(apart), axis=0)))]
+
+
+def _around(values: np.ndarray) -> np.ndarray:
+    """(4, F): of every value (F,) the two before and the two behind, mirrored at the ends."""
+    wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
+    return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])

@@ -1,7 +1,5 @@
 """How well a coarse reconstruction explains the frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,11 +20,8 @@ _FREEDOM = 0.3  # of flats and levels, over the volume's own: without it their n
 
 @dataclass(frozen=True, eq=False)
 class WithFlats:
-    """A x + b + c: line integrals of a volume, a pattern b (rows, columns) of all frames and a level c (F,) of each.
-
-    b is what flats leave behind: their noise, air that is not 0. c is how bright the source was. The vector has the volume,
-    b and c one after another, in units of ``pattern`` and ``level``.
-    """
+    """A x + b + c: line integrals of a volume, a pattern b (rows, columns) of all frames (noise of flats, air that is
+    not 0) and a level c (F,) of each (the source's); one vector, b and c in units of ``pattern`` and ``level``."""
 
     operator: LinearOperator
     volume_shape: tuple[int, ...]
@@ -35,7 +30,7 @@ class WithFlats:
     level: float
 
     @classmethod
-    def of(cls, operator: LinearOperator, frames_shape: tuple[int, int, int]) -> WithFlats:
+    def of(cls, operator: LinearOperator, frames_shape: tuple[int, int, int]) -> "WithFlats":
         frames, pixels = frames_shape[0], frames_shape[1] * frames_shape[2]
         length = math.prod(operator.volume_shape) + pixels + frames
         back = operator.adjoint(np.ones(frames_shape, np.float32))
@@ -51,7 +46,7 @@ class WithFlats:
         flats = self.pattern * frames.sum(0).ravel(), self.level * frames.sum((1, 2))
         return np.concatenate([x, *flats]).astype(np.float32)
 
-    def subset(self, frames: Sequence[int]) -> WithFlats:
+    def subset(self, frames: Sequence[int]) -> "WithFlats":
         shape = (len(frames), *self.frames_shape[1:])
         return WithFlats.of(self.operator.subset(frames), shape)
 

@@ -1,7 +1,5 @@
 """All questions in the order in which they rest on each other; what is found is taken out of the way of the next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -56,13 +54,8 @@ def check(
     counts: CountReader | None = None,
     report: Callable[[int, int, str], None] = lambda done, total, question: None,
 ) -> CheckResult:
-    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was.
-
-    ``report`` gets how many questions are answered, of how many, and the one that is asked next.
-
-    Raises:
-        InputError: every pixel is masked; NaN or infinity where none is.
-    """
+    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was. ``report`` gets how
+    many questions are answered, of how many, and the next. InputError: every pixel masked; NaN or infinity elsewhere."""
     scan = prepared(_usable(scan), InputOptions())
     asks_readout = scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0
     asks_exposure = scan.shutter.exposure_s > 0
@@ -120,10 +113,8 @@ def _looks_alike(question: str) -> Finding:
 def _turning(
     rt: Runtime, quick: Scan, add: Callable[[Finding], Finding], sees_angles: bool
 ) -> tuple[bool, Offset, Finding]:
-    """(whether the gantry turns the other way, where its axis is on the panel, what was found about the axis).
-
-    A panel of few columns says neither: its reconstructions fit whatever the shift.
-    """
+    """(does the gantry turn the other way, where is its axis on the panel, what was found about that); a panel
+    of few columns says neither."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         add(too_narrow(SIGN, "standard errors"))
         return False, Offset(math.nan, math.nan, np.empty(0)), add(too_narrow(CENTRE, "pixels"))
@@ -145,13 +136,12 @@ def _turning(
 def _usable(scan: Scan) -> Scan:
     """The scan with zeros for masked values that are not finite."""
     p = np.asarray(scan.projections)
-    valid = np.broadcast_to(True if scan.pixel_mask is None else np.asarray(scan.pixel_mask) == 0, p.shape)
-    if not valid.any():
+    if not scan.valid.any():
         raise InputError("pixel_mask", "every pixel masked", "pixels that say something", "check the mask")
     finite = np.isfinite(p)
     if finite.all():
         return scan
-    checks.finite("projections", p[valid])
+    checks.finite("projections", p[scan.valid])
     return replace(scan, projections=np.where(finite, p, 0).astype(np.float32))
 
 

@@ -1,7 +1,5 @@
 """What the residuals of a few hypotheses say, with how sure one can be of it: frames are the sample."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _DRAWS = 200
@@ -9,11 +7,8 @@ _TINY = 1e-30
 
 
 def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
-    """By how many standard errors the stated hypothesis explains the frames (F,) better than the other.
-
-    Squared residuals are compared frame by frame, relative to the stated one's, so that what makes a frame hard to explain
-    under both does not count. 0 where there are fewer than three frames or both are the same.
-    """
+    """By how many standard errors the stated hypothesis explains the frames (F,) better than the other, relative to the
+    stated one's residuals frame by frame. 0 with fewer than three frames, or where both are the same."""
     difference = (other - stated) / np.maximum(stated + other, _TINY)
     if difference.size < 3:
         return 0.0
@@ -27,15 +22,8 @@ def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
-    """Where the parabola through three sums of squares has its minimum, and its standard deviation.
-
-    Args:
-        at: three values (3,), evenly spaced, ascending.
-        squares: (3, F) squared residuals of every frame; frames are drawn anew for the deviation (bootstrap).
-
-    Returns:
-        NaN where there is no minimum.
-    """
+    """Where the parabola through sums of squares (3, F) at three even, ascending places (3,) has its minimum, and the
+    standard deviation of that, by drawing frames anew (bootstrap); NaN where there is no minimum."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
     found = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])

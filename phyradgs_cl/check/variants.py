@@ -1,7 +1,5 @@
 """The same frames under another hypothesis: turned the other way, read the other way, exposed longer, panel shifted."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,18 +9,18 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.trajectory import Trajectory
-from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.questions.timing import azimuth_rad, start_azimuths_rad, wrapped
 
 _MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at the plane y = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields below.
+    """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields.
 
-    is_reversed: the gantry turns the other way (a mirror image of the poses, whose columns then run backwards);
-    offset_u_mm of the panel stays on its side. shift_px: the panel moves along u, in its own columns. block: pixels
-    become blocks. frames (F,): which frames of ``base`` are used; None: all.
+    is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
+    on its side. shift_px: the panel moves along u, in its own columns. block: pixels become blocks. frames (F,): which of
+    ``base`` are used; None: all.
     """
 
     base: Trajectory
@@ -112,8 +110,7 @@ def read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
     """Frames turned about z by ``angle_rad`` (F,), the gantry ``speed`` times as fast within them."""
-    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
-    first_rad = azimuth_rad(np.concatenate(starts))
+    first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
         since = wrapped(azimuth_rad(pose) - first_rad[frame])
@@ -123,10 +120,8 @@ def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
 
 
 def stretched(scan: Scan, v: float, u: float) -> Scan:
-    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel.
-
-    The box grows alike if it then fits what the panel sees better than as it is.
-    """
+    """Pixels ``v`` times as high and ``u`` times as wide about the middle of the panel; the box grows alike if it then
+    fits what the panel sees better than as it is."""
     rows, columns = scan.geometry.detector_shape
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:

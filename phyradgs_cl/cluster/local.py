@@ -1,12 +1,12 @@
-"""A scheduler and workers on this machine, one process per worker, each with a device of its own."""
+"""dask.distributed, imported when needed and quiet; and workers on this machine, each with a device of its own."""
 
-from __future__ import annotations
-
+import importlib.util
 import logging
 import warnings
+from types import ModuleType
 from typing import Any
 
-from phyradgs_cl.cluster.library import distributed
+from phyradgs_cl import checks
 from phyradgs_cl.cluster.workers import Workers
 from phyradgs_cl.runtime import DEVICE_VARIABLE
 
@@ -16,10 +16,8 @@ _DASHBOARD = f"{_HOST}:8787"
 
 
 def local_cluster(workers: Workers) -> Any:
-    """Starts them; what is returned closes them. A worker that dies is replaced by its nanny.
-
-    There is no limit of memory per worker: Dask would kill a run that is larger than its share, again and again.
-    """
+    """Starts them; what is returned closes them. A worker that dies is replaced by its nanny. No limit of memory per
+    worker: Dask would kill a run that is larger than its share, again and again."""
     package = distributed()
     spec = {number: _worker(package, device) for number, device in enumerate(workers.devices())}
     scheduler = {
@@ -43,3 +41,18 @@ def _worker(package: Any, device: str) -> dict[str, Any]:
         "silence_logs": logging.CRITICAL,
     }
     return {"cls": package.Nanny, "options": options}
+
+
+def has_dask() -> bool:
+    """Whether dask.distributed is installed."""
+    return importlib.util.find_spec("distributed") is not None
+
+
+def distributed() -> ModuleType:
+    """The package, or an InputError that says how to install it."""
+    use = "the package that --scheduler and --workers need"
+    package = checks.package("distributed", use, "phyradgs-cl[cluster]")
+    for name in list(logging.root.manager.loggerDict):
+        if name == "distributed" or name.startswith("distributed."):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    return package

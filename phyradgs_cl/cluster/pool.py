@@ -1,9 +1,4 @@
-"""Runs shared out over Dask's workers: no more are handed out than there are devices, the rest waits here.
-
-What Dask holds at a worker shares that worker's deaths: so a run that kills workers takes no other with it.
-"""
-
-from __future__ import annotations
+"""Runs shared out over Dask's workers, no more than there are devices, and a run that kills workers takes no other along."""
 
 import asyncio
 import logging
@@ -15,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.cluster.library import distributed
-from phyradgs_cl.cluster.local import RESOURCE, local_cluster
+from phyradgs_cl.cluster.local import RESOURCE, distributed, local_cluster
 from phyradgs_cl.cluster.workers import Workers
 from phyradgs_cl.errors import DeviceError, InputError
 
@@ -51,7 +45,7 @@ class Pool:
         self._cluster: Any = None
         self._client: Any = None
 
-    def __enter__(self) -> Pool:
+    def __enter__(self) -> "Pool":
         distributed()
         try:
             if self.workers.is_local:
@@ -82,11 +76,8 @@ class Pool:
         arguments: Mapping[str, Any],
         look: Callable[[PoolState], None] = lambda state: None,
     ) -> Iterator[tuple[str, Any]]:
-        """(name, ``function(argument)`` or Lost) of every argument once, as they come.
-
-        An exception of ``function`` is raised here; the other runs are then given up. ``look`` is called some times a
-        second. Raises InputError when the scheduler goes away.
-        """
+        """(name, ``function(argument)`` or Lost) of every argument once, as they come; ``look`` is called some times a
+        second. An exception of ``function`` is raised here and ends the others. InputError when the scheduler goes away."""
         waiting, running = deque(arguments), dict[Any, str]()
         seen_s, revivals = time.monotonic(), 0
         try:
@@ -101,11 +92,14 @@ class Pool:
                         waiting.extendleft(running.values())
                         running.clear()
                     else:
-                        self._say_no_worker()
+                        start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
+                        log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)
                     seen_s = time.monotonic()
                 while waiting and len(running) < devices:
                     name = waiting.popleft()
-                    running[self._submitted(function, arguments[name], name)] = name
+                    key = f"{name}-{time.time_ns():x}"  # of this call alone: no earlier result is taken for it
+                    how = {"key": key, "resources": {RESOURCE: 1}, "pure": False}
+                    running[self._client.submit(function, arguments[name], **how)] = name
                 look(PoolState(len(waiting), len(running), devices))
                 for future in self._finished(running):
                     revivals = 0
@@ -113,10 +107,6 @@ class Pool:
         finally:
             if self._client.status == "running":
                 self._client.cancel(list(running))
-
-    def _submitted(self, function: Callable[[Any], Any], argument: Any, name: str) -> Any:
-        key = f"{name}-{time.time_ns():x}"  # of this call alone: no result of an earlier one is taken for it
-        return self._client.submit(function, argument, key=key, resources={RESOURCE: 1}, pure=False)
 
     def _finished(self, running: Mapping[Any, str]) -> set[Any]:
         if not running:
@@ -161,7 +151,6 @@ class Pool:
         return package.Client(**where, timeout=_CONNECT_S, set_as_default=False)
 
     def _devices(self) -> int:
-        """How many runs the workers may have at a time."""
         try:
             workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
         except _NO_ANSWER as error:
@@ -180,7 +169,3 @@ class Pool:
         log.warning("no local worker is left: starting them anew")
         self.__exit__()
         self.__enter__()
-
-    def _say_no_worker(self) -> None:
-        start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
-        log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)

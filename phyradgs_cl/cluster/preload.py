@@ -1,12 +1,9 @@
 """What a local worker does first: Ctrl-C in a terminal reaches the whole group, and is the client's to answer."""
 
-from __future__ import annotations
-
 import signal
 import threading
 
 
 def dask_setup(worker: object) -> None:
-    """Called by Dask in the worker's process."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)

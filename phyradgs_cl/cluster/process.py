@@ -1,7 +1,5 @@
 """The device of a worker's process: kernels are built once and stay, run after run."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +12,8 @@ _alone = threading.Lock()
 
 @contextmanager
 def runtime_of_process(wish: str | None = None) -> Iterator[Runtime]:
-    """This process's runtime for a device (``PHYRADGS_DEVICE`` where none is asked for), for one run at a time.
-
-    A worker that was started with several threads would otherwise set the arguments of one kernel twice at once.
-    """
+    """This process's runtime for a device (None: ``PHYRADGS_DEVICE``'s), for one run at a time: threads of a worker
+    would otherwise set the arguments of one kernel twice at once."""
     with _alone:
         if wish not in _runtimes:
             _runtimes[wish] = Runtime(wish)

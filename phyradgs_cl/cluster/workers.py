@@ -1,7 +1,5 @@
 """Which workers make the runs: some of this machine, or those of a scheduler that is there already."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 
@@ -15,15 +13,9 @@ _MOST_WORKERS = 1024
 
 @dataclass(frozen=True)
 class Workers:
-    """Where runs are made.
-
-    Args:
-        scheduler: ``local`` for workers of this machine; else the address of a Dask scheduler (``tcp://host:8786``) or
-            the JSON file that one has written (``dask scheduler --scheduler-file``).
-        count: of local workers; None is one per device.
-        device: what a worker's device is asked for by; several with commas are given out in turn. Only for local
-            workers: others say it themselves, by the environment variable PHYRADGS_DEVICE.
-    """
+    """Where runs are made. ``scheduler``: ``local``, else the address of a Dask scheduler (``tcp://host:8786``) or its JSON
+    file (``dask scheduler --scheduler-file``). ``count``: of local workers; None is one per device. ``device``: what local
+    workers' devices are asked for by, several with commas; others have PHYRADGS_DEVICE."""
 
     scheduler: str = LOCAL
     count: int | None = None

@@ -1,13 +1,11 @@
 """bench: a quick comparison of methods."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from phyradgs_cl.commands.files import file_parser
+from phyradgs_cl.commands.files import file_parser, option
 from phyradgs_cl.commands.options import Device, Scheduler, WorkerCount
 from phyradgs_cl.commands.sweep import chosen_workers, make_sweep
 from phyradgs_cl.errors import InputError
@@ -21,30 +19,19 @@ EXAMPLE = (
     "Runs that the results file in the folder has already are not made again. The paper's tables, on volumes of your own: "
     "python benchmarks/tables --help, in a checkout."
 )
+_KIND = f"quick: methods with and without motion on two phantoms of {VOXELS}³ from {PIXELS}², a minute or two."
+_OUTPUT = f"Folder for scans, {RESULTS} (one line per run), volumes and tables."
 _TABLES = ("table1", "table2", "phantom")
 
 
 def bench_command(
-    kind: Annotated[
-        str,
-        typer.Argument(
-            metavar="quick",
-            help=f"quick: methods with and without motion on two phantoms of {VOXELS}³ from {PIXELS}², a minute or two.",
-        ),
-    ],
+    kind: Annotated[str, typer.Argument(metavar="quick", help=_KIND)],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            parser=file_parser("-o"),
-            metavar="DIR",
-            help=f"Folder for scans, {RESULTS} (one line per run), volumes and tables.",
-            show_default="bench-results",
-        ),
+        option(_OUTPUT, "bench-results", "--output", "-o", parser=file_parser("-o"), metavar="DIR"),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise, cloud and frame order.")] = 0,
-    iterations: Annotated[int, typer.Option(help="Iterations of the splatting methods.")] = ITERATIONS,
+    seed: Annotated[int, option("Of noise, cloud and frame order.", min=0)] = 0,
+    iterations: Annotated[int, option("Iterations of the splatting methods.")] = ITERATIONS,
     scheduler: Scheduler = None,
     workers: WorkerCount = None,
     device: Device = None,

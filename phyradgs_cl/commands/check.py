@@ -1,17 +1,13 @@
 """check: what is wrong or suspicious in a scan."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from phyradgs_cl.check import SUSPICIOUS, CheckResult, CountReader, check
 from phyradgs_cl.commands.console import AsJson, say
-from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, read_scan
@@ -24,21 +20,15 @@ from phyradgs_cl.workflow.files import expecting, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs check scan.h5"
 SUSPICIOUS_STATUS = 10
+_FIX_OFFSET = "Write a copy of the scan (-o) with the centre-of-rotation offset that was found."
 
 
 def check_command(
     scan: Scan,
     as_json: AsJson = False,
-    fix_offset: Annotated[
-        bool,
-        typer.Option(
-            "--fix-offset",
-            help="Write a copy of the scan (-o) with the centre-of-rotation offset that was found.",
-        ),
-    ] = False,
+    fix_offset: Annotated[bool, option(_FIX_OFFSET, True, "--fix-offset")] = False,
     output: Annotated[
-        Path | None,
-        file_option("--output", "-o", help="The copy to write, with --fix-offset.", show_default=False),
+        Path | None, file_option("The copy to write, with --fix-offset.", "--output", "-o", default=False)
     ] = None,
     device: Device = None,
 ) -> int:
@@ -77,9 +67,8 @@ def _write_copy(scan: Path, target: Path, found: CheckResult, quiet: bool) -> No
         remedy = "set right what is suspicious, and check again"
         raise InputError("--fix-offset", "frames that do not fit together", "an offset that means something", remedy)
     if not (math.isfinite(found.offset_mm) and math.isfinite(found.offset_spread_mm)):
-        raise InputError(
-            "--fix-offset", "no offset that fits best", "a scan whose frames tell it", "leave it out"
-        )
+        expected = "a scan whose frames tell it"
+        raise InputError("--fix-offset", "no offset that fits best", expected, "leave it out")
     with only_run(target), finish_despite_interrupt():
         copy_with_offset(scan, target, found.offset_mm)
     if not quiet:

@@ -1,6 +1,4 @@
-"""What a command says: results on stdout, one line about trouble on stderr, and the status it ends with."""
-
-from __future__ import annotations
+"""What a command says: results on stdout, one line about trouble on stderr, its status, and its help."""
 
 import os
 import sys
@@ -9,6 +7,7 @@ from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.text import plain_text
@@ -73,3 +72,17 @@ def give_up_stdout() -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
+
+
+class PanelledCommand(TyperCommand):
+    """A command whose help lists options with a ``rich_help_panel`` apart; Typer does so only with rich, in boxes."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
+            if (record := parameter.get_help_record(ctx)) is not None:
+                panels.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(record)
+        for name in sorted(panels, key=lambda name: name not in ("Arguments", "Options")):
+            with formatter.section(name):
+                formatter.write_dl(panels[name])

@@ -1,7 +1,5 @@
 """devices: what OpenCL offers, and what would be taken."""
 
-from __future__ import annotations
-
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import Device
 from phyradgs_cl.runtime import choose_device, list_devices

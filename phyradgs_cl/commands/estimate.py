@@ -1,7 +1,5 @@
 """estimate: what a reconstruction would take."""
 
-from __future__ import annotations
-
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import Scan
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
@@ -14,10 +12,7 @@ EXAMPLE = "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row
 
 
 @with_run_options("seed")
-def estimate_command(
-    scan: Scan,
-    request: RunRequest,
-) -> None:
+def estimate_command(scan: Scan, request: RunRequest) -> None:
     """Say how long a reconstruction would take and how much memory, from a few iterations of it."""
     settings = request.settings()
     options = method_options(settings.method, settings.preset, settings.changes)

@@ -1,7 +1,5 @@
 """evaluate: a volume against the truth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated
@@ -11,22 +9,16 @@ from phyradgs_cl.commands.files import file_argument, file_option
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"
+_REFERENCE = "Scan with a known truth, or a volume; VOLUME is resampled onto its grid (linear)."
 
 
 def evaluate_command(
     volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
-    reference: Annotated[
-        Path,
-        file_option("--reference", help="Scan with a known truth, or a volume; VOLUME is resampled onto its grid (linear)."),
-    ],
+    reference: Annotated[Path, file_option(_REFERENCE, "--reference")],
     as_json: AsJson = False,
     picture: Annotated[
         Path | None,
-        file_option(
-            "--picture",
-            help="PNG of slices: result, truth, difference.",
-            show_default="VOLUME with .png",
-        ),
+        file_option("PNG of slices: result, truth, difference.", "--picture", default="VOLUME with .png"),
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""

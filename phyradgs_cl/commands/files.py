@@ -1,6 +1,4 @@
-"""File names as words of a command."""
-
-from __future__ import annotations
+"""How commands declare their options and arguments."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +7,11 @@ from typing import Any
 import typer
 
 from phyradgs_cl.errors import InputError
+
+
+def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
+    """An option of Typer: what its help says, and what that calls the default where it is not the value itself."""
+    return typer.Option(*flags, help=help, show_default=default, **more)
 
 
 def file_parser(culprit: str) -> Callable[[str], Path]:
@@ -22,10 +25,9 @@ def file_parser(culprit: str) -> Callable[[str], Path]:
     return file
 
 
-def file_option(*names: str, help: str, show_default: bool | str = True) -> Any:
+def file_option(help: str, *flags: str, default: bool | str = True) -> Any:
     """An option that takes a file name."""
-    parser = file_parser(names[-1])
-    return typer.Option(*names, parser=parser, metavar="FILE", help=help, show_default=show_default)
+    return option(help, default, *flags, parser=file_parser(flags[-1]), metavar="FILE")
 
 
 def file_argument(name: str, help: str) -> Any:

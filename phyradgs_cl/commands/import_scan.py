@@ -1,22 +1,19 @@
 """import: a scan of another program becomes one of ours."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import typer
 
 from phyradgs_cl.commands.console import remark, say
-from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option, option
 from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, VoxelMm, lengths
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
-from phyradgs_cl.importers.options import ANGLE_AT, COLUMN_0, PARTS, QUANTITIES, ROTATES, ROW_0
+from phyradgs_cl.importers.options import WORDS
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 
@@ -25,97 +22,60 @@ EXAMPLE = (
     "Example: phyradgs import scan.xml -o scan.h5 --exposure-s 0.03 --readout-s 0.02 --frame-time-s 0.05"
 )
 
-
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
-AngleAt, Part, Quantity = Literal[ANGLE_AT], Literal[PARTS], Literal[QUANTITIES]
-Rotates, Row0, Column0 = Literal[ROTATES], Literal[ROW_0], Literal[COLUMN_0]
-
+AngleAt = Literal[WORDS["angle_at"]]  # type: ignore[name-defined, valid-type]
+Part = Literal[WORDS["part"]]  # type: ignore[name-defined, valid-type]
+Quantity = Literal[WORDS["quantity"]]  # type: ignore[name-defined, valid-type]
+Rotates = Literal[WORDS["rotates"]]  # type: ignore[name-defined, valid-type]
+Row0 = Literal[WORDS["row_0"]]  # type: ignore[name-defined, valid-type]
+Column0 = Literal[WORDS["column_0"]]  # type: ignore[name-defined, valid-type]
 
 _FIELDS = frozenset(f.name for f in fields(ImportOptions))
-
-
-def _number(help: str, default: str = "the file's") -> typer.models.OptionInfo:
-    return typer.Option(help=help, show_default=default)
+_FILE, _FORMAT = "the file's", "the format's"
 
 
 def import_command(
     source: Annotated[Path, file_argument("SRC", "File or folder of another program; see docs/import.md.")],
     output: Annotated[
-        Path, file_option("--output", "-o", help="Scan file to write; an existing one is replaced whole.")
+        Path, file_option("Scan file to write; an existing one is replaced whole.", "--output", "-o")
     ],
-    form: Annotated[
-        FormatName | None,  # type: ignore[valid-type]
-        typer.Option("--format", help="Format of SRC.", show_default="recognised"),
-    ] = None,
-    exposure_s: Annotated[float | None, _number("Exposure of a line, s.")] = None,
+    form: Annotated[FormatName | None, option("Format of SRC.", "recognised", "--format")] = None,  # type: ignore[valid-type]
+    exposure_s: Annotated[float | None, option("Exposure of a line, s.", _FILE)] = None,
     readout_s: Annotated[
-        float | None, _number("From the first line's opening to the last line's, s.")
+        float | None, option("From the first line's opening to the last line's, s.", _FILE)
     ] = None,
     frame_time_s: Annotated[
         float | None,
-        _number(
-            "From one frame's opening to the next, s: the gantry turned without a stop.",
-            "the file's, else at rest",
-        ),
+        option("From one frame's opening to the next, s: the gantry turned without a stop.", f"{_FILE}, else at rest"),
     ] = None,
     angle_at: Annotated[
-        AngleAt | None,  # type: ignore[valid-type]
-        typer.Option(
-            help="What a frame's angle belongs to: start or middle of its exposure.", show_default="start"
-        ),
+        AngleAt | None, option("What a frame's angle belongs to: start or middle of its exposure.", "start")
     ] = None,
-    readout_axis: Annotated[
-        Axis | None, typer.Option("--readout", help="What is read out at one time.", show_default="the format's")
-    ] = None,
+    readout_axis: Annotated[Axis | None, option("What is read out at one time.", _FORMAT, "--readout")] = None,
     readout_direction: Annotated[
-        int | None,
-        typer.Option(
-            help="1 reads our row 0 (lowest) or column 0 (left) first, -1 last.", show_default="the format's"
-        ),
+        int | None, option("1 reads our row 0 (lowest) or column 0 (left) first, -1 last.", _FORMAT)
     ] = None,
-    source_to_axis_mm: Annotated[float | None, _number("Source to rotation axis, mm.")] = None,
-    source_to_detector_mm: Annotated[float | None, _number("Source to detector, mm.")] = None,
-    pixel_size_mm: Annotated[Any, lengths("--pixel-size-mm", "Pixel size V,U in mm.", "the file's")] = None,
-    detector_offset_mm: Annotated[
-        Any, lengths("--detector-offset", "Detector offset V,U in mm.", "the file's")
-    ] = None,
-    unit_mm: Annotated[float, typer.Option(help="Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
-    rotates: Annotated[
-        Rotates | None,  # type: ignore[valid-type]
-        typer.Option(help="What the stored angles turn.", show_default="the format's"),
-    ] = None,
-    row_0: Annotated[
-        Row0 | None,  # type: ignore[valid-type]
-        typer.Option("--row-0", help="Where the first stored row is.", show_default="the format's"),
-    ] = None,
+    source_to_axis_mm: Annotated[float | None, option("Source to rotation axis, mm.", _FILE)] = None,
+    source_to_detector_mm: Annotated[float | None, option("Source to detector, mm.", _FILE)] = None,
+    pixel_size_mm: Annotated[Any, lengths("--pixel-size-mm", "Pixel size V,U in mm.", _FILE)] = None,
+    detector_offset_mm: Annotated[Any, lengths("--detector-offset", "Detector offset V,U in mm.", _FILE)] = None,
+    unit_mm: Annotated[float, option("Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
+    rotates: Annotated[Rotates | None, option("What the stored angles turn.", _FORMAT)] = None,
+    row_0: Annotated[Row0 | None, option("Where the first stored row is.", _FORMAT, "--row-0")] = None,
     column_0: Annotated[
-        Column0 | None,  # type: ignore[valid-type]
-        typer.Option(
-            "--column-0", help="Where the first stored column is, seen from the source.", show_default="left"
-        ),
+        Column0 | None, option("Where the first stored column is, seen from the source.", "left", "--column-0")
     ] = None,
-    quantity: Annotated[
-        Quantity | None,  # type: ignore[valid-type]
-        typer.Option(help="What the pixels hold.", show_default="the file's"),
-    ] = None,
+    quantity: Annotated[Quantity | None, option("What the pixels hold.", _FILE)] = None,
     flat_value: Annotated[
-        float | None, _number("Counts without an object, where there are no flat frames.")
+        float | None, option("Counts without an object, where there are no flat frames.", _FILE)
     ] = None,
     detector_model: Annotated[
         DetectorModel | None,
-        typer.Option(
-            help="What is averaged over an exposure: line integrals or intensity.", show_default="log"
-        ),
+        option("What is averaged over an exposure: line integrals or intensity.", "log"),
     ] = None,
-    part: Annotated[
-        Part,  # type: ignore[valid-type]
-        typer.Option(help="Projections of a benchmark folder (r2, phyradgs, naf)."),
-    ] = "train",
+    part: Annotated[Part, option("Projections of a benchmark folder (r2, phyradgs, naf).")] = "train",
     first_view: Annotated[
-        int | None,
-        typer.Option(
-            help="Where this scan begins in a JSON of several (phyradgs-real).", show_default="the whole"
-        ),
+        int | None, option("Where this scan begins in a JSON of several (phyradgs-real).", "the whole")
     ] = None,
     size: Size = None,
     voxel_mm: VoxelMm = None,

@@ -1,7 +1,5 @@
 """Commands under mpiexec: one voice, and one end for all."""
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback

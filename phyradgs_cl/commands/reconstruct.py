@@ -1,7 +1,5 @@
 """reconstruct: a scan file to a volume file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +8,7 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say, scores
-from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Output, Scan
 from phyradgs_cl.commands.ranks import last_words
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
@@ -21,12 +19,15 @@ from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow import ReconstructionJob, profile_report, run_reconstruction
+from phyradgs_cl.workflow import profile_report, run_reconstruction
 
 EXAMPLE = (
     "Example: phyradgs reconstruct scan.h5 -o volume.h5 --iterations 2000\n\n"
     "Ctrl-C keeps what there is, here as volume.partial.h5, and a checkpoint; --resume goes on from it."
 )
+_CHECKPOINT = "Keep a checkpoint beside the output so often, for --resume after a kill; 0: on Ctrl-C only."
+_PREVIEW = "PNG of the three middle slices; of the run under way, every five seconds, as NAME.partial.png."
+_PROFILE = "Say where the device's time went, kernel by kernel, beside its best rates."
 
 
 @with_run_options()
@@ -34,45 +35,14 @@ def reconstruct_command(
     scan: Scan,
     output: Output,
     request: RunRequest,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint of an interrupted run.")
-    ] = False,
-    checkpoint_every: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            help="Keep a checkpoint beside the output so often, for --resume after a kill; 0: on Ctrl-C only.",
-        ),
-    ] = 600.0,
-    preview: Annotated[
-        Path | None,
-        file_option(
-            "--preview",
-            help="PNG of the three middle slices; of the run under way, every five seconds, as NAME.partial.png.",
-        ),
-    ] = None,
-    profile: Annotated[
-        bool,
-        typer.Option(
-            "--profile", help="Say where the device's time went, kernel by kernel, beside its best rates."
-        ),
-    ] = False,
+    resume: Annotated[bool, option("Go on from the checkpoint of an interrupted run.", True, "--resume")] = False,
+    checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
+    preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
+    profile: Annotated[bool, option(_PROFILE, True, "--profile")] = False,
 ) -> None:
     """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
     settings = request.settings()
-    job = ReconstructionJob(
-        scan,
-        output,
-        method=settings.method,
-        seed=settings.seed,
-        preset=settings.preset,
-        changes=settings.changes,
-        resume=resume,
-        config=request.config,
-        before=settings.before,
-        checkpoint_every_s=checkpoint_every,
-    )
-
+    job = request.job(settings, scan, output, resume=resume, checkpoint_every_s=checkpoint_every)
     ranks = launched_ranks()
     runtimes: list[Runtime] = []
     ticker = Ticker("iteration")

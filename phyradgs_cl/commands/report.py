@@ -1,14 +1,10 @@
 """report: a reconstruction as an HTML page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option, option
 from phyradgs_cl.commands.options import Device, Output
 from phyradgs_cl.report import write_report
 from phyradgs_cl.report.page import DEFAULT_VIEWS
@@ -24,15 +20,11 @@ def report_command(
     output: Output,
     scan: Annotated[
         Path | None,
-        file_option(
-            "--scan", help="Its scan.", show_default="the one that the volume file names, if unchanged"
-        ),
+        file_option("Its scan.", "--scan", default="the one that the volume file names, if unchanged"),
     ] = None,
     views: Annotated[
         int,
-        typer.Option(
-            min=0, max=MOST_VIEWS, help="Frames to compute from the volume and compare with the measurement."
-        ),
+        option("Frames to compute from the volume and compare with the measurement.", min=0, max=MOST_VIEWS),
     ] = DEFAULT_VIEWS,
     device: Device = None,
 ) -> None:

@@ -1,37 +1,80 @@
 """The options of a reconstruction, given to every command that speaks of one."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from phyradgs_cl.commands import options
+from phyradgs_cl.commands.files import file_option, option
+from phyradgs_cl.reconstructors import METHODS
 from phyradgs_cl.settings import RunSettings, run_settings
+from phyradgs_cl.workflow import ReconstructionJob
+
+_METHOD = (
+    "phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
+    "naf, sax-nerf: neural fields; MODULE:NAME: a function of your own (docs: api.md); "
+    "the others are iterative on voxels."
+)
+_MOTION = (
+    "How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
+    "every line at its own times (per-row), or splats that move while lines integrate (exact); "
+    "not every method has all of them."
+)
+_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2); the window of fdk."
+_CONFIG = (
+    "TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
+    "the command line wins."
+)
+_SET = (
+    "Any option of the method by name, as in the file: --set tv_weight=0.002 --set order=random. "
+    "Docs: methods.md."
+)
+_RANKS = "Under mpiexec (docs: cluster.md)"  # a panel of its own at the end of a command's help
+
+
+def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
+    return Annotated[kind | None, option(help, default, *flags, **more)]
+
 
 RUN_OPTIONS: dict[str, Any] = {
-    "method": options.Method,
-    "motion": options.MotionModel,
-    "strips": options.Strips,
-    "sub_intervals": options.SubIntervals,
-    "segments": options.Segments,
-    "time_error": options.TimeError,
-    "iterations": options.Iterations,
-    "gaussians": options.GaussianCount,
+    "method": _asked(str, _METHOD, "phyradgs", metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
+    "motion": _asked(
+        Literal["static", "static-start", "micro-views", "per-row", "exact"],
+        _MOTION,
+        "exact for phyradgs, else static",
+    ),
+    "strips": _asked(int, "Strips M of a frame (rolling shutter); means micro-views.", "8"),
+    "sub_intervals": _asked(
+        int, "Sub-intervals N of an exposure (motion blur); for phyradgs means micro-views.", "5"
+    ),
+    "segments": _asked(int, "Segments of a frame (motion exact); 0: by the time error.", "0"),
+    "time_error": _asked(float, "Relative error that averaging over time may leave (motion exact).", "0.005"),
+    "iterations": _asked(
+        int, "Iterations: one frame each for splats, all frames for voxels.", "preset's: 3000 for splats"
+    ),
+    "gaussians": _asked(int, "Gaussians at the start.", "preset's: from the grid"),
     "size": options.Size,
     "voxel_mm": options.VoxelMm,
     "roi_mm": options.RoiMm,
-    "seed": options.Seed,
-    "preset": options.Preset,
-    "batch": options.Batch,
-    "config": options.Config,
-    "assignments": options.Assignments,
-    "detector_model": options.LineModel,
-    "ignore_lag": options.IgnoreLag,
-    "median_filter": options.MedianFilter,
+    "seed": _asked(int, "Seed of cloud, frame order and sub-volumes.", "0"),
+    "preset": _asked(str, _PRESET, "the method's first"),
+    "batch": _asked(
+        int, "Frames per step, for splats.", "as many as ranks", metavar="B", rich_help_panel=_RANKS
+    ),
+    "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
+    "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
+    "detector_model": _asked(
+        options.DetectorModel,
+        "What is averaged over an exposure: line integrals (log) or intensity.",
+        "the scan's",
+    ),
+    "ignore_lag": Annotated[
+        bool, option("Leave the lag that the scan file states in the frames.", True, "--ignore-lag")
+    ],
+    "median_filter": _asked(int, "Median filter of the frames: 3 or 5 pixels per side, 0 none.", "0"),
     "device": options.Device,
     "memory": options.Memory,
 }
@@ -46,19 +89,18 @@ class RunRequest:
     given: dict[str, Any]
 
     def settings(self) -> RunSettings:
-        """Everything together, checked.
-
-        Raises:
-            InputError: an option, or a line of the file, is not what it should be.
-        """
+        """Everything together, checked; InputError for an option or line that is not what it should be."""
         return run_settings(self.config, self.given, self.assignments)
+
+    def job(self, settings: RunSettings, scan: Path, output: Path, **more: Any) -> ReconstructionJob:
+        """What is to be done with ``scan``, by the ``settings`` of this request."""
+        known = {name: getattr(settings, name) for name in ("method", "seed", "preset", "changes", "before")}
+        return ReconstructionJob(scan, output, config=self.config, **known, **more)
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command all options of a reconstruction but some, in the place of its parameter ``request``.
-
-    Typer reads a command's signature: the one that it finds has the options, and the command is called with a RunRequest.
-    """
+    """Gives a command all options of a reconstruction but some, in place of its parameter ``request``: Typer, which
+    reads a command's signature, sees the options, and the command is called with a RunRequest."""
     names = [name for name in RUN_OPTIONS if name not in without]
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
@@ -80,13 +122,9 @@ def _signature(command: Callable[..., None], names: list[str]) -> inspect.Signat
     parameters: list[inspect.Parameter] = []
     for own in inspect.signature(command, eval_str=True).parameters.values():
         if own.name == "request":
-            parameters += [_parameter(name) for name in names]
+            for name in names:
+                default = False if get_args(kind := RUN_OPTIONS[name])[0] is bool else None
+                parameters.append(inspect.Parameter(name, own.KEYWORD_ONLY, default=default, annotation=kind))
         else:
-            parameters.append(own.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            parameters.append(own.replace(kind=own.KEYWORD_ONLY))
     return inspect.Signature(parameters)
-
-
-def _parameter(name: str) -> inspect.Parameter:
-    annotation = RUN_OPTIONS[name]
-    default = False if get_args(annotation)[0] is bool else None
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

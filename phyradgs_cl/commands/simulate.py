@@ -1,164 +1,103 @@
 """simulate: a phantom or a volume to a scan file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
-
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.files import file_option
+from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output, lengths
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, pair_parser
-from phyradgs_cl.simulation import scanner_for, scanner_options
+from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options
 from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_options, run_simulation
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
 
-
 PhantomName = Literal["foot", "jaw", "shepp-logan", "spheres"]
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]
+_VOLUME = "Volume file: ours, an HDF5 file with a dataset /volume (z, y, x), mha, nii, nrrd, npy or tiff."
+_PROTOCOL = (
+    "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
+    "rapid, or of the fly-scan that the options below describe."
+)
 
 
 def simulate_command(
     output: Output,
-    phantom: Annotated[
-        PhantomName | None, typer.Option(help="Built-in phantom.", show_default="foot, without --volume")
+    phantom: Annotated[PhantomName | None, option("Built-in phantom.", "foot, without --volume")] = None,
+    volume: Annotated[Path | None, file_option(_VOLUME, "--volume")] = None,
+    scanner: Annotated[str, option("Scanner by name (r2, carm) or a TOML file.")] = "r2",
+    protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]
+    views: Annotated[int | None, option("Frames in the turn.", "protocol's")] = None,
+    exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,
+    readout_ratio: Annotated[float | None, option("Readout over exposure time, T_ro/T_exp.", "0.86")] = None,
+    start_deg: Annotated[float | None, option("Gantry angle at the start, degrees.", "0")] = None,
+    readout_axis: Annotated[
+        Axis | None, option("What is read out at one time.", "scanner's", "--readout")
     ] = None,
-    volume: Annotated[
-        Path | None,
-        file_option(
-            "--volume",
-            help="Volume file: ours, an HDF5 file with a dataset /volume (z, y, x), mha, nii, nrrd, npy or tiff.",
-        ),
-    ] = None,
-    scanner: Annotated[str, typer.Option(help="Scanner by name (r2, carm) or a TOML file.")] = "r2",
-    protocol: Annotated[
-        ProtocolName,  # type: ignore[valid-type]
-        typer.Option(
-            help="rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
-            "rapid, or of the fly-scan that the options below describe."
-        ),
-    ] = "rapid",
-    views: Annotated[int | None, typer.Option(help="Frames in the turn.", show_default="protocol's")] = None,
-    exposure_deg: Annotated[
-        float | None, typer.Option(help="Arc of one exposure, degrees.", show_default="protocol's")
-    ] = None,
-    readout_ratio: Annotated[
-        float | None, typer.Option(help="Readout over exposure time, T_ro/T_exp.", show_default="0.86")
-    ] = None,
-    start_deg: Annotated[
-        float | None, typer.Option(help="Gantry angle at the start, degrees.", show_default="0")
-    ] = None,
-    readout: Annotated[
-        Axis | None, typer.Option(help="What is read out at one time.", show_default="scanner's")
-    ] = None,
-    readout_direction: Annotated[
-        int | None, typer.Option(help="1 reads index 0 first, -1 last.", show_default="scanner's")
-    ] = None,
+    readout_direction: Annotated[int | None, option("1 reads index 0 first, -1 last.", "scanner's")] = None,
     pulse: Annotated[
         Any,
-        typer.Option(
+        option(
+            "When the beam is on, after a frame's start, in shares of the exposure.",
+            "scanner's: always on",
             parser=pair_parser("--pulse", "START,LENGTH in shares of the exposure", "0.86,0.14"),
             metavar="START,LENGTH",
-            help="When the beam is on, after a frame's start, in shares of the exposure.",
-            show_default="scanner's: always on",
         ),
     ] = None,
     lag: Annotated[
         float | None,
-        typer.Option(
-            help="Share of a recorded frame that comes from the frames before, 0 to 0.9.",
-            show_default="scanner's: 0",
-        ),
+        option("Share of a recorded frame that comes from the frames before, 0 to 0.9.", "scanner's: 0"),
     ] = None,
     detector_model: Annotated[
-        DetectorModel,
-        typer.Option(help="Average line integrals (log) or transmitted intensity over the exposure."),
+        DetectorModel, option("Average line integrals (log) or transmitted intensity over the exposure.")
     ] = "log",
     peak: Annotated[
-        float, typer.Option(help="Scale attenuation so that the largest line integral is this; 0 leaves it.")
+        float, option("Scale attenuation so that the largest line integral is this; 0 leaves it.")
     ] = 0.0,
     noise: Annotated[
         Noise,
-        typer.Option(
-            help="tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."
-        ),
+        option("tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."),
     ] = "none",
-    dose: Annotated[
-        float | None, typer.Option(help="Photons per pixel without object, for --noise.", show_default="10000")
-    ] = None,
+    dose: Annotated[float | None, option("Photons per pixel without object, for --noise.", "10000")] = None,
     electronic_noise: Annotated[
-        float | None,
-        typer.Option(help="Standard deviation of electronic noise, counts, for --noise.", show_default="10"),
+        float | None, option("Standard deviation of electronic noise, counts, for --noise.", "10")
     ] = None,
     jitter_deg: Annotated[
         float | None,
-        typer.Option(
-            help="Wander of the gantry about constant speed (std, degrees), written to the encoder table.",
-            show_default="0",
-        ),
+        option("Wander of the gantry about constant speed (std, degrees), written to the encoder table.", "0"),
     ] = None,
     detector: Annotated[
         int | None,
-        typer.Option(
-            help="Detector columns (rows in proportion); the panel keeps its size.", show_default="scanner's"
-        ),
+        option("Detector columns (rows in proportion); the panel keeps its size.", "scanner's"),
     ] = None,
     detector_offset: Annotated[
         Any, lengths("--detector-offset", "Detector offset V,U in mm.", "scanner's")
     ] = None,
     size: Annotated[
         int | None,
-        typer.Option(
-            help="Voxels along the longest side of the grid and truth.",
-            show_default="scanner's or the file's",
-        ),
+        option("Voxels along the longest side of the grid and truth.", "scanner's or the file's"),
     ] = None,
     pixel_samples: Annotated[
-        int,
-        typer.Option(
-            help="Rays along each side of a pixel, over whose area they are averaged; 1: its centre."
-        ),
+        int, option("Rays along each side of a pixel, over whose area they are averaged; 1: its centre.")
     ] = 1,
     time_samples: Annotated[
-        int,
-        typer.Option(help="Times at which every line is projected in its exposure; 0 chooses by the motion."),
+        int, option("Times at which every line is projected in its exposure; 0 chooses by the motion.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of phantom, noise and jitter.")] = 0,
+    seed: Annotated[int, option("Seed of phantom, noise and jitter.")] = 0,
     device: Device = None,
     memory: Memory = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
+    given = {name: value for name, value in locals().items() if name in OPTION_NAMES}
     refuse_jitter(protocol, jitter_deg)
     refuse_noise_options(noise, {"--dose": dose, "--electronic-noise": electronic_noise})
     wish = device_wish(device)
     described = scanner_for(scanner, detector, detector_offset)
-    options = scanner_options(
-        described,
-        protocol,
-        views=views,
-        exposure_deg=exposure_deg,
-        readout_ratio=readout_ratio,
-        pulse=pulse,
-        start_deg=start_deg,
-        readout_axis=readout,
-        readout_direction=readout_direction,
-        detector_model=detector_model,
-        peak=peak,
-        noise=noise,
-        dose=dose,
-        electronic_noise=electronic_noise,
-        jitter_deg=jitter_deg,
-        lag=lag,
-        time_samples=time_samples,
-        seed=seed,
-    )
+    options = scanner_options(described, protocol, **given)
     job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples)
     with Ticker("frame") as ticker:
         scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)

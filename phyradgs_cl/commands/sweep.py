@@ -1,7 +1,5 @@
 """sweep: scans × settings × seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +9,9 @@ import typer
 from phyradgs_cl import signals
 from phyradgs_cl.cluster import LOCAL, Workers, has_dask
 from phyradgs_cl.commands.console import complain, remark, say, scores
-from phyradgs_cl.commands.files import file_argument
+from phyradgs_cl.commands.files import file_argument, option
 from phyradgs_cl.commands.options import Scheduler, WorkerCount
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.json_lines import Line
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.settings import device_wish, read_config
 from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, SweepProgress, read_grid, run_sweep
@@ -24,29 +21,21 @@ EXAMPLE = (
     "Runs that the results file in the folder has already are not made again: interrupt and repeat at will. "
     "Docs: cluster.md."
 )
+_OUTPUT = f"Folder for {RESULTS} (one line per run), volumes and tables."
+_CHECKPOINT = "Keep a checkpoint of each run so often; a lost run goes on from it."
 
 
 def sweep_command(
     grid: Annotated[Path, file_argument("GRID", "TOML file: scans, settings and seeds (docs: cluster.md).")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="DIR", help=f"Folder for {RESULTS} (one line per run), volumes and tables."
-        ),
-    ],
+    output: Annotated[Path, option(_OUTPUT, True, "--output", "-o", metavar="DIR")],
     scheduler: Scheduler = None,
     workers: WorkerCount = None,
-    checkpoint_every: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS", help="Keep a checkpoint of each run so often; a lost run goes on from it."
-        ),
-    ] = 600.0,
+    checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     device: Annotated[
         str | None,
-        typer.Option(
-            help="Devices of local workers, with commas: indices, cpu, gpu or parts of names.",
-            show_default="all GPUs, else the best device",
+        option(
+            "Devices of local workers, with commas: indices, cpu, gpu or parts of names.",
+            "all GPUs, else the best device",
         ),
     ] = None,
 ) -> None:
@@ -92,7 +81,7 @@ class SweepTicker:
     def __init__(self) -> None:
         self.all, self.one, self.name = Ticker("run"), Ticker("iteration"), ""
 
-    def __enter__(self) -> SweepTicker:
+    def __enter__(self) -> "SweepTicker":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -104,7 +93,9 @@ class SweepTicker:
             return
         if p.line is not None:
             self._end_lines()
-            say(f"{p.done}/{p.total} {p.line['run']} ({p.line['label']}): {_found(p.line)}")
+            error = p.line.get("error")
+            found = f"failed: {error}" if error else f"{p.line['seconds']:.1f} s{scores(p.line['metrics'])}"
+            say(f"{p.done}/{p.total} {p.line['run']} ({p.line['label']}): {found}")
         if p.progress is not None:
             if p.name != self.name:
                 self.name, self.one = p.name, Ticker(f"{p.done + 1}/{p.total} {p.name}: iteration")
@@ -119,9 +110,3 @@ class SweepTicker:
         for ticker in (self.all, self.one):
             with ticker:
                 pass
-
-
-def _found(line: Line) -> str:
-    if "error" in line:
-        return f"failed: {line['error']}"
-    return f"{line['seconds']:.1f} s{scores(line['metrics'])}"

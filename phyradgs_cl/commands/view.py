@@ -1,7 +1,5 @@
 """view: a volume in a window."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

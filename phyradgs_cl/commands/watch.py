@@ -1,7 +1,5 @@
 """watch: scans reconstructed as they arrive."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -9,60 +7,41 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say, scores
-from phyradgs_cl.commands.files import file_argument
+from phyradgs_cl.commands.files import file_argument, option
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow import ReconstructionJob
 from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch
 
 EXAMPLE = (
     "Example: phyradgs watch incoming -o volumes --method fista-tv\n\n"
     "Kill and restart it at will: what is done stays done, and a run goes on from its checkpoint. Docs: cluster.md."
 )
+_SETTLE = "How long a file must not have changed; one renamed into place is taken at once."
 
 
 @with_run_options("batch")
 def watch_command(
     folder: Annotated[Path, file_argument("FOLDER", "Folder in which scans arrive, as *.h5.")],
     output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder for a volume, or an error, of each scan."),
+        Path, option("Folder for a volume, or an error, of each scan.", True, "--output", "-o", metavar="DIR")
     ],
     request: RunRequest,
     once: Annotated[
-        bool, typer.Option("--once", help="End when every complete scan has its volume or its error.")
+        bool, option("End when every complete scan has its volume or its error.", True, "--once")
     ] = False,
     poll_s: Annotated[
-        float, typer.Option("--poll-s", metavar="SECONDS", help="Between two looks at the folder.")
+        float, option("Between two looks at the folder.", True, "--poll-s", metavar="SECONDS")
     ] = 2.0,
-    settle_s: Annotated[
-        float,
-        typer.Option(
-            "--settle-s",
-            metavar="SECONDS",
-            help="How long a file must not have changed; one renamed into place is taken at once.",
-        ),
-    ] = 5.0,
+    settle_s: Annotated[float, option(_SETTLE, True, "--settle-s", metavar="SECONDS")] = 5.0,
     checkpoint_every: Annotated[
-        float,
-        typer.Option(metavar="SECONDS", help="Keep a checkpoint of the run under way so often."),
+        float, option("Keep a checkpoint of the run under way so often.", metavar="SECONDS")
     ] = 600.0,
 ) -> None:
     """Reconstruct the scans of a folder as they arrive, each once; failures are set aside with their message."""
     settings = request.settings()
-    template = ReconstructionJob(
-        folder,
-        output,
-        method=settings.method,
-        preset=settings.preset,
-        changes=settings.changes,
-        seed=settings.seed,
-        config=request.config,
-        before=settings.before,
-        checkpoint_every_s=checkpoint_every,
-    )
+    template = request.job(settings, folder, output, checkpoint_every_s=checkpoint_every)
     job = WatchJob(folder, output, template, poll_s, settle_s, once)
 
     def runtime() -> Runtime:

@@ -10,25 +10,12 @@ from phyradgs_cl.detector.noise import (
     tigre_counts,
     tigre_noise,
 )
-from phyradgs_cl.detector.noise_level import noise_level
+from phyradgs_cl.detector.noise_level import noise_level, transmission_weights
 from phyradgs_cl.detector.saturation import clustered_share, find_saturation
-from phyradgs_cl.detector.transmission import transmission_weights
 
 __all__ = [
-    "add_lag",
-    "average",
-    "beer_lambert_counts",
-    "beer_lambert_noise",
-    "clustered_share",
-    "counts_to_attenuation",
-    "find_saturation",
-    "frames_to_attenuation",
-    "intensity_average",
-    "lagged",
-    "noise_level",
-    "sample_counts",
-    "tigre_counts",
-    "tigre_noise",
-    "transmission_weights",
-    "without_lag",
-]
+    "add_lag", "average", "beer_lambert_counts", "beer_lambert_noise", "clustered_share",
+    "counts_to_attenuation", "find_saturation", "frames_to_attenuation", "intensity_average",
+    "lagged", "noise_level", "sample_counts", "tigre_counts", "tigre_noise", "transmission_weights",
+    "without_lag"
+]  # fmt: skip

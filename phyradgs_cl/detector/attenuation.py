@@ -1,7 +1,5 @@
 """From what a detector records to line integrals, with its flat and dark frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,24 +20,13 @@ _BLOCK = 1 << 18  # pixels that are converted at a time
 def counts_to_attenuation(
     data: ArrayLike, image_key: ArrayLike, quantity: str
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Line integrals of the projections of a scan.
+    """Line integrals of the projections of a scan: data (F, v, u), integers or floats.
 
-    "counts" become (I - dark) / (flat - dark) with the means of the flat and of the dark frames (dark 0
-    where there are none), "transmission" T becomes -ln T, "attenuation" stays. Frames whose key is
-    not 0 are left out.
-
-    Args:
-        data: (F, v, u), integers or floats.
-        image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid.
-        quantity: what `data` holds.
-
-    Returns:
-        (P, v, u) float32 line integrals of the P projections, in order and always finite; and a bool
-        mask of the same shape, True where a value must not be used: not finite, a flat that is not
-        brighter than the dark, or a transmission at or below `TRANSMISSION_FLOOR`.
-
-    Raises:
-        InputError: shapes, keys or quantity wrong, no projection, or counts without a flat frame.
+    "counts" become (I - dark) / (flat - dark) with the mean flat and dark (0 where there are none), "transmission" T
+    becomes -ln T, "attenuation" stays. Frames whose key is not 0 are left out; image_key (F,): 0 projection, 1 flat, 2 dark,
+    3 invalid. Returns (P, v, u) float32, in order and always finite; and a bool mask of the same shape, True where a value
+    must not be used: not finite, a flat that is not brighter than the dark, a transmission at or below `TRANSMISSION_FLOOR`.
+    InputError: shapes, keys or quantity wrong, no projection, or counts without a flat frame.
     """
     one_of("quantity", quantity, QUANTITIES)
     frames, key = np.asarray(data), np.asarray(image_key)
@@ -56,10 +43,8 @@ def frames_to_attenuation(
     darks: NDArray[np.generic] | None = None,
     largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own.
-
-    Attenuation above ``largest`` must not be used either.
-    """
+    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own;
+    attenuation above ``largest`` must not be used either."""
     return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
 
 

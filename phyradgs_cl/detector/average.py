@@ -1,7 +1,5 @@
 """How a detector averages what it sees while the beam or the object moves."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np
@@ -15,21 +13,11 @@ _WEIGHT_TOLERANCE = 1e-6  # what weights summed in float32 may miss 1 by
 
 
 def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
-    """Line integrals of one exposure from those at several times.
+    """Line integrals (...) float64 of one exposure from those at several times, p (S, ...).
 
-    "log" is the mean of line integrals (PhyRadGS, Eq. 1), "intensity" is what a detector does:
-    it adds photons, so that P = -ln(sum of w · exp(-p)), evaluated without overflow at any p.
-
-    Args:
-        p: (S, ...) line integrals at S times.
-        weight: (S,) share of the exposure, not negative, sum 1.
-        model: "log" or "intensity".
-
-    Returns:
-        (...) float64.
-
-    Raises:
-        InputError: unknown model, shapes that do not fit, weights negative or not adding to 1, NaN.
+    "log" is their mean (PhyRadGS, Eq. 1), "intensity" what a detector does: it adds photons, P = -ln(sum of w · exp(-p)),
+    without overflow at any p. weight (S,): share of the exposure, not negative, sum 1. InputError: unknown model, shapes
+    that do not fit, weights negative or not adding to 1, NaN.
     """
     one_of("detector model", model, MODELS)
     values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
@@ -46,11 +34,8 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
 def intensity_average(
     p: Iterable[np.ndarray], weights: Iterable[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """−ln Σ w exp(−p) over S times, and each time's share w exp(−p) / Σ w exp(−p), without overflow.
-
-    p: S arrays, whose precision is that of the result. weights: S numbers or arrays that broadcast with them, sum 1;
-    where all are 0, average and shares are 0.
-    """
+    """−ln Σ w exp(−p) over S times, and each time's share w exp(−p) / Σ w exp(−p), without overflow. p: S arrays of the
+    result's precision. weights: S numbers or arrays that broadcast, sum 1; where all are 0, so are both results."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # of the brightest time
     least = np.where(np.isfinite(least), least, 0)

@@ -1,10 +1,8 @@
 """Detector lag: a panel gives back part of what it saw in the frames before, added and undone in intensity.
 
-One exponential, from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), y before the first frame 0, because the beam is off
-before a scan. For what lag does to reconstructions: Tilley et al., arXiv:1805.11631.
+One exponential, from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), y before the first frame 0 (beam off). For what lag
+does to reconstructions: Tilley et al., arXiv:1805.11631.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -33,12 +31,9 @@ def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
 
 
 def without_lag(scan: Scan) -> Scan:
-    """The scan as a panel without lag had recorded it; the scan itself if its lag is 0.
-
-    A value that comes out at or below ``TRANSMISSION_FLOOR``, or that needs a masked pixel of its own or of the
-    previous frame, is masked. Photon noise comes back as it was; noise added after the panel, such as electronic noise,
-    grows by √(1 + λ²)/(1 − λ).
-    """
+    """The scan as a panel without lag had recorded it; the scan itself if its lag is 0. Values at or below
+    ``TRANSMISSION_FLOOR``, or that need a masked pixel of this or the previous frame, are masked. Photon noise comes
+    back as it was; noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)

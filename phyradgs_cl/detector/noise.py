@@ -2,13 +2,10 @@
 
 counts = Poisson(expected) + N(0, electronic_noise), in two ways of arriving at `expected`:
 
-- tigre: line integrals are divided by the largest one of the scan first, which squeezes the
-  transmission into [1/e, 1]; the noise setting of the published synthetic scans (TIGRE's CTnoise;
-  A. Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
+- tigre: line integrals over the scan's largest one, which squeezes the transmission into [1/e, 1]: the noise of the
+  published synthetic scans (TIGRE's CTnoise; Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
 - beer-lambert: expected = dose · exp(-p), the physics.
 """
-
-from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,14 +23,7 @@ COUNT_FLOOR = 0.5
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:
-    """Expected counts dose · exp(-p/m), and the scale m: the largest line integral of the scan.
-
-    A scan that is empty (m not above 0) has m = 1.
-
-    Args:
-        line_integrals: (F, v, u).
-        dose: counts of an unattenuated pixel.
-    """
+    """Expected counts dose · exp(-p/m) of p (F, v, u), and the scale m: its largest value, of an empty scan 1."""
     p = np.asarray(line_integrals, dtype=np.float64)
     largest = float(p.max(initial=0.0))
     scale = largest if largest > 0 else 1.0
@@ -46,13 +36,7 @@ def beer_lambert_counts(line_integrals: ArrayLike, dose: float) -> Array:
 
 
 def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Generator) -> Array:
-    """One draw of Poisson(expected) + N(0, electronic_noise), float64, not clamped.
-
-    Args:
-        expected: (...) counts, not negative.
-        electronic_noise: standard deviation in counts.
-        rng: the only source of randomness.
-    """
+    """One draw of Poisson(expected (...)) + N(0, electronic_noise), float64 counts, not clamped."""
     many = expected > NORMAL_FROM
     counts = rng.poisson(np.where(many, 0.0, expected)).astype(np.float64)
     if many.any():
@@ -70,21 +54,12 @@ def tigre_noise(
     rng: np.random.Generator,
     light: ArrayLike = 1.0,
 ) -> NDArray[np.float32]:
-    """Noisy line integrals -ln(counts/dose) · m after TIGRE's scaling; negatives become 0.
+    """Noisy line integrals -ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling; negatives become 0.
 
-    Args:
-        line_integrals: (F, v, u), all projections of the scan: m is their maximum.
-        dose: counts of an unattenuated pixel; the published scans have 1e4.
-        electronic_noise: standard deviation in counts; the published scans have 10.
-        rng: source of randomness.
-        light: share of the dose that each pixel gets, above 0, broadcast to (F, v, u): a pulse may miss part of a
-            line's window.
-
-    Returns:
-        (F, v, u) float32, finite at any dose.
-
-    Raises:
-        InputError: dose not positive, electronic noise negative, line integrals not finite.
+    line_integrals (F, v, u): all projections of the scan, m is their maximum. ``dose``: counts of an unattenuated pixel;
+    ``electronic_noise``: standard deviation in counts; the published scans have 1e4 and 10. ``light``: share of the dose of
+    each pixel, above 0, broadcast to (F, v, u): a pulse may miss part of a line's window. InputError: dose not positive,
+    electronic noise negative, line integrals not finite.
     """
     _check(line_integrals, dose, electronic_noise)
     expected, scale = tigre_counts(line_integrals, dose)
@@ -101,11 +76,8 @@ def beer_lambert_noise(
     light: ArrayLike = 1.0,
     lag: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Noisy line integrals -ln(counts/dose), counts clamped at `COUNT_FLOOR`; negatives are kept.
-
-    Arguments, result and errors as in `tigre_noise`. Clipping negatives would make air attenuate. A panel with the
-    `lag` λ mixes the photons of successive frames; electronic noise comes after it.
-    """
+    """-ln(counts/dose), counts clamped at `COUNT_FLOOR`; negatives are kept, else air would attenuate. Arguments, result and
+    errors as in `tigre_noise`. Lag λ mixes the photons of successive frames; electronic noise comes after it."""
     _check(line_integrals, dose, electronic_noise)
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)

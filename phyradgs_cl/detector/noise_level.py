@@ -1,6 +1,4 @@
-"""How noisy line integrals are, estimated from themselves."""
-
-from __future__ import annotations
+"""How noisy line integrals are, estimated from themselves, and how far each can be trusted."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +11,9 @@ _LARGEST_SAMPLE = 1_000_000
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
     """Standard deviation of the noise of a pixel behind the object, dimensionless.
 
-    From the median of |second differences| along rows, where an object is seen (values above 0): structure is smooth
-    beside white noise, and a median does not mind edges (Donoho and Johnstone, Biometrika 81 (1994) 425, for the idea).
-    Structure that is as fine as a pixel raises the estimate, noise that is correlated along rows lowers it.
-
-    Args:
-        line_integrals: (F, v, u).
-        valid: (F, v, u), False where a value must not be used; None: all may be.
-
-    Returns:
-        0 where nothing can be told: fewer than three columns, or nothing above 0.
+    From the median of |second differences| along rows where values are above 0: structure is smooth beside white noise, and
+    a median does not mind edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine as a pixel raises it,
+    noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all. 0 where nothing can be told.
     """
     if line_integrals.shape[-1] < 3:
         return 0.0
@@ -36,3 +27,20 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
         return 0.0
     second = middle.ravel()[chosen] - 0.5 * (left.ravel()[chosen] + right.ravel()[chosen])
     return float(np.median(np.abs(second))) / (_MEDIAN_OF_NORMAL * _FILTER_NORM)
+
+
+def transmission_weights(
+    line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
+    """Weights exp(−p) of a scan's pixels p (F, v, u), scaled to the mean 1 over those that are ``valid`` (None: all).
+
+    Those of least squares for photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534). What lies below 0
+    counts as air: noise should not be trusted more for being bright.
+    """
+    weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
+    if valid is None:
+        mean = float(weights.mean(dtype=np.float64))
+    else:
+        chosen = np.broadcast_to(valid, weights.shape)
+        mean = float(weights.mean(dtype=np.float64, where=chosen)) if chosen.any() else 1.0
+    return weights / np.float32(mean) if mean > 0 else np.ones_like(weights)

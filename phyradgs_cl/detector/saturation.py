@@ -1,7 +1,5 @@
 """Pixels at the end of a detector's range: asked of raw counts, before they become line integrals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np
@@ -19,11 +17,8 @@ _WHITE = 0.5  # least ratio of two estimates that agree on white noise and diffe
 
 
 def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
-    """The largest count of projections (P, v, u), and the share of their pixels that is clipped there.
-
-    Clipped are whole areas at the largest count, unless they may as well be air without noise: that lies together at one
-    count too, which is then the count of the mean ``flat`` (v, u), in frames that show no noise elsewhere.
-    """
+    """The largest count of projections (P, v, u), and the share of their pixels clipped there: whole areas, unless they
+    may as well be air without noise, at the mean ``flat``'s (v, u) count in frames that show no noise elsewhere."""
     level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
     share = clustered_share(frame == level for frame in frames)
     if share <= LEAST_SHARE or not (_flat_differs(frames, flat, level) or _shows_noise(frames, level)):
@@ -32,10 +27,8 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
 
 
 def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
-    """The share of pixels at an extreme, given frame by frame (v, u), if most of those have four such neighbours; else 0.
-
-    Noise that is cut off puts single pixels at an extreme, saturation whole areas.
-    """
+    """The share of pixels at an extreme, frame by frame (v, u), if most have four such neighbours; else 0: noise that
+    is cut off puts single pixels there, saturation whole areas."""
     pixels = count = inner = touching = 0
     for at in extreme:
         pixels, count = pixels + at.size, count + int(np.count_nonzero(at))
@@ -43,9 +36,8 @@ def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
             continue
         middle = at[1:-1, 1:-1]
         inner += int(np.count_nonzero(middle))
-        touching += int(
-            np.count_nonzero(middle & at[:-2, 1:-1] & at[2:, 1:-1] & at[1:-1, :-2] & at[1:-1, 2:])
-        )
+        sides = at[:-2, 1:-1] & at[2:, 1:-1] & at[1:-1, :-2] & at[1:-1, 2:]
+        touching += int(np.count_nonzero(middle & sides))
     return count / pixels if inner and touching / inner > _TOUCHING else 0.0
 
 

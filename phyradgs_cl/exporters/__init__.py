@@ -1,7 +1,5 @@
 """Volumes in other programs' formats, with spacing, origin and directions; `export_volume` is the door."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,15 +35,10 @@ def export_volume(
 ) -> Path:
     """Write a volume file in another format, whole or not at all; returns what was written.
 
-    Args:
-        path: a volume file of this package.
-        to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels.
-        output: file, or folder for dicom; None puts it beside ``path``.
-        mu_water_per_mm: water's attenuation; the values are then Hounsfield units.
-
-    Raises:
-        InputError: no such format, a volume that is damaged or has no Gaussians, a name that does not fit.
-        OutputError: it cannot be written.
+    ``to``: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: file, or folder for dicom;
+    None puts it beside ``path``. ``mu_water_per_mm``: water's attenuation; the values are then Hounsfield units.
+    InputError: no such format, a volume that is damaged or has no Gaussians, a name that does not fit. OutputError: it
+    cannot be written.
     """
     checks.one_of("--to", to, EXPORTS)
     path = Path(path)

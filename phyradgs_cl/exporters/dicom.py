@@ -1,19 +1,19 @@
-"""A DICOM series: a folder of CT images, one per slice, in Hounsfield units or in 1/mm with a rescale slope.
-
-Attributes of the CT Image module (DICOM PS3.3, A.3 and C.8.2): position and orientation in LPS, 16 bits per voxel.
-"""
-
-from __future__ import annotations
+"""A DICOM series, an image per slice: PS3.3's CT Image module (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
 
 import hashlib
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
-from phyradgs_cl.exporters.folder_beside import folder_written_beside
+from phyradgs_cl import checks, signals
+from phyradgs_cl.errors import OutputError
 from phyradgs_cl.exporters.placed import Placed
+from phyradgs_cl.io.output import temporary_name
 
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
@@ -24,17 +24,13 @@ def write_dicom(path: Path, volume: Placed) -> None:
     """A new folder with 0001.dcm from the lowest slice up."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     slope = rescale_slope(volume)
-    seed = hashlib.sha256(
-        volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
-    ).hexdigest()
-    uid = {
-        name: pydicom.uid.generate_uid(entropy_srcs=[seed, volume.unit, name])
-        for name in ("study", "series", "frame")
-    }
+    content = volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
+    seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
+    uid = {n: generate(entropy_srcs=[seed, volume.unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:
         for index, plane in enumerate(volume.values):
             image = _common(pydicom, volume, slope, uid)
-            instance = pydicom.uid.generate_uid(entropy_srcs=[seed, volume.unit, str(index)])
+            instance = generate(entropy_srcs=[seed, volume.unit, str(index)])
             image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = instance
             _place(image, volume, index)
             image.PixelData = np.rint(plane / float(slope)).astype("<i2").tobytes()
@@ -50,7 +46,6 @@ def rescale_slope(volume: Placed) -> str:
 
 
 def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> Any:
-    """What all slices share."""
     image = pydicom.dataset.Dataset()
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE
@@ -87,3 +82,26 @@ def _place(image: Any, volume: Placed, index: int) -> None:
 def _decimal(number: float) -> str:
     """At most 16 characters, as DICOM's decimal strings must be."""
     return f"{number:.10g}" if 1e-4 <= abs(number) < 1e9 or number == 0 else f"{number:.8e}"
+
+
+@contextmanager
+def folder_written_beside(path: Path) -> Iterator[Path]:
+    """Yield a new folder that becomes ``path`` on success, and of which nothing is left otherwise. A folder with
+    something in it is never replaced: it could hold anything."""
+    target = Path(os.path.abspath(path))
+    if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
+        found = "something that is there already"
+        raise OutputError(str(path), found, "a new or an empty folder", "choose another name")
+    temporary = temporary_name(target)
+    try:
+        temporary.mkdir()
+        yield temporary
+        os.replace(temporary, target)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            found = error.strerror or str(error)
+            raise OutputError(str(path), found, "a folder that can be written", "choose another") from error
+        raise
+    finally:
+        signals.unfinished.discard(str(temporary))

@@ -1,7 +1,5 @@
 """The Gaussians of a volume file: points with properties (.ply), or NumPy arrays (.npz)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +9,7 @@ from phyradgs_cl.exporters.placed import write_whole
 from phyradgs_cl.io import StoredVolume, written_beside
 
 _PLY_NAMES = (
-    *("x", "y", "z", "scale_0", "scale_1", "scale_2"),
-    *("rot_0", "rot_1", "rot_2", "rot_3", "density"),
+    *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
 )
 
 

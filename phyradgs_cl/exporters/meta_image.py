@@ -1,7 +1,5 @@
 """MetaImage (.mha): a text header, whose frame is LPS, then voxels with x running fastest."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from phyradgs_cl.exporters.placed import Placed, write_whole

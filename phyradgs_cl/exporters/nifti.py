@@ -1,7 +1,5 @@
 """NIfTI-1 (.nii, .nii.gz): a header of 348 bytes, whose frame is RAS, then voxels with x running fastest."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 
@@ -19,16 +17,13 @@ _FLOAT32, _MILLIMETRES, _SCANNER = 16, 2, 1
 def write_nifti(path: Path, volume: Placed) -> None:
     """One file, compressed if its name ends in .gz."""
     if max(volume.shape_xyz) > _LARGEST:
-        raise InputError(
-            "--to nii", f"{max(volume.shape_xyz)} voxels", f"at most {_LARGEST}", "use --to nrrd"
-        )
+        found = f"{max(volume.shape_xyz)} voxels"
+        raise InputError("--to nii", found, f"at most {_LARGEST}", "use --to nrrd")
     head = header(volume).tobytes() + bytes(VOXELS_AT - HEADER.itemsize)
     data = volume.values.astype("<f4", copy=False).data.cast("B")
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         if path.suffix.lower() == ".gz":
-            with gzip.GzipFile(
-                "", "wb", 4, file, mtime=0
-            ) as packed:  # no name, no time: the same bytes again
+            with gzip.GzipFile("", "wb", 4, file, mtime=0) as packed:  # no name, no time: the same bytes again
                 packed.write(head)
                 packed.write(data)
         else:

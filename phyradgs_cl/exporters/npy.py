@@ -1,7 +1,5 @@
 """A bare NumPy array (.npy), and its grid as JSON beside it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -22,8 +20,5 @@ def write_npy(path: Path, volume: Placed) -> None:
     }
     with written_beside(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-    with (
-        written_beside(path) as temporary,
-        open(temporary, "wb") as file,
-    ):  # np.save would add a suffix to a name
-        np.save(file, volume.values)
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, volume.values)  # which would add a suffix to a name

@@ -1,9 +1,4 @@
-"""NRRD (.nrrd): a text header in LPS, an empty line, then voxels with x running fastest.
-
-https://teem.sourceforge.net/nrrd/format.html
-"""
-
-from __future__ import annotations
+"""NRRD: a text header in LPS, an empty line, then voxels, x fastest. https://teem.sourceforge.net/nrrd/format.html"""
 
 from pathlib import Path
 

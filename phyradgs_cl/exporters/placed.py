@@ -1,11 +1,8 @@
 """A volume as other programs see it: values, spacing and origin in their frame of patient directions.
 
-The world's x, y, z are taken as left, posterior, superior (LPS, the frame of DICOM and ITK): z, the rotation axis, is
-up in every viewer, programs of the ITK family show this package's own millimetres, and a slice on screen looks the same
-in a viewer that knows directions and in one that shows bare images with row 0 at the top.
+The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK): z, the rotation axis, is up in
+every viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,9 +51,8 @@ def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
     with np.errstate(over="ignore"):
         hu = (1000.0 * (values.astype(np.float64) / mu_water_per_mm - 1.0)).astype(np.float32)
     if not np.isfinite(hu).all():
-        raise InputError(
-            "--mu-water-per-mm", f"{mu_water_per_mm:g}", "water's attenuation in 1/mm, near 0.02"
-        )
+        expected = "water's attenuation in 1/mm, near 0.02"
+        raise InputError("--mu-water-per-mm", f"{mu_water_per_mm:g}", expected)
     return hu
 
 

@@ -1,9 +1,4 @@
-"""A TIFF stack as ImageJ writes it: a page per slice from the lowest up, row 0 the smallest y, with voxel sizes in mm.
-
-TIFF has no place for the origin; ImageJ's own, in pixels, is written, and napari and others read the sizes.
-"""
-
-from __future__ import annotations
+"""TIFF as ImageJ writes it: a page per slice from the lowest up, row 0 the smallest y; sizes in mm, its origin in pixels."""
 
 from pathlib import Path
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from phyradgs_cl.errors import InputError
+from phyradgs_cl import checks
 
 ROWS = 11  # mean 3, scale 3, quaternion 4, density 1
 MEAN, SCALE, QUATERNION, DENSITY = slice(0, 3), slice(3, 6), slice(6, 10), 10
@@ -21,8 +21,8 @@ _DENSITY_FLOOR = 1e-12
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z;
-    quaternion (G, 4) w x y z, unit; density (G,) attenuation per that length.
+    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; quaternion (G, 4) w x y z,
+    unit; density (G,) attenuation per that length. Raises InputError for other shapes, and for what is no finite number.
     """
 
     mean: np.ndarray
@@ -31,15 +31,18 @@ class Gaussians:
     density: np.ndarray
 
     def __post_init__(self) -> None:
-        count = len(self.mean)
+        count = len(np.atleast_1d(self.mean))
         shapes = {"mean": (count, 3), "scale": (count, 3), "quaternion": (count, 4), "density": (count,)}
         for name, shape in shapes.items():
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise InputError(f"Gaussians' {name}", f"shape {found}", f"shape {shape}")
+            checks.numbers(f"Gaussians' {name}", getattr(self, name), shape)
+            object.__setattr__(self, name, np.asarray(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        return f"Gaussians({self.count} of them)"
 
     @property
     def count(self) -> int:
+        """How many Gaussians G there are."""
         return len(self.mean)
 
     def rows(self) -> np.ndarray:

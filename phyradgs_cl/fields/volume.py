@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
 MOST_VOXELS = 2**38
@@ -25,30 +26,37 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 
 @dataclass(frozen=True)
 class Grid:
-    """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays."""
+    """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays.
+
+    shape: counts. voxel_size_mm: sides of a voxel in mm.
+
+    Raises InputError for counts below 1 and lengths that are not finite, or not above 0.
+    """
 
     shape: tuple[int, int, int]
     voxel_size_mm: tuple[float, float, float]
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 3 or any(int(n) < 1 for n in self.shape):
+        shape = checks.numbers("grid shape", self.shape, (3,))
+        if (shape < 1).any() or (shape != np.floor(shape)).any():
             raise InputError("grid shape", str(self.shape), "three counts of at least 1 (z, y, x)")
         if math.prod(int(n) for n in self.shape) > MOST_VOXELS:
             raise InputError("grid shape", str(self.shape), f"at most {MOST_VOXELS:.3g} voxels")
-        if len(self.voxel_size_mm) != 3 or not all(np.isfinite(d) and d > 0 for d in self.voxel_size_mm):
-            raise InputError(
-                "grid voxel_size", str(self.voxel_size_mm), "three positive lengths in mm (z, y, x)"
-            )
-        if len(self.offset_mm) != 3 or not np.all(np.isfinite(self.offset_mm)):
-            raise InputError("grid offset", str(self.offset_mm), "three finite lengths in mm (z, y, x)")
+        if (checks.numbers("grid voxel_size", self.voxel_size_mm, (3,)) <= 0).any():
+            raise InputError("grid voxel_size", str(self.voxel_size_mm), "three positive lengths in mm (z, y, x)")
+        checks.numbers("grid offset", self.offset_mm, (3,))
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         object.__setattr__(self, "voxel_size_mm", tuple(float(d) for d in self.voxel_size_mm))
         object.__setattr__(self, "offset_mm", tuple(float(d) for d in self.offset_mm))
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> Grid:
-        """A centred cube of ``count``³ voxels with a side of ``side_mm``."""
+        """A centred cube of ``count``³ voxels with a side of ``side_mm``. Raises InputError for numbers that are not
+        above 0.
+        """
+        checks.whole("count", count, 1, MOST_VOXELS)
+        checks.positive("side_mm", side_mm)
         return cls((count,) * 3, (side_mm / count,) * 3)
 
     @property

@@ -1,7 +1,5 @@
 """What the user says about a foreign scan that its files do not say, or say differently."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 from phyradgs_cl import checks
@@ -9,22 +7,14 @@ from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 
-PARTS = ("train", "test", "all")
-ANGLE_AT = ("start", "middle")
-QUANTITIES = ("attenuation", "transmission", "counts")
-ROTATES = ("gantry", "sample")
-ROW_0 = ("top", "bottom")
-COLUMN_0 = ("left", "right")
-
-_WORDS = {
-    "part": PARTS,
-    "angle_at": ANGLE_AT,
-    "quantity": QUANTITIES,
-    "rotates": ROTATES,
-    "row_0": ROW_0,
-    "column_0": COLUMN_0,
+WORDS: dict[str, tuple[str, ...]] = {
+    "part": ("train", "test", "all"),
+    "angle_at": ("start", "middle"),
+    "quantity": ("attenuation", "transmission", "counts"),
+    "rotates": ("gantry", "sample"),
+    "row_0": ("top", "bottom"),
+    "column_0": ("left", "right"),
     "readout_axis": AXES,
-    "readout_direction": (1, -1),
     "detector_model": DETECTOR_MODELS,
 }
 _POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm")
@@ -35,15 +25,11 @@ _TIMES = ("exposure_s", "readout_s")
 class ImportOptions:
     """Options of an import; None leaves it to the file, or to the format's custom.
 
-    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next, which says
-    that the gantry turned without a stop; ``angle_at``: whether a frame's angle is that of the opening of its
-    first line, or of the middle of that line's exposure. Readout axis and direction are those of the imported
-    scan, whose row 0 is the lowest and whose column 0 is on the left, seen from the source.
-
-    Geometry: distances, pixel size (v, u) and detector offset (v, u) in mm; ``unit_mm``: the length of one scene
-    unit in formats without a unit; ``rotates``: whether angles are the gantry's or the sample's; ``row_0`` and
-    ``column_0``: where the first stored row and column are, seen from the source.
-
+    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next: the gantry turned
+    without a stop; ``angle_at``: a frame's angle is that of its first line's opening ("start") or mid-exposure. Readout
+    axis and direction are those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
+    Geometry: distances, pixel size and detector offset (v, u) in mm; ``unit_mm``: a scene unit where formats have none;
+    ``rotates``: what the angles turn; ``row_0``, ``column_0``: where the first stored ones are, seen from the source.
     Pixels: ``quantity`` that is stored; ``flat_value``: counts without an object, where there are no flat frames.
     ``part``: which projections of a benchmark folder; ``first_view``: where this scan begins in a file of several.
     """
@@ -69,15 +55,15 @@ class ImportOptions:
     first_view: int | None = None
 
     def __post_init__(self) -> None:
-        for name, allowed in _WORDS.items():
+        for name, allowed in {**WORDS, "readout_direction": (1, -1)}.items():
             if getattr(self, name) is not None:
                 checks.one_of(option_name(name), getattr(self, name), allowed)
-        for name in _POSITIVE:
-            if getattr(self, name) is not None:
-                checks.positive(option_name(name), getattr(self, name))
-        for name in _TIMES:
-            if getattr(self, name) is not None:
-                checks.at_least(option_name(name), getattr(self, name), 0)
+        for name in (*_POSITIVE, *_TIMES):
+            if (value := getattr(self, name)) is not None:
+                if name in _TIMES:
+                    checks.at_least(option_name(name), value, 0)
+                else:
+                    checks.positive(option_name(name), value)
         if self.first_view is not None:
             checks.within(option_name("first_view"), self.first_view, 0, 1_000_000)
         for length in self.pixel_size_mm or ():
@@ -89,13 +75,9 @@ class ImportOptions:
         """InputError for an option that the format ``form`` would pass over in silence."""
         for item in fields(self):
             if item.name not in used and getattr(self, item.name) != item.default:
+                culprit, found = f"{option_name(item.name)} with format {form}", str(getattr(self, item.name))
                 expected = "none of it: the files say it, or it has no meaning there"
-                raise InputError(
-                    f"{option_name(item.name)} with format {form}",
-                    str(getattr(self, item.name)),
-                    expected,
-                    "leave the option out",
-                )
+                raise InputError(culprit, found, expected, "leave the option out")
 
 
 # what formats that say little take from the user

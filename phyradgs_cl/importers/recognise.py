@@ -1,7 +1,5 @@
 """Which format a file or folder is in, from what is in it; nothing is guessed from numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py
@@ -10,8 +8,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import phyradgs_real, phyradgs_synthetic, r2_gaussian
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.folder import SafeFolder
-from phyradgs_cl.importers.reading.hdf5_frames import opened
 from phyradgs_cl.importers.reading.meta_image import SUFFIXES as STACKS
+from phyradgs_cl.io.hdf5.source import open_hdf5
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _BY_SUFFIX = {".pickle": "naf", ".pkl": "naf", ".xml": "rtk", ".toml": "tiff"}
@@ -25,23 +23,17 @@ def recognise(path: Path) -> str:
     if len(found) == 1:
         return found[0]
     if not found and _holds_tiffs(path):
-        what, expected = (
-            "TIFF images and no TOML that describes them",
-            "geometry and angles in a TOML beside them",
-        )
-        raise InputError(
-            str(path), what, expected, "docs/import.md and docs/tutorial.md have one to start from"
-        )
+        what, expected = "TIFF images and no TOML that describes them", "geometry and angles in a TOML beside them"
+        remedy = "docs/import.md and docs/tutorial.md have one to start from"
+        raise InputError(str(path), what, expected, remedy)
     what = f"several: {', '.join(found)}" if found else "no known format"
     raise InputError(str(path), what, "one of the formats of docs/import.md", "say which with --format")
 
 
 def _holds_tiffs(path: Path) -> bool:
-    return (
-        bool(SafeFolder(path).matching(*tiff.SUFFIXES))
-        if path.is_dir()
-        else path.suffix.lower() in tiff.SUFFIXES
-    )
+    if path.is_dir():
+        return bool(SafeFolder(path).matching(*tiff.SUFFIXES))
+    return path.suffix.lower() in tiff.SUFFIXES
 
 
 def _of_folder(folder: SafeFolder) -> list[str]:
@@ -79,7 +71,7 @@ def _of_file(path: Path) -> list[str]:
 
 
 def _of_hdf5(path: Path) -> str:
-    with opened(path) as source:
+    with open_hdf5(path) as source:
         if isinstance(source.find("/exchange"), h5py.Group):
             return "data-exchange"
         for member in ("/entry/reconstruction", "/volume"):

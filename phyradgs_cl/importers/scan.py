@@ -1,7 +1,5 @@
 """A scan of another program, by the function of formats/ that reads it."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 
@@ -28,14 +26,8 @@ FORMATS = {
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
     """A scan from a file or folder of another program, with line integrals, row 0 the lowest, in mm, s and radians.
 
-    Args:
-        path: file or folder.
-        options: what the files do not say.
-        form: a key of ``FORMATS``; None recognises it.
-
-    Raises:
-        InputError: a format that is not known, files that are damaged, incomplete or not what they seem, options that
-            the format has no use for.
+    ``options``: what the files do not say; ``form``: a key of ``FORMATS``, None recognises it. InputError: a format that is
+    not known, files that are damaged, incomplete or not what they seem, options that the format has no use for.
     """
     path = Path(path)
     if not (path.is_dir() or path.is_file()):

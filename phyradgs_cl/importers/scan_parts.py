@@ -1,7 +1,5 @@
 """The last step of every importer: parts of a scan put together, with what the user says over them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

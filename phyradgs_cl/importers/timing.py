@@ -1,7 +1,5 @@
 """From a list of angles, and what is known about time, to shutter, trajectory and opening times."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 
@@ -18,10 +16,8 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When frames were taken. ``start_s`` (F,) opening of each first-read line; ``is_fly``: the gantry never stops.
-
-    ``angle_at``: what a frame's stored angle belongs to, "start" or "middle" of its first line's exposure.
-    """
+    """When frames were taken. ``start_s`` (F,) opening of each first-read line; ``is_fly``: the gantry never stops;
+    ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -36,10 +32,8 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """What a format itself says; None where it is silent. ``start_s`` (F,) means that the gantry did not stop.
-
-    ``written``: by what names a description that the user wrote says any of it; a file's header does not count.
-    """
+    """What a format itself says; None where it is silent. ``start_s`` (F,): the gantry did not stop. ``written``: by
+    what names a description that the user wrote says any of it; a file's header does not count."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -55,11 +49,9 @@ class StoredTiming:
 def make_timing(
     culprit: str, frames: int, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Timing of ``frames`` frames; the options win over what is stored.
-
-    Start times, or the time from frame to frame, say that the gantry turned all the while; then there must be an
-    exposure. Without them every frame is taken at rest, and what a user says of a turn in between is refused.
-    """
+    """Timing of ``frames`` frames; the options win over what is stored. Start times, or the time from frame to frame,
+    say that the gantry turned all the while, which needs an exposure. Without them every frame is taken at rest, and
+    what a user says of a turn in between is refused."""
     stored = stored or StoredTiming()
     exposure_s = _first(options.exposure_s, stored.exposure_s) or 0.0
     readout_s = _first(options.readout_s, stored.readout_s) or 0.0
@@ -82,11 +74,8 @@ def make_timing(
 
 
 def turning(geometry: ConeGeometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
-    """A circular orbit through gantry angles (F,), each frame at the mean speed around it.
-
-    A frame's speed is the slope of the angles over time there (one-sided at both ends); equal angles at start and
-    end of the exposure where the gantry stands.
-    """
+    """A circular orbit through gantry angles (F,), each frame at the slope of the angles over time around it (one-sided
+    at both ends); at rest where the gantry stands."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -114,12 +103,9 @@ def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: 
 
 def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray) -> None:
     if shutter.exposure_s <= 0:
-        raise InputError(
-            f"{culprit} exposure",
-            "none, with a gantry that does not stop",
-            "a time above 0 s",
-            f"say {option_name('exposure_s')}, or leave the frame time out for frames taken at rest",
-        )
+        found = "none, with a gantry that does not stop"
+        remedy = f"say {option_name('exposure_s')}, or leave the frame time out for frames taken at rest"
+        raise InputError(f"{culprit} exposure", found, "a time above 0 s", remedy)
     checks.finite(f"{culprit} start times", start_s)
     if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):
         found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"

@@ -1,7 +1,5 @@
 """Voxel volumes of any origin: HDF5 files of ours or bare, and what `phyradgs export` and other programs write."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,14 +24,9 @@ def foreign_volume(path: str | Path) -> str | None:
 
 
 def load_volume(path: str | Path) -> LoadedVolume:
-    """A volume (nz, ny, nx) float32 and its grid, which bare values do not have.
-
-    Axes run along the world's and are turned to rise with them, as LPS (docs/export.md); values are taken as 1/mm. Bare
-    values are those of HDF5 datasets `/volume`, NRRD and TIFF without voxel sizes and .npy without its .json.
-
-    Raises:
-        InputError: not such a file, damaged, not three axes, oblique, Hounsfield units, NaN or infinity.
-    """
+    """A volume (nz, ny, nx) float32 in 1/mm and its grid; axes are turned to rise with the world's, as LPS
+    (docs/export.md). Bare values have no grid: HDF5 datasets `/volume`, NRRD and TIFF without voxel sizes, .npy without
+    its .json. InputError: not such a file, damaged, not three axes, oblique, Hounsfield units, NaN or infinity."""
     found = _format(path)
     return along_world_axes(str(path), found[1](Path(path))) if found else io.load_volume(path)
 

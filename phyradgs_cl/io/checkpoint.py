@@ -1,7 +1,5 @@
 """Checkpoints of interrupted runs: plain arrays in a NumPy archive, never a pickle."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.names import beside
-from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.io.output import beside, written_beside
 
 _FORMAT = 1
 _MOST_DIFFERENCES, _LONGEST_NAME = 3, 60
@@ -57,14 +54,12 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
     found = str(arrays.pop("fingerprint", ""))
     if found != fingerprint:
         remedy = f"use the same scan and options, or {_RESTART}"
-        raise InputError(
-            str(path), f"a checkpoint of {_other_run(found, fingerprint)}", "one of this run", remedy
-        )
+        expected = "one of this run"
+        raise InputError(str(path), f"a checkpoint of {_other_run(found, fingerprint)}", expected, remedy)
     return arrays
 
 
 def _other_run(found: str, wanted: str) -> str:
-    """What a checkpoint's run had otherwise, as far as its fingerprint tells."""
     unknown = "another scan or other options"
     try:
         then, now = json.loads(found), json.loads(wanted)

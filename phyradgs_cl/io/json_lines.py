@@ -1,9 +1,4 @@
-"""Results files: JSON lines, one per run, only ever appended to.
-
-A run that is killed while it writes leaves a damaged last line, which reading skips and the next append closes off.
-"""
-
-from __future__ import annotations
+"""Results files: JSON lines, one per run, only appended to; a damaged last line is skipped, and closed off by the next."""
 
 import json
 import logging
@@ -24,11 +19,8 @@ _MOST_BYTES = 1 << 30
 
 
 def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True) -> list[Line]:
-    """All whole and sound lines of a results file, with a word about others; none where there is no file.
-
-    Raises:
-        InputError: a file that cannot be read, or that has content but no result.
-    """
+    """All whole and sound lines of a results file, with a word about others; none where there is no file. InputError
+    for a file that cannot be read, or that has content but no result."""
     text = ""
     if path.exists():
         text = read_regular(path, str(path), _MOST_BYTES, _WANTED).decode(errors="replace")
@@ -65,9 +57,8 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise OutputError(
-            str(path), error.strerror or str(error), "a file that can be appended to"
-        ) from error
+        expected = "a file that can be appended to"
+        raise OutputError(str(path), error.strerror or str(error), expected) from error
 
 
 def json_text(value: object) -> str:
@@ -84,7 +75,6 @@ def _parsed(row: str) -> Line | None:
 
 
 def _is_open_ended(file: Any) -> bool:
-    """Whether the file ends in the middle of a line."""
     if file.seek(0, os.SEEK_END) == 0:
         return False
     file.seek(-1, os.SEEK_END)

@@ -1,7 +1,5 @@
 """One run per output: a lock file beside it that the operating system lets go of when its process ends, however it ends."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -9,7 +7,7 @@ from pathlib import Path
 
 from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
-from phyradgs_cl.io.names import beside
+from phyradgs_cl.io.output import beside
 
 _LOOK_EVERY_S = 0.2
 
@@ -26,10 +24,7 @@ def lock_path(output: str | Path) -> Path:
 
 @contextmanager
 def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Holds the lock of ``output``; raises BusyError if another run still does after ``wait_s``.
-
-    A dead run's file is taken over.
-    """
+    """Holds the lock of ``output``, a dead run's too; raises BusyError if another run still does after ``wait_s``."""
     from filelock import FileLock, Timeout
 
     path = lock_path(output)

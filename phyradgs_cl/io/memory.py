@@ -1,7 +1,5 @@
 """How much memory a reading may take: what the file's header promises, and what this machine has."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator
@@ -30,10 +28,8 @@ def host_bytes() -> float:
 
 @contextmanager
 def at_most(more_bytes: int) -> Iterator[None]:
-    """Whoever asks the system for more than ``more_bytes`` (and some) in the body gets none, where Linux counts.
-
-    Libraries that unfold compressed data grow their buffers until there is no memory left; here they fail in order.
-    """
+    """Whoever asks the system for more than ``more_bytes`` (and some) in the body gets none, where Linux counts:
+    libraries that unfold compressed data would go on until there is no memory left."""
     in_use = in_use_bytes("VmSize:")
     if resource is None or not in_use:
         yield

@@ -1,7 +1,5 @@
 """The header of NIfTI-1, as written and read here: https://nifti.nimh.nih.gov/nifti-1 (nifti1.h)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 VOXELS_AT = 352  # the header and four bytes that say: no extension

@@ -1,9 +1,8 @@
-"""Outputs that are there whole or not at all: written beside the target, then moved over it."""
-
-from __future__ import annotations
+"""Outputs that are there whole or not at all: written beside the target, then moved over it; names of files beside."""
 
 import errno
 import glob
+import hashlib
 import os
 import platform
 import re
@@ -26,26 +25,29 @@ _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part$")
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise OutputError now if ``path`` could not be written later; leaves nothing behind.
+    """Raise OutputError now if ``path`` could not be written later: makes, and removes, an empty file in its folder."""
+    _remove(_create_beside(_target(path)))
 
-    Meant for the start of long work: it makes, and removes, an empty file in the target's folder.
-    """
-    temporary = _create_beside(_target(path))
-    _remove(temporary)
+
+def make_folder(folder: Path, culprit: Path) -> None:
+    """Makes a folder, and those above it; OutputError about ``culprit`` where that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise OutputError(str(culprit), found, "a folder that can be written") from error
 
 
 @contextmanager
 def written_beside(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the target's folder; on success it replaces the target in one step.
-
-    The body only writes: its operating system errors are reported as OutputError about ``path``. Whatever
-    goes wrong, an existing target keeps its content and the temporary file is removed.
-    """
+    """Yield a temporary path in the target's folder that replaces the target on success, in one step. The body only writes:
+    its system errors become OutputError about ``path``. Whatever goes wrong, an existing target keeps its content."""
     target = _target(path)
     temporary = _create_beside(target)
     try:
         yield temporary
-        _flush_to_disk(temporary)
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
         if target.exists():
             shutil.copymode(target, temporary)
         os.replace(temporary, target)
@@ -74,13 +76,11 @@ def _target(path: str | Path) -> Path:
     if mode is not None and not stat.S_ISREG(mode):
         raise OutputError(shown, "something that is not a regular file", "a file name")
     if mode is not None and not os.access(target, os.W_OK):
-        raise OutputError(
-            shown, "a write-protected file", "a file that may be replaced", "choose another name"
-        )
+        expected = "a file that may be replaced"
+        raise OutputError(shown, "a write-protected file", expected, "choose another name")
     if not target.parent.is_dir():
-        raise OutputError(
-            shown, f"no folder {target.parent}", "an existing folder", "create the folder first"
-        )
+        expected = "an existing folder"
+        raise OutputError(shown, f"no folder {target.parent}", expected, "create the folder first")
     return target
 
 
@@ -91,12 +91,9 @@ def _create_beside(target: Path) -> Path:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
         signals.unfinished.discard(str(temporary))
-        raise OutputError(
-            str(target),
-            f"{error.strerror or error} in folder {target.parent}",
-            "a folder that can be written",
-            "choose another folder or change its permissions",
-        ) from error
+        found = f"{error.strerror or error} in folder {target.parent}"
+        remedy = "choose another folder or change its permissions"
+        raise OutputError(str(target), found, "a folder that can be written", remedy) from error
     return temporary
 
 
@@ -126,21 +123,14 @@ def _is_dead(process: int) -> bool:
         return False
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    except OSError:  # somebody else's
-        return False
+    except OSError as error:
+        return isinstance(error, ProcessLookupError)  # others say that it is somebody else's
     return False
 
 
 def _remove(temporary: Path) -> None:
     signals.unfinished.discard(str(temporary))
     temporary.unlink()
-
-
-def _flush_to_disk(path: Path) -> None:
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
 
 
 def _flush_folder(folder: Path) -> None:
@@ -158,10 +148,28 @@ def _output_error(target: Path, error: BaseException) -> OutputError:
     full = code in NO_SPACE or any(f"errno = {number}," in str(error) for number in NO_SPACE)
     if full:
         found = f"no room left in folder {target.parent}"
-        return OutputError(
-            str(target), found, "enough space on the disk", "free some space or choose another folder"
-        )
+        expected = "enough space on the disk"
+        return OutputError(str(target), found, expected, "free some space or choose another folder")
     if code == errno.ENAMETOOLONG:
         return OutputError(str(target), "a file name that is too long", "a shorter name", "shorten the name")
     found = getattr(error, "strerror", None) or str(error)
     return OutputError(str(target), found, "a file that can be written", "choose another folder")
+
+
+_LONGEST_BYTES = 255  # of a name, in every file system that is common
+
+
+def shortened(name: str, most_bytes: int) -> str:
+    """``name``, or as much of it as fits in front of a digest of all of it."""
+    raw = os.fsencode(name)
+    if len(raw) <= most_bytes:
+        return name
+    ending = f"~{hashlib.sha256(raw).hexdigest()[:12]}"
+    return raw[: most_bytes - len(ending)].decode("utf-8", "ignore") + ending
+
+
+def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
+    """The path ``beginning`` + name + ``ending`` in the same folder, shortened where no file system would take it."""
+    room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
+    path = Path(path)
+    return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")

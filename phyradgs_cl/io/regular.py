@@ -1,7 +1,5 @@
 """Files that a user or another file names, opened without waiting: a device, a pipe or a file of /proc may never end."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator
@@ -33,10 +31,7 @@ def regular_file(path: Path, culprit: str, expected: str = "a regular file") -> 
 
 @contextmanager
 def open_regular(path: Path, culprit: str, expected: str = "a regular file") -> Iterator[tuple[BinaryIO, int]]:
-    """A file to read and its size. Those of /proc have none, and one that grows is read no further.
-
-    Errors of the system in the body are InputErrors about ``culprit``.
-    """
+    """A file to read and its size, beyond which nothing is read; errors of the system in the body become InputError."""
     regular_file(path, culprit, expected)
     try:
         with open(os.open(path, os.O_RDONLY | _NO_WAITING), "rb") as file:

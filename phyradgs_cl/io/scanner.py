@@ -1,19 +1,17 @@
 """Scanner descriptions: a small TOML file with a geometry, a volume and how the panel reads out."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
-from phyradgs_cl.io.hdf5.grid import default_grid
 from phyradgs_cl.io.hdf5.units import LENGTH
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.text import near_miss
@@ -21,8 +19,7 @@ from phyradgs_cl.text import near_miss
 _TABLES: dict[str, tuple[str, ...]] = {
     "source": ("to_axis_mm", "to_detector_mm"),
     "detector": (
-        *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"),
-        "lag",
+        *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"), "lag"
     ),
     "beam": ("pulse_start", "pulse_length"),
     "volume": ("shape", "size_mm", "offset_mm"),
@@ -34,11 +31,9 @@ MOST_LINES = 65_536
 
 @dataclass(frozen=True)
 class Scanner:
-    """A scanner: where things stand, what volume it images, and how its panel is read by default.
-
-    ``readout_ratio`` is T_ro/T_exp, or None if the file leaves it to the protocol. ``pulse`` is when the beam is on
-    in a frame (start, length; shares of the exposure), None always; ``lag`` the panel's λ (detector/lag.py).
-    """
+    """A scanner: where things stand, what volume it images, and how its panel is read by default. ``readout_ratio``:
+    T_ro/T_exp, None is the protocol's. ``pulse``: when the beam is on in a frame (start, length; shares of the
+    exposure), None always. ``lag``: the panel's λ."""
 
     name: str
     geometry: ConeGeometry
@@ -51,11 +46,8 @@ class Scanner:
 
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
-    """A scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml.
-
-    Raises:
-        InputError: no such scanner, not TOML, unknown, missing or wrong keys: "FILE [table] key".
-    """
+    """A scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. InputError: no such scanner, not
+    TOML, unknown, missing or wrong keys: "FILE [table] key"."""
     path = _located(str(name_or_path), data_dir)
     return scanner_from(path, read_toml(path))
 
@@ -110,8 +102,7 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
 def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
     to_axis_mm, to_detector_mm = _length(source, "to_axis_mm"), _length(source, "to_detector_mm")
     if to_detector_mm <= to_axis_mm:
-        expected = f"more than to_axis_mm ({to_axis_mm:g})"
-        raise InputError(source.name("to_detector_mm"), f"{to_detector_mm:g}", expected)
+        raise source.error("to_detector_mm", f"{to_detector_mm:g}", f"more than to_axis_mm ({to_axis_mm:g})")
     return ConeGeometry(
         to_axis_mm,
         to_detector_mm,
@@ -123,7 +114,7 @@ def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
 
 def _length(table: Fields, key: str) -> float:
     if (value := table.number(key, highest=LENGTH.largest)) < 1 / LENGTH.largest:
-        raise InputError(table.name(key), f"{value:g}", "a length above 0")
+        raise table.error(key, f"{value:g}", "a length above 0")
     return value
 
 
@@ -134,7 +125,7 @@ def _position(table: Fields, key: str) -> float:
 def _pulse(beam: Fields) -> tuple[float, float]:
     start, length = (beam.number(key, highest=LENGTH.largest) for key in ("pulse_start", "pulse_length"))
     if length <= 0:
-        raise InputError(beam.name("pulse_length"), f"{length:g}", "a share of the exposure above 0")
+        raise beam.error("pulse_length", f"{length:g}", "a share of the exposure above 0")
     return start, length
 
 
@@ -142,16 +133,15 @@ def _grid(volume: Fields) -> Grid:
     shape, size_mm = _triple(volume, "shape"), _triple(volume, "size_mm")
     offset_mm = _triple(volume, "offset_mm") if volume.has("offset_mm") else (0.0, 0.0, 0.0)
     if any(n < 1 or n != int(n) for n in shape):
-        raise InputError(volume.name("shape"), str(list(shape)), "three counts of at least 1 (z, y, x)")
+        raise volume.error("shape", str(list(shape)), "three counts of at least 1 (z, y, x)")
     if math.prod(shape) > MOST_VOXELS:
-        raise InputError(volume.name("shape"), checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
+        raise volume.error("shape", checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
     if min(size_mm) < 1 / LENGTH.largest:
-        raise InputError(volume.name("size_mm"), str(list(size_mm)), "three lengths above 0 (z, y, x)")
+        raise volume.error("size_mm", str(list(size_mm)), "three lengths above 0 (z, y, x)")
     voxel_mm = triple(side / n for side, n in zip(size_mm, shape, strict=True))
     return Grid(triple(int(n) for n in shape), voxel_mm, offset_mm)
 
 
 def _triple(volume: Fields, key: str) -> tuple[float, float, float]:
-    """Three numbers (z, y, x)."""
     z, y, x = volume.numbers(key, 3, LENGTH.largest).tolist()
     return z, y, x

@@ -1,7 +1,5 @@
 """The hash that ties a result to the file that it came from."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Typed values out of nested plain containers (JSON, TOML, pickles), each named by its path when it is wrong."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,10 +40,8 @@ def refuse_unknown(culprit: str, found: Collection[str], known: Collection[str],
 
 
 class Fields:
-    """A mapping and the name to blame: values are taken out one by one, each checked.
-
-    ``known``: the only names that it may have; None for a table that may have more than is read of it.
-    """
+    """A mapping and the name to blame: values are taken out one by one, each checked. ``known``: the only names that it
+    may have; None for a table that may have more than is read of it."""
 
     def __init__(self, culprit: str, values: object, known: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
@@ -60,17 +56,20 @@ class Fields:
         """How messages name a value of the table."""
         return f"{self.culprit}{self._joint}{key}"
 
+    def error(self, key: str, found: str, expected: str, remedy: str = "") -> InputError:
+        """What to raise about a value of the table."""
+        return InputError(self.name(key), found, expected, remedy)
+
     def has(self, key: str) -> bool:
-        """Whether there is a value other than None."""
         return self.values.get(key) is not None
 
     def get(self, key: str) -> object:
         """A required value of any kind."""
         if not self.has(key):
-            raise InputError(self.name(key), "nothing", "a value", "add it to the file")
+            raise self.error(key, "nothing", "a value", "add it to the file")
         return self.values[key]
 
-    def table(self, key: str) -> Fields:
+    def table(self, key: str) -> "Fields":
         """A required table inside this one."""
         return Fields(self.name(key), self.get(key))
 
@@ -83,14 +82,14 @@ class Fields:
         value = self._finite(key, self.get(key))
         if not lowest <= value <= highest:
             least = f"at least {lowest:g} and " if lowest > -LARGEST else ""
-            raise InputError(self.name(key), f"{value:g}", f"a number, {least}at most {highest:g}")
+            raise self.error(key, f"{value:g}", f"a number, {least}at most {highest:g}")
         return value
 
     def length(self, key: str) -> float:
         """A number above zero."""
         value = self.number(key)
         if value <= 0:
-            raise InputError(self.name(key), f"{value:g}", "a number above 0")
+            raise self.error(key, f"{value:g}", "a number above 0")
         return value
 
     def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:
@@ -100,30 +99,30 @@ class Fields:
             found = found.tolist() if found.ndim == 1 else None
         wanted = f"{_COUNTS.get(count, count)} numbers" if count is not None else "a list of numbers"
         if not isinstance(found, Sequence) or isinstance(found, (str, bytes)):
-            raise InputError(self.name(key), described(self.get(key)), wanted)
+            raise self.error(key, described(self.get(key)), wanted)
         if count is not None and len(found) != count:
-            raise InputError(self.name(key), f"{len(found)} values", wanted)
+            raise self.error(key, f"{len(found)} values", wanted)
         return np.array([self._finite(key, value, largest) for value in found], np.float64)
 
     def lengths(self, key: str, count: int) -> np.ndarray:
         """(count,) numbers above zero."""
         values = self.numbers(key, count)
         if values.min() <= 0:
-            raise InputError(self.name(key), str(values.tolist()), "numbers above 0")
+            raise self.error(key, str(values.tolist()), "numbers above 0")
         return values
 
     def count(self, key: str, most: int) -> int:
         """A whole number from 1 to ``most``."""
         value = self.number(key)
         if not 1 <= value <= most or value != int(value):
-            raise InputError(self.name(key), f"{value:g}", f"a whole number from 1 to {most}")
+            raise self.error(key, f"{value:g}", f"a whole number from 1 to {most}")
         return int(value)
 
     def counts(self, key: str, count: int) -> tuple[int, ...]:
         """``count`` whole numbers of at least 1."""
         values = self.numbers(key, count)
         if values.min() < 1 or values.max() > 1e6 or np.any(values != np.rint(values)):
-            raise InputError(self.name(key), str(values.tolist()), "whole numbers from 1 to 1000000")
+            raise self.error(key, str(values.tolist()), "whole numbers from 1 to 1000000")
         return tuple(int(value) for value in values)
 
     def word(self, key: str, allowed: Sequence[str] | None = None, default: str | None = None) -> str:
@@ -132,16 +131,16 @@ class Fields:
             return default
         value = self.get(key)
         if not isinstance(value, str):
-            raise InputError(self.name(key), described(value), "a string")
+            raise self.error(key, described(value), "a string")
         if allowed is not None:
             checks.one_of(self.name(key), value, allowed)
         return value
 
-    def tables(self, key: str) -> Iterator[Fields]:
+    def tables(self, key: str) -> "Iterator[Fields]":
         """The tables of a list that is not empty."""
         found = self.get(key)
         if not isinstance(found, list) or not found:
-            raise InputError(self.name(key), described(found), "a list with at least one entry")
+            raise self.error(key, described(found), "a list with at least one entry")
         return (Fields(f"{self.name(key)}[{index}]", value) for index, value in enumerate(found))
 
     def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
@@ -149,7 +148,7 @@ class Fields:
             value = value.item()
         good = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not good or not abs(value) <= largest:  # type: ignore[arg-type]
-            raise InputError(self.name(key), described(value), f"a finite number of at most {largest:g}")
+            raise self.error(key, described(value), f"a finite number of at most {largest:g}")
         return float(value)  # type: ignore[arg-type]
 
 

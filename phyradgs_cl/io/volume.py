@@ -1,7 +1,5 @@
 """Volume files: a reconstruction with its grid, its history and its Gaussians, as an NXdata in HDF5; bare volumes too."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable, Mapping
@@ -37,11 +35,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class StoredVolume:
-    """A volume file: volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what is kept beside it.
-
-    ``provenance``: facts of the kinds that ``facts.PROVENANCE`` states. ``gaussians`` float32 in mm and 1/mm. ``metrics``:
-    numbers by name. None where there are none.
-    """
+    """Volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what its file has beside it: ``provenance`` of the kinds that
+    ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name; None where there are none."""
 
     volume: np.ndarray
     grid: Grid
@@ -65,15 +60,9 @@ def write_volume(
     gaussians: Gaussians | None = None,
     metrics: Mapping[str, object] | None = None,
 ) -> None:
-    """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all.
-
-    ``provenance`` and ``metrics`` are stored as JSON, plain values also as attributes; the parameters of ``gaussians``
-    as float32 datasets of their names.
-
-    Raises:
-        InputError: a volume that is not finite or does not fit its grid.
-        OutputError: the file cannot be written.
-    """
+    """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all: ``provenance`` and
+    ``metrics`` as JSON, plain values also as attributes; ``gaussians`` as float32. InputError: a volume that is not finite
+    or does not fit its grid. OutputError: the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     with written_beside(path) as temporary, new_hdf5(temporary) as file:
@@ -92,26 +81,17 @@ def write_volume(
 
 
 def read_volume(path: str | Path) -> StoredVolume:
-    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning.
-
-    A run that was interrupted is a warning too.
-    """
+    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning,
+    and a run that was interrupted is one too."""
     with open_hdf5(path) as source:
         volume, grid = _read_voxels(source)
         return StoredVolume(volume, grid, read_provenance(source), _read_gaussians(source), _read_metrics(source))
 
 
 def load_volume(path: str | Path) -> LoadedVolume:
-    """Read a 3D volume of any origin.
-
-    Either a dataset `/volume` (z, y, x) at the root (integers are divided by their type's maximum,
-    floats stay as they are; no grid), or the voxels of a volume file. Negative values are allowed: real reconstructions
-    have them.
-
-    Raises:
-        InputError: no such file, not HDF5, no such dataset, not 3D, empty, not numbers, NaN or infinity, larger than
-            the file can hold, kept in another file, axes that do not fit; names the file and the dataset.
-    """
+    """The voxels of a volume file, or of a bare 3D dataset `/volume` (z, y, x), without a grid, whose integers are divided
+    by their type's maximum. Negative values are allowed. InputError: no such file or dataset, NaN or infinity, larger than
+    the file can hold, kept in another file, axes that do not fit; names the file and the dataset."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_BARE), h5py.Dataset):
             return LoadedVolume(_read_bare(source), None)
@@ -125,13 +105,8 @@ def load_volume(path: str | Path) -> LoadedVolume:
 def load_attenuation(
     path: str | Path, *, warn: bool = True, load: Callable[[str | Path], LoadedVolume] = load_volume
 ) -> LoadedVolume:
-    """What ``load`` reads, for a volume that rays are to be sent through.
-
-    Where a tenth as much lies below 0 as above, that is worth a warning: noise about 0 in air has less.
-
-    Raises:
-        InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units.
-    """
+    """What ``load`` reads, for a volume that rays are to be sent through; a tenth as much below 0 as above is a warning.
+    InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units."""
     loaded = load(path)
     volume = loaded.volume
     positive = float(np.sum(volume, where=volume > 0, dtype=np.float64))
@@ -164,11 +139,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def file_kind(path: str | Path) -> str:
-    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume).
-
-    Raises:
-        InputError: not readable, or none of the three.
-    """
+    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume); InputError if none of them."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"
@@ -229,14 +200,13 @@ def _plain(value: object) -> object:
 
 
 def _checked(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
-    """The volume's dataset, unread, and its grid; they fit each other."""
     dataset = source.dataset(_VOLUME)
     if dataset.ndim != 3 or min(dataset.shape) < 1:
-        raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", "three axes (z, y, x), none empty")
+        raise source.error(_VOLUME, f"shape {dataset.shape}", "three axes (z, y, x), none empty")
     stored = source.optional_group("/entry/grid")
     grid = read_grid(source, "/entry/grid") if stored is not None else _grid_of_axes(source, dataset.shape)
     if grid.shape != dataset.shape:
-        raise InputError(source.name(_VOLUME), f"shape {dataset.shape}", f"the grid's {grid.shape}")
+        raise source.error(_VOLUME, f"shape {dataset.shape}", f"the grid's {grid.shape}")
     return dataset, grid
 
 
@@ -249,7 +219,7 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
         even_mm = axis_mm[0] + np.arange(count) * step_mm
         if count > 1 and (step_mm <= 0 or np.abs(axis_mm - even_mm).max() > _AXIS_TOLERANCE * step_mm):
             expected = "even steps in mm, or a group /entry/grid"
-            raise InputError(source.name(f"{_DATA}/{name}"), "values that do not rise evenly", expected)
+            raise source.error(f"{_DATA}/{name}", "values that do not rise evenly", expected)
         steps_mm.append(step_mm if count > 1 else None)
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
     known = [step for step in steps_mm if step is not None]  # one voxel has no spacing of its own

@@ -1,28 +1,15 @@
 """A volume against the truth: the numbers of the published tables."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics.psnr import psnr
 from phyradgs_cl.metrics.ssim import ssim
 
 
-def compare(volume: NDArray[np.floating], reference: NDArray[np.floating]) -> dict[str, float]:
-    """3D PSNR and SSIM against a reference, with the range that was used: the reference's maximum.
-
-    Args:
-        volume: (z, y, x).
-        reference: (z, y, x), the truth in the same unit.
-
-    Returns:
-        psnr_db, ssim, data_range.
-
-    Raises:
-        InputError: an empty reference, shapes that differ, NaN or infinity.
-    """
+def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``, of a volume against the truth, both (z, y, x).
+    InputError: an empty reference, shapes that differ, NaN or infinity."""
     peak = float(reference.max())
     if peak <= 0:
         raise InputError("reference", f"a maximum of {peak:g}", "a volume with something in it")

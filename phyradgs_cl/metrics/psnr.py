@@ -1,7 +1,5 @@
 """Peak signal-to-noise ratio."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -12,18 +10,10 @@ from phyradgs_cl.errors import InputError
 
 
 def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """10 · log10(data_range² / mean squared error) in dB, over all voxels, without clipping.
+    """10 · log10(data_range² / mean squared error) in dB, over all voxels, without clipping; infinity for equals.
 
-    Args:
-        result: (z, y, x) or any shape.
-        reference: the same shape: the truth.
-        data_range: peak value; by default the reference's maximum (1 for the benchmark volumes).
-
-    Returns:
-        dB; infinity where the two are equal.
-
-    Raises:
-        InputError: shapes that differ, NaN or infinity, a range that is not positive.
+    ``data_range``: by default the reference's maximum. InputError: shapes that differ, NaN or infinity, a range
+    that is not positive.
     """
     a, b, peak = checked_pair(result, reference, data_range)
     # A slice at a time: float64 copies of whole volumes would triple the memory.

@@ -1,7 +1,5 @@
 """A volume on another grid."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -9,13 +7,9 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Grid
 
 
-def resampled(
-    volume: NDArray[np.floating], grid: Grid, onto: Grid
-) -> tuple[NDArray[np.float32], float]:
-    """A volume (nz, ny, nx) at the voxel centres of another grid, trilinear; and the share of them that lie in its box.
-
-    Outside of its box the volume is 0; between its outermost centres and its faces it is what it is at the centres.
-    """
+def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
+    """A volume (nz, ny, nx) at the voxel centres of another grid, trilinear, 0 outside of its box; and the share of
+    them that lie in it. Between its outermost centres and its faces it is what it is at the centres."""
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
     first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
     values = scipy.ndimage.affine_transform(

@@ -1,7 +1,5 @@
 """A figure of the three middle slices beside the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,48 +7,38 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.checks import finite, shape
+from phyradgs_cl.drawing import draw_image, new_figure
 from phyradgs_cl.errors import OutputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics.psnr import psnr
 from phyradgs_cl.metrics.ssim import ssim
 from phyradgs_cl.text import plain_text
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import FigureBase
 
 Image = NDArray[np.floating]
 _INCH, _DPI = 3.2, 110
 
 
-def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str) -> None:
-    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference.
+def slices_png(
+    path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str, grid: Grid | None = None
+) -> None:
+    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference. z and y point up.
 
-    Grey values run over the truth's range in both columns, so that a wrong gain shows; the difference has
-    a scale of its own, symmetric about 0. Titles carry the slice's number and root mean square error, the
-    heading PSNR and SSIM. z and y point up in the pictures.
-
-    Args:
-        path: file to write.
-        result: (z, y, x).
-        reference: (z, y, x), the truth, or None where there is none: then there is one column.
-        title: the heading's first line.
-
-    Raises:
-        InputError: not 3D, shapes that differ, NaN or infinity.
-        OutputError: the file cannot be written.
+    Grey values run over the truth's range, so that a wrong gain shows; the difference has a scale of its own, symmetric
+    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line; ``grid`` of
+    both, for a bar of a length. InputError: not 3D, shapes that differ, NaN or infinity. OutputError: the file cannot be
+    written.
     """
-    from matplotlib.figure import Figure  # slow to import, and only figures need it
-
     volume = np.asarray(result)
     shape("result", volume, (None, None, None))
     finite("result", volume)
     truth = None if reference is None else np.asarray(reference)
-    figure = Figure(
-        figsize=((1 if truth is None else 3) * _INCH * 1.25, 3 * _INCH + 0.6), layout="constrained"
-    )
+    figure = new_figure((1 if truth is None else 3) * _INCH * 1.25, 3 * _INCH + 0.6)
     heading = plain_text(title if truth is None else f"{title}\n{_numbers(volume, truth)}")
     figure.suptitle(heading, parse_math=False)  # a dollar in a file's name is one
-    _fill(figure, volume, truth)
+    draw_slices(figure, volume, truth, grid)
     try:
         figure.savefig(path, dpi=_DPI, format="png")
     except OSError as error:
@@ -63,31 +51,29 @@ def _numbers(result: Image, reference: Image) -> str:
     return f"PSNR {psnr(result, reference):.2f} dB, SSIM {ssim(result, reference):.4f}"
 
 
-def _fill(figure: Figure, volume: Image, truth: Image | None) -> None:
+def draw_slices(figure: "FigureBase", volume: Image, truth: Image | None, grid: Grid | None) -> None:
+    """The middle slices of a volume (z, y, x) in 1/mm below each other, those of a truth and of the difference beside."""
     if truth is not None:
         shape("reference", truth, volume.shape)
         finite("reference", truth)
     shown = volume if truth is None else truth
     low, high = min(0.0, float(shown.min())), float(shown.max())
     high = high if high > low else low + 1.0
+    grey = {"cmap": "gray", "vmin": low, "vmax": high}
     panels = figure.subplots(3, 1 if truth is None else 3, squeeze=False)
     for axis, name in enumerate("zyx"):
         index = volume.shape[axis] // 2
         image = volume.take(index, axis=axis)
-        _panel(figure, panels[axis, 0], image, f"result, {name} = {index}", "gray", low, high)
+        sides = None if grid is None else [side for a, side in enumerate(grid.size_mm) if a != axis]
+        size_mm = None if sides is None else (sides[0], sides[1])
+        where = f"{name} = {index}" if grid is None else f"{name} = {grid.axes_mm()[axis][index]:.3g} mm"
+        unit = "" if grid is None else ", 1/mm"
+        draw_image(panels[axis, 0], image, f"result{unit}, {where}", size_mm=size_mm, **grey)
         if truth is not None:
             other = truth.take(index, axis=axis)
             difference = image.astype(np.float64) - other
             limit = float(np.abs(difference).max()) or 1.0
             rms = float(np.sqrt(np.mean(difference**2)))
-            _panel(figure, panels[axis, 1], other, f"truth, {name} = {index}", "gray", low, high)
-            _panel(figure, panels[axis, 2], difference, f"difference, RMS {rms:.3g}", "RdBu_r", -limit, limit)
-
-
-def _panel(
-    figure: Figure, axes: Axes, image: Image, title: str, colours: str, low: float, high: float
-) -> None:
-    drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, origin="lower")
-    axes.set_title(title, fontsize=9)
-    axes.set_axis_off()
-    figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
+            draw_image(panels[axis, 1], other, f"truth, {where}", size_mm=size_mm, **grey)
+            signed = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+            draw_image(panels[axis, 2], difference, f"difference, RMS {rms:.3g}", size_mm=size_mm, **signed)

@@ -1,11 +1,8 @@
 """Structural similarity (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) of volumes.
 
-In two dimensions, with an 11x11 Gaussian window of sigma 1.5 and zeros beyond the border, averaged over
-the slices of each axis whose truth is not empty and then over the three axes: how the published tables
-of radiative Gaussian splatting are made.
+In 2D, 11x11 Gaussian window of sigma 1.5, zeros beyond the border, averaged over the slices of each axis whose truth is
+not empty, then over the axes: as in the published tables of radiative Gaussian splatting.
 """
-
-from __future__ import annotations
 
 import numpy as np
 import scipy
@@ -23,18 +20,10 @@ _VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size live at onc
 
 
 def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """Mean structural similarity of the slices of a volume.
+    """Mean structural similarity, at most 1, of the slices of a volume (z, y, x); those whose truth is zero do not count.
 
-    Args:
-        result: (z, y, x).
-        reference: (z, y, x), the truth; slices of it that are zero throughout do not count.
-        data_range: L in C1 = (0.01 L)², C2 = (0.03 L)²; by default the reference's maximum.
-
-    Returns:
-        at most 1, which means equal.
-
-    Raises:
-        InputError: not 3D, shapes that differ, NaN or infinity, a range that is not positive.
+    ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for what is
+    not 3D, shapes that differ, NaN or infinity, a range that is not positive.
     """
     a, b, peak = checked_pair(result, reference, data_range)
     shape("reference", b, (None, None, None))
@@ -42,16 +31,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
 
 
 def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Array:
-    """Structural similarity at every pixel of a stack of images.
-
-    Args:
-        result: (..., v, u).
-        reference: the same shape.
-        data_range: L, as in `ssim`.
-
-    Returns:
-        (..., v, u) float64.
-    """
+    """Structural similarity (..., v, u) float64 at every pixel of two stacks of images (..., v, u)."""
     a, b = np.asarray(result, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
     mean_a, mean_b = _blur(a), _blur(b)

@@ -1,7 +1,5 @@
 """What a reconstruction may ask of the other processes that work on the same scan, and the answers of one that is alone."""
 
-from __future__ import annotations
-
 from typing import Any, NoReturn
 from typing import Protocol as Interface
 

@@ -1,7 +1,5 @@
 """The end of one rank is the end of all: others would wait for it for ever."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

@@ -5,8 +5,6 @@ overflow: adding those is exact and associative. What a float32 has below 2⁻³
 last bit at 2⁻²³ is the float's own) is rounded off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

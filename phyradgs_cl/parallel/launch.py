@@ -1,7 +1,5 @@
 """How this process was started: alone, or as one of several by mpiexec or srun. Read from the environment alone."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass

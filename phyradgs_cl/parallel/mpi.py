@@ -1,7 +1,5 @@
 """Ranks of an MPI launch through mpi4py, which is imported here and only when it is needed."""
 
-from __future__ import annotations
-
 import time
 from functools import lru_cache
 from typing import Any, NoReturn

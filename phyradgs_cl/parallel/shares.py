@@ -1,7 +1,5 @@
 """Who does what: counts divided over ranks."""
 
-from __future__ import annotations
-
 
 def span(count: int, parts: int, part: int) -> range:
     """The ``part``-th of ``parts`` runs of 0 … count−1, whose lengths differ by one at most."""

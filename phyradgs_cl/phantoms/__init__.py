@@ -1,15 +1,10 @@
-"""Phantoms: objects whose attenuation is known, for simulations and for truth to compare with.
+"""Phantoms: objects whose attenuation is known, for simulations and for truth to compare with; `make_phantom` is the door.
 
-`make_phantom` is the door. What comes out has `name`, `kind` and `voxelise(grid)`; an "analytic"
-phantom also has `line_integrals(source, target)` in closed form, a "voxel" phantom its `volume` and
-`grid`. Attenuation scales with 1 / half-size in all of them, so that line integrals do not depend on
-the size chosen; in units of the half-size the procedural volumes are in [0, 1].
+All have `name`, `kind` and `voxelise(grid)`; an "analytic" one also `line_integrals(source, target)` in closed form, a
+"voxel" one `volume` and `grid`. Attenuation scales with 1 / half-size, so that line integrals do not depend on the size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,36 +19,11 @@ from phyradgs_cl.phantoms.spheres import sphere_phantom
 from phyradgs_cl.phantoms.voxels import VoxelPhantom
 
 __all__ = [
-    "PHANTOMS",
-    "Ellipsoid",
-    "EllipsoidPhantom",
-    "Phantom",
-    "VoxelPhantom",
-    "foot",
-    "jaw",
-    "make_phantom",
-    "rotation_about_z",
-    "shepp_logan",
-    "sphere_phantom",
-]
+    "PHANTOMS", "Ellipsoid", "EllipsoidPhantom", "Phantom", "VoxelPhantom", "foot", "jaw",
+    "make_phantom", "rotation_about_z", "shepp_logan", "sphere_phantom"
+]  # fmt: skip
 
-
-class Phantom(Protocol):
-    """What every phantom offers."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def kind(self) -> str:
-        """ "analytic" or "voxel"."""
-        ...
-
-    def voxelise(self, grid: Grid, supersampling: int = ...) -> NDArray[np.float32]:
-        """(nz, ny, nx) in 1/mm."""
-        ...
-
-
+Phantom = EllipsoidPhantom | VoxelPhantom
 # (half_size_mm, resolution, seed) -> phantom; closed forms have no use for the last two.
 Factory = Callable[[float, int, int], Phantom]
 
@@ -75,17 +45,10 @@ PHANTOMS: dict[str, Factory] = {
 
 
 def make_phantom(name: str, half_size_mm: float, resolution: int = 128, seed: int = 0) -> Phantom:
-    """A phantom by its name, in a cube of side 2 · `half_size_mm` about the origin.
+    """A phantom by its name, a key of `PHANTOMS`, in a cube of side 2 · `half_size_mm` about the origin.
 
-    Args:
-        name: a key of `PHANTOMS`.
-        half_size_mm: half the cube's side.
-        resolution: voxels per side, for voxel phantoms.
-        seed: of the procedural phantoms' shape and texture.
-
-    Raises:
-        InputError: an unknown name (the message lists the known ones), or a size or count that is
-            not positive.
+    Voxel phantoms have `resolution` voxels per side; `seed` is of the procedural ones' shape and texture. Raises
+    InputError for an unknown name (the message lists the known ones), or a size or count that is not positive.
     """
     one_of("phantom", name, PHANTOMS)
     positive("half_size_mm", half_size_mm)

@@ -1,13 +1,9 @@
 """Phantoms made of additive ellipsoids: line integrals in closed form, no voxels in between.
 
-An affine map takes an ellipsoid to the unit ball and a ray to a ray, so that the chord follows from
-the ray's distance to the ball's centre (A. C. Kak and M. Slaney, Principles of Computerized
-Tomographic Imaging, IEEE Press 1988, section 3.1).
+An affine map takes an ellipsoid to the unit ball and a ray to a ray: the chord follows from the ray's distance to the
+centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1).
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -36,14 +32,9 @@ def rotation_about_z(angle_rad: float) -> Matrix:
 class Ellipsoid:
     """One solid ellipsoid whose attenuation adds to whatever else is there.
 
-    Args:
-        centre_mm: (x, y, z).
-        semi_axes_mm: (a, b, c) along the ellipsoid's own axes.
-        attenuation_per_mm: added inside; may be negative, to carve a hole.
-        rotation: 3x3 matrix whose columns are the ellipsoid's axes in world coordinates.
-
-    Raises:
-        InputError: semi-axes not positive, values not finite, or a matrix that is no rotation.
+    Centre (x, y, z); semi-axes along the ellipsoid's own axes, which are the columns of the 3x3 ``rotation``;
+    ``attenuation_per_mm`` may be negative, to carve a hole. Raises InputError for semi-axes that are not positive, values
+    that are not finite, or a matrix that is no rotation.
     """
 
     centre_mm: Triple
@@ -88,22 +79,16 @@ class EllipsoidPhantom:
         object.__setattr__(self, "ellipsoids", tuple(self.ellipsoids))
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
-        """Attenuation integrated along the segments from `source` to `target`.
+        """Attenuation integrated from `source` to `target`, (..., 3) world points (x, y, z) in mm that broadcast.
 
-        Args:
-            source: (..., 3) world points (x, y, z) in mm.
-            target: (..., 3) in mm; the two broadcast against each other.
-
-        Returns:
-            (...) float64, dimensionless; 0 for a segment that misses or has no length.
-
-        Raises:
-            InputError: last axis not 3, or shapes that do not broadcast.
+        Returns (...) float64, dimensionless; 0 for a segment that misses or has no length. Raises InputError for a last axis
+        that is not 3, or shapes that do not broadcast.
         """
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
         flat = result.reshape(-1)
-        for chunk in _chunks(flat.size):
+        for first in range(0, flat.size, RAYS_PER_CHUNK):
+            chunk = slice(first, min(first + RAYS_PER_CHUNK, flat.size))
             # Indexing the broadcast views copies a chunk's points only, never all of them.
             where = np.unravel_index(np.arange(chunk.start, chunk.stop), result.shape) if result.ndim else ()
             p = start[where].reshape(-1, 3)
@@ -111,7 +96,6 @@ class EllipsoidPhantom:
         return result
 
     def _segments(self, start: Array, step: Array) -> Array:
-        """(n,) integrals over start + t·step for t in [0, 1]; start and step (n, 3)."""
         total = np.zeros(len(start))
         for ellipsoid in self.ellipsoids:
             total += ellipsoid.attenuation_per_mm * _chord_fraction(ellipsoid, start, step)
@@ -126,11 +110,7 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Mean attenuation of every voxel, from `supersampling` points along each axis of it.
-
-        Returns:
-            (nz, ny, nx) float32 in 1/mm.
-        """
+        """Mean attenuation (nz, ny, nx) float32 in 1/mm, from `supersampling` points along each axis of a voxel."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)
@@ -149,11 +129,6 @@ def _broadcast_points(source: ArrayLike, target: ArrayLike) -> tuple[Array, Arra
         found = f"shapes {start.shape} and {end.shape}"
         raise InputError("ray source and target", found, "shapes (..., 3) that broadcast")
     return np.broadcast_to(start, common), np.broadcast_to(end, common)
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    for first in range(0, count, RAYS_PER_CHUNK):
-        yield slice(first, min(first + RAYS_PER_CHUNK, count))
 
 
 def _chord_fraction(ellipsoid: Ellipsoid, start: Array, step: Array) -> Array:

@@ -1,12 +1,8 @@
 """Implicit bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
-Everything is a function of position in the cube [-1, 1]^3, so that every resolution samples the same
-object. Edges are averaged over a voxel through the signed distance, textures through the exact mean
-of a cosine over a voxel: a coarse phantom is close to the block mean of a fine one.
-Distances are positive outside. Points run (x, y, z), arrays (z, y, x), float32.
+Functions of position in the cube [-1, 1]^3, averaged over voxels: every resolution samples the same object. Distances
+are positive outside. Points run (x, y, z), arrays (z, y, x), float32.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +27,7 @@ class Capsule:
     r0: float
     r1: float
 
-    def grown(self, width: float) -> Capsule:
+    def grown(self, width: float) -> "Capsule":
         """The same with `width` added to both radii."""
         return Capsule(self.p0, self.p1, self.r0 + width, self.r1 + width)
 
@@ -48,7 +44,6 @@ class Lattice:
 
     @property
     def everything(self) -> Box:
-        """All voxels."""
         return (slice(0, self.count),) * 3
 
     def axis(self) -> Field:
@@ -140,15 +135,8 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Band-limited isotropic noise of unit variance: random cosines, averaged over each voxel.
-
-    Args:
-        wavelengths: shortest and longest wavelength.
-        waves: how many cosines; the same draws from `rng` whatever the resolution.
-
-    Returns:
-        (n, n, n) float32.
-    """
+    """Isotropic noise (n, n, n) float32 of unit variance: `waves` random cosines between two wavelengths, averaged over
+    each voxel; the same draws from `rng` whatever the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length

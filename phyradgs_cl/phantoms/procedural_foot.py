@@ -1,11 +1,8 @@
-"""A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue.
+"""A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue, drawn from scratch.
 
-Drawn from scratch as tapered capsules with a cortical shell and a trabecular inside; no scan of
-anybody is in it. The foot points along the rotation axis (toes to +z), the big toe to -x, the sole
-to -y. Lengths are in units of half the cube's side.
+Tapered capsules with a cortical shell and a trabecular inside. Toes point to +z, the big one to -x, the sole to -y.
+Lengths are in units of half the cube's side.
 """
-
-from __future__ import annotations
 
 from itertools import pairwise
 
@@ -60,21 +57,13 @@ _FLESH = (
 
 
 def foot(grid_shape: int, seed: int) -> Field:
-    """The phantom at a resolution; the same seed gives the same foot at every resolution.
-
-    Args:
-        grid_shape: voxels along each axis of the cube.
-        seed: proportions and texture follow from it.
-
-    Returns:
-        (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    Raises:
-        InputError: fewer than 4 voxels.
-    """
+    """The phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. The same
+    `seed` gives the same foot at every resolution; InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
-    bones, toes = _bones(rng), _toes(rng)
+    bones = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
+    bones += [_long_bone(base, head, 0.046 * thickness, rng) for base, head, thickness, _ in _RAYS]
+    toes = [bone for _, head, thickness, z in _RAYS for bone in _toe(head, thickness, z, rng)]
     lattice = Lattice(int(grid_shape))
     ripple = np.float32(0.004) * texture(lattice, (0.15, 0.4), 48, rng)
     grain = texture(lattice, (0.035, 0.09), 160, rng)
@@ -84,17 +73,6 @@ def foot(grid_shape: int, seed: int) -> Field:
     for bone in bones + toes:
         _add_bone(volume, lattice, bone, ripple, grain)
     return volume
-
-
-def _bones(rng: np.random.Generator) -> list[Bone]:
-    """Tarsals, leg and metatarsals; positions and thicknesses differ a little between seeds."""
-    tarsals = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
-    return tarsals + [_long_bone(base, head, 0.046 * thickness, rng) for base, head, thickness, _ in _RAYS]
-
-
-def _toes(rng: np.random.Generator) -> list[Bone]:
-    """The phalanges of all toes."""
-    return [bone for _, head, thickness, z in _RAYS for bone in _toe(head, thickness, z, rng)]
 
 
 def _chain(points: list[tuple[Point, float]], rng: np.random.Generator) -> Bone:
@@ -115,7 +93,7 @@ def _long_bone(start: Point, end: Point, radius: float, rng: np.random.Generator
     waist = radius * 0.66
     points = (ends[0], 0.65 * ends[0] + 0.35 * ends[1], 0.3 * ends[0] + 0.7 * ends[1], ends[1])
     radii = (radius, waist, waist, radius * 0.95)
-    return _chain([(_point(p), r) for p, r in zip(points, radii, strict=True)], rng)
+    return _chain([((float(x), float(y), float(z)), r) for (x, y, z), r in zip(points, radii, strict=True)], rng)
 
 
 def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.random.Generator) -> list[Bone]:
@@ -127,10 +105,6 @@ def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.rando
         q = (head[0] + spread * (z1 - joints[0]), head[1] - 0.10 * (z1 - joints[0]), z1)
         bones.append(_long_bone(p, q, 0.038 * thickness * 0.9**i, rng))
     return bones
-
-
-def _point(values: np.ndarray) -> Point:
-    return (float(values[0]), float(values[1]), float(values[2]))
 
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:

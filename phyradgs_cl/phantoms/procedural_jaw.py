@@ -1,11 +1,8 @@
-"""A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue.
+"""A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue, drawn from scratch.
 
-Drawn from scratch: the body of the mandible is an elliptic section swept along a horizontal arc, rami
-and roots are tapered capsules, crowns are small ellipsoids with an enamel cap. The chin points to -y,
-the teeth to +z. Lengths are in units of half the cube's side.
+The body is an elliptic section swept along a horizontal arc; rami and roots are tapered capsules, crowns small
+ellipsoids with an enamel cap. The chin points to -y, the teeth to +z. Lengths are in units of half the cube's side.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -66,18 +63,8 @@ class Tooth:
 
 
 def jaw(grid_shape: int, seed: int) -> Field:
-    """The phantom at a resolution; the same seed gives the same jaw at every resolution.
-
-    Args:
-        grid_shape: voxels along each axis of the cube.
-        seed: proportions and texture follow from it.
-
-    Returns:
-        (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    Raises:
-        InputError: fewer than 4 voxels.
-    """
+    """The phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. The same
+    `seed` gives the same jaw at every resolution; InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     teeth = _teeth(rng)
@@ -149,7 +136,6 @@ def _rami() -> list[Capsule]:
 
 
 def _bone_distance(lattice: Lattice) -> Field:
-    """(n, n, n) distance to the whole mandible: swept body, chin, rami."""
     _, _, z = lattice.points(lattice.everything)
     section = (np.float32(_BODY_WIDTH), np.float32(_BODY_HEIGHT))
     across = _arc_distance(lattice)
@@ -197,24 +183,19 @@ def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.
 
 
 def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
-    """Root, crown with an enamel cap, pulp chamber and canals."""
     middle = _GUM_Z + tooth.height / 2
     roots = _roots(tooth, 0.40 * tooth.depth, 0.016)
     crown = Capsule(_on(tooth, 0.0, middle), _on(tooth, 0.0, middle), tooth.depth, tooth.depth)
     box = capsule_box(lattice, [*roots, crown], 0.03)
     x, y, z = lattice.points(box)
-    along = (x - np.float32(tooth.centre[0])) * tooth.along[0] + (
-        y - np.float32(tooth.centre[1])
-    ) * tooth.along[1]
-    across = (x - np.float32(tooth.centre[0])) * tooth.along[1] - (
-        y - np.float32(tooth.centre[1])
-    ) * tooth.along[0]
+    dx, dy = x - np.float32(tooth.centre[0]), y - np.float32(tooth.centre[1])
+    along = dx * tooth.along[0] + dy * tooth.along[1]
+    across = dx * tooth.along[1] - dy * tooth.along[0]
     axes = (0.47 * tooth.width, 0.5 * tooth.depth, 0.58 * tooth.height)
     cap = ratio_distance((along, across, z - np.float32(middle)), axes)
     root = capsule_union(lattice, roots, 0.008, box)
-    pulp = np.minimum(
-        capsule_union(lattice, _roots(tooth, 0.014, 0.006), 0.004, box), cap + 0.36 * tooth.width
-    )
+    canals = capsule_union(lattice, _roots(tooth, 0.014, 0.006), 0.004, box)
+    pulp = np.minimum(canals, cap + 0.36 * tooth.width)
     enamel, core = lattice.coverage(cap), lattice.coverage(cap + np.float32(_ENAMEL_DEPTH))
     dentine = np.maximum(lattice.coverage(root), core)
     hollow = lattice.coverage(pulp) * dentine

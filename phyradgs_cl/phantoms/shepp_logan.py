@@ -1,14 +1,9 @@
 """The 3D Shepp-Logan head phantom in Kak and Slaney's table.
 
-Geometry: A. C. Kak and M. Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988,
-table 3.2 with the authors' errata. TIGRE and RTK draw the same ten ellipsoids.
-Contrasts: "kak-slaney" has the table's own (skull 2, brain about 1.02, details of 1-2 %). "toft" has
-the same bodies with contrasts of tens of per cent, after P. Toft, The Radon Transform: Theory and
-Implementation, PhD thesis, DTU 1996, in the values that H. Yu, Y. Ye and G. Wang gave to these ten
-ellipsoids (Proc. SPIE 5535, 550-557, 2004; TIGRE's "yu-ye-wang").
+Geometry: A. C. Kak and M. Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, table 3.2 with the
+authors' errata, as in TIGRE and RTK. "kak-slaney" has the table's own contrasts (details of 1-2 %), "toft" tens of per
+cent, after P. Toft's PhD thesis, DTU 1996, in the values of H. Yu, Y. Ye and G. Wang (Proc. SPIE 5535, 550-557, 2004).
 """
-
-from __future__ import annotations
 
 import numpy as np
 
@@ -39,14 +34,8 @@ def shepp_logan(
 ) -> EllipsoidPhantom:
     """The phantom inside a cube of side 2 · `half_size_mm` about the origin.
 
-    Args:
-        half_size_mm: what length 1 of the table means.
-        variant: "toft" (high contrast) or "kak-slaney".
-        unit_attenuation_per_mm: what grey level 1 means; by default 1 / `half_size_mm`, so that the
-            line integrals do not depend on the size.
-
-    Raises:
-        InputError: a size that is not positive, or an unknown variant.
+    `variant`: "toft" (high contrast) or "kak-slaney". `unit_attenuation_per_mm`: what grey level 1 means, by default
+    1 / `half_size_mm`, so that line integrals do not depend on the size. InputError: size or variant.
     """
     positive("half_size_mm", half_size_mm)
     one_of("Shepp-Logan variant", variant, _GREY_LEVELS)

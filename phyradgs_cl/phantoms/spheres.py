@@ -1,10 +1,8 @@
 """A double-layer sphere phantom, like those that cone-beam scanners are calibrated with.
 
-Two horizontal circles of dense beads at different heights, turned against each other by half a step,
-the beads of several diameters, in a light holder. Sharp round edges show blur and distortion at once.
+Two horizontal circles of dense beads of several diameters, turned by half a step, in a light holder: sharp round edges
+show blur and distortion at once.
 """
-
-from __future__ import annotations
 
 import numpy as np
 
@@ -22,13 +20,8 @@ _HOLDER_AXES = (0.85, 0.85, 0.7)  # holds every bead entirely; inside the scanne
 
 
 def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
-    """The phantom inside a cube of side 2 · `half_size_mm` about the origin.
-
-    Beads have attenuation 1 / `half_size_mm` (holder included), the holder 0.15 / `half_size_mm`.
-
-    Raises:
-        InputError: a size that is not positive.
-    """
+    """The phantom inside a cube of side 2 · `half_size_mm` (else InputError) about the origin: beads of attenuation 1 /
+    `half_size_mm` (holder included), the holder 0.15 / `half_size_mm`."""
     positive("half_size_mm", half_size_mm)
     unit = 1.0 / half_size_mm
     ax, ay, az = (a * half_size_mm for a in _HOLDER_AXES)

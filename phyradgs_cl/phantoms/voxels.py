@@ -1,7 +1,5 @@
 """A phantom that is a volume on a grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,16 +13,7 @@ from phyradgs_cl.fields.volume import Grid
 
 @dataclass(frozen=True, eq=False)
 class VoxelPhantom:
-    """Attenuation on a grid.
-
-    Args:
-        volume: (nz, ny, nx), 1/mm; kept as float32.
-        grid: where the voxels are.
-        name: what the phantom is called.
-
-    Raises:
-        InputError: shapes that differ, NaN or infinity.
-    """
+    """Attenuation (nz, ny, nx) float32 in 1/mm on a grid. InputError: shapes that differ, NaN or infinity."""
 
     volume: NDArray[np.float32]
     grid: Grid
@@ -37,11 +26,7 @@ class VoxelPhantom:
         object.__setattr__(self, "volume", np.ascontiguousarray(self.volume, dtype=np.float32))
 
     def voxelise(self, grid: Grid, supersampling: int = 1) -> NDArray[np.float32]:
-        """The volume (nz, ny, nx) itself, on its own grid; the counterpart of the analytic phantoms'.
-
-        Raises:
-            InputError: another grid; voxels are never resampled behind the user's back.
-        """
+        """The volume (nz, ny, nx) itself,  InputError for another grid: nothing is resampled."""
         if grid != self.grid:
             remedy = "make the phantom at this resolution and size"
             raise InputError(f"grid for phantom {self.name}", str(grid), str(self.grid), remedy)

@@ -3,10 +3,13 @@ from .preprocess import InputOptions as InputOptions
 from .registry import METHODS as METHODS
 from .registry import input_options as input_options
 from .registry import method_name as method_name
+from .registry import method_of as method_of
 from .registry import method_options as method_options
 from .registry import reconstruct as reconstruct
+from .registry import usual_preset as usual_preset
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
 from .result import Reconstruction as Reconstruction
 from .result import State as State
 from .result import ignore_progress as ignore_progress
+from .result import interrupted as interrupted

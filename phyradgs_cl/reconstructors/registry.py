@@ -1,4 +1,4 @@
-"""The methods by name. Adding one is a file that says its METHOD, and a line in METHODS."""
+"""The methods by name, and those of one's own. Adding one is a file that says its METHOD, and a line in METHODS."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from importlib import import_module
 from typing import Any
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.motion import MODELS
+from phyradgs_cl.acquisition import Exact, Motion, Scan
+from phyradgs_cl.acquisition.motion import MODELS, STILL, check_own_motion
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.method import Method
+from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.runtime import Runtime
@@ -20,6 +20,7 @@ from phyradgs_cl.text import near_miss
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
+_ALL = (*STILL, Exact())  # of methods of one's own
 
 
 class _Methods(MutableMapping[str, Method]):
@@ -66,36 +67,59 @@ METHODS = _Methods({
 
 
 def method_name(method: object) -> str:
-    """The name of a method in METHODS, however its letters are cased. Raises InputError for what is none."""
-    name = method.lower() if isinstance(method, str) else ""
-    if name not in METHODS:
-        raise InputError("--method", checks.shown(method), f"one of {', '.join(METHODS)}")
-    return name
+    """The name of a method: a key of METHODS, however its letters are cased, or ``package.module:name`` of one's own.
+
+    Raises InputError for what is none.
+    """
+    if isinstance(method, str) and method.lower() in METHODS:
+        return method.lower()
+    if callable(method):
+        return f"{getattr(method, '__module__', '')}:{getattr(method, '__qualname__', type(method).__name__)}"
+    if not isinstance(method, str) or ":" not in method:
+        expected = f"one of {', '.join(METHODS)}, or package.module:function of your own"
+        raise InputError("--method", checks.shown(method), expected, near_miss(method, METHODS, ""))
+    return method
 
 
-def method_options(method: str, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
+def method_of(method: object) -> Method:
+    """The method of that name; a function of one's own, itself or by ``package.module:name``, as a method.
+
+    Raises InputError for what is none, or cannot be imported.
+    """
+    name = method_name(method)
+    if name in METHODS:
+        return METHODS[name]
+    return own_method(name, imported(name) if isinstance(method, str) else method)
+
+
+def usual_preset(method: object) -> str:
+    """The name of the preset that a method has by itself."""
+    return next(iter(method_of(method).presets))
+
+
+def method_options(method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
     may be a model of one's own.
     Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
     """
-    method = method_name(method)
-    presets = METHODS[method].presets
-    name = next(iter(presets)) if preset is None else preset
-    if not isinstance(name, str) or name not in presets:
-        raise InputError("--preset", checks.shown(name), f"one of {', '.join(presets)} for --method {method}")
+    name, presets = method_name(method), method_of(method).presets
+    chosen = next(iter(presets)) if preset is None else preset
+    if not isinstance(chosen, str) or chosen not in presets:
+        raise InputError("--preset", checks.shown(chosen), f"one of {', '.join(presets)} for --method {name}")
     changes = dict(changes or {})
-    base = presets[name]
-    motion = changes.pop("motion", None)
-    counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
-    base = replace(base, motion=_motion(method, base, motion, counts))
-    return _changed(base, changes, f"--method {method}")
+    base = presets[chosen]
+    if hasattr(base, "motion"):
+        motion = changes.pop("motion", None)
+        counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
+        base = replace(base, motion=_motion(name, base, motion, counts))
+    return _changed(base, changes, f"--method {name}")
 
 
 def reconstruct(
     scan: Scan,
-    method: str,
+    method: object,
     rt: Runtime,
     options: Any = None,
     *,
@@ -104,21 +128,21 @@ def reconstruct(
     before: InputOptions | None = None,
     **extra: Any,
 ) -> Reconstruction:
-    """Runs a method by name; ``options`` as from ``method_options``, the method's default when None.
+    """Runs a method, by its name or a function of one's own; ``options`` as from ``method_options``, its default when None.
 
     ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing.
     """
-    method = method_name(method)
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
-        _check_ranks(method, rt)
+        _check_ranks(method_name(method), rt)
     ready = prepared(scan, InputOptions() if before is None else before)
-    return METHODS[method].run(ready, chosen, rt, seed=seed, report=report, **extra)
+    check_own_motion(getattr(chosen, "motion", None), ready)
+    return method_of(method).run(ready, chosen, rt, seed=seed, report=report, **extra)
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:
     """InputError where the method has no work for several ranks, or ranks would not come to the same numbers."""
-    if not METHODS[method].is_shared:
+    if method not in METHODS or not METHODS[method].is_shared:
         sharing = ", ".join(name for name, one in METHODS.items() if one.is_shared)
         found = f"{rt.ranks.size} ranks"
         raise InputError(f"--method {method}", found, f"one, or one of {sharing}", "start it without mpiexec")
@@ -135,14 +159,15 @@ def input_options(changes: Mapping[str, Any]) -> InputOptions:
     return _changed(InputOptions(), changes, "reconstruct")
 
 
-def motions_of(method: str) -> tuple[str, ...]:
+def motions_of(method: object) -> tuple[str, ...]:
     """The names of the motion models that a method takes."""
-    return tuple(_models(next(iter(METHODS[method].presets.values()))))
+    return tuple(_models(next(iter(method_of(method).presets.values()))))
 
 
 def _models(options: Any) -> dict[str, Any]:
     """The models of ``options`` by name, with what the preset says of its own."""
-    return {model.name: model for model in (*options.MOTIONS, options.motion)}
+    own = [options.motion] if hasattr(options.motion, "name") else []
+    return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
 
 def _has(model: Any, count: str) -> bool:
@@ -154,6 +179,8 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
     if callable(getattr(motion, "cells", None)) and not counts:
         return motion
     models = _models(options)
+    if motion is None and not hasattr(options.motion, "name"):
+        return options.motion
     name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
     if not isinstance(name, str) or name not in models:
         raise InputError("--motion", checks.shown(name), f"one of {', '.join(models)} for --method {method}")
@@ -197,7 +224,10 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
             remedy = near_miss(key, names, "leave it out")
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
         values[key] = _converted(known[key], value, f"{culprit}: option {key}")
-    return replace(options, **values)
+    try:
+        return replace(options, **values)
+    except (TypeError, ValueError) as error:  # of options of one's own, which check in their own way
+        raise InputError(culprit, str(error), "values that its options take") from error
 
 
 def _converted(current: Any, value: Any, culprit: str) -> Any:
@@ -212,6 +242,8 @@ def _converted(current: Any, value: Any, culprit: str) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
             raise InputError(culprit, checks.shown(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, culprit) for c, v in zip(current, value, strict=True))
+    if type(current) not in _EXPECTED:  # of options of one's own
+        return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
         raise InputError(culprit, checks.shown(value), expected)

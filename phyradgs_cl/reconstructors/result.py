@@ -5,25 +5,32 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from phyradgs_cl.acquisition import Scan
+    from phyradgs_cl.runtime import Runtime
 
 State = Mapping[str, np.ndarray]
 """What an interrupted run needs to go on, as named arrays: each method knows its own names."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
-    """A volume (nz, ny, nx) float32 in 1/mm on ``grid``.
+    """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, whose lengths are in mm.
 
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
-    was interrupted.
+    was interrupted. Raises InputError for a volume that is not the grid's.
     """
 
     volume: np.ndarray
@@ -33,13 +40,52 @@ class Reconstruction:
     facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, Grid):
+            raise InputError("grid", checks.shown(self.grid), "a Grid")
+        checks.shape("volume", self.volume, self.grid.shape)
+
+    def __repr__(self) -> str:
+        voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
+        of = f" of {self.gaussians.count} Gaussians" if self.gaussians is not None else ""
+        at = self.facts.get("interrupted_at")
+        way = f", interrupted at iteration {at}" if at is not None else ""
+        return f"Reconstruction({self.facts.get('method', 'a volume')}{of}, {voxels} voxels in {sides} mm{way})"
+
+    def plot(self, scan: Scan | None = None, *, frame: int = 0, device: str | Runtime | None = None) -> Figure:
+        """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.
+
+        scan: the result's; then also a frame, its residual and, where the scan has a reference (nz, ny, nx) in 1/mm, the
+        truth and the difference. device: what projects the volume for the residual.
+
+        Raises InputError for what is no scan, or a frame that it does not have.
+        """
+        from phyradgs_cl.reconstructors.plot import plot_result
+
+        return plot_result(self, scan, frame, device)
+
+
+def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
+    """A KeyboardInterrupt with the result so far as its attribute ``partial``; None where there is no volume yet.
+
+    No class of its own: Python ends by the signal, so that shells stop too, for exactly this one.
+    """
+    at = None if partial is None else partial.facts.get("interrupted_at")
+    when = "at its end" if at is None else f"after iteration {at}"
+    kept = f"{when}; the volume so far is the error's partial"
+    error = KeyboardInterrupt(f"interrupted {'before there was a volume' if partial is None else kept}")
+    error.partial = partial  # type: ignore[attr-defined]
+    return error
+
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of a running method: ``loss`` is what ``quantity`` names; 0 Gaussians where there are none.
+    """One report of a running method: ``iteration`` of ``iterations`` done, after so many ``seconds`` in s.
+
+    ``loss`` is what ``quantity`` names, dimensionless; ``gaussians``: how many, 0 where there are none.
 
     ``state`` makes what a run needs to go on from here, ``volume`` the present volume (nz, ny, nx) in 1/mm with its grid;
-    both are for the time of the report only.
+    both are for the time of the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does.
     """
 
     iteration: int
@@ -60,8 +106,9 @@ def ignore_progress(progress: Progress) -> None:
 
 
 def option_facts(options: Any) -> dict[str, object]:
-    """A method's options for the facts of its result."""
-    return {**asdict(options), "motion": motion_facts(options.motion)}
+    """A method's options for the facts of its result; those of one's own methods need no motion."""
+    own = {"motion": motion_facts(options.motion)} if hasattr(options, "motion") else {}
+    return {**asdict(options), **own}
 
 
 def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:

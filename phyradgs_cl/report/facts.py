@@ -1,7 +1,5 @@
 """Facts as words and numbers for people: labels with units, a few digits, nested tables flattened."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 
@@ -9,6 +7,7 @@ UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
 _RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # finer than anything a scanner knows
 _WORDS = {"psnr": "PSNR", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def flattened(facts: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
@@ -44,10 +43,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Four digits are more than a report's numbers deserve; powers of ten only where they save zeros.
-
-    What is a millionth of ``resolution`` or less is what rounding left of 0.
-    """
+    """Four digits at most, powers of ten only where they save zeros; a millionth of ``resolution`` or less is 0, rounded."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):
@@ -55,12 +51,8 @@ def number(value: float, resolution: float = 0.0) -> str:
     text = f"{value:.4g}"
     if "e" in text:
         mantissa, exponent = text.split("e")
-        text = f"{mantissa}·10{_superscript(int(exponent))}"
+        text = f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}"
     return text.replace("-", "−")
-
-
-def _superscript(exponent: int) -> str:
-    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def _text(value: object, resolution: float) -> str:

@@ -1,7 +1,5 @@
 """HTML and SVG built from elements, so that nothing from a file gets into a page unescaped."""
 
-from __future__ import annotations
-
 import html
 import json
 
@@ -16,20 +14,16 @@ VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """``<name attributes>children</name>``; children and attribute values that are no Markup are escaped.
-
-    Attributes that are None or False are left out, True stands without a value. Of their names underscores become dashes
-    and one at the end goes (``class_``); SVG's camel case is written as it is.
-    """
+    """``<name attributes>children</name>``; what is no Markup is escaped. Attributes that are None or False are left out,
+    True has no value; underscores in names become dashes, one at the end goes (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
-    if name in VOID:
-        return Markup(opening)
-    return Markup(f"{opening}{joined(*children)}</{name}>")
+    return Markup(opening) if name in VOID else Markup(f"{opening}{joined(*children)}</{name}>")
 
 
 def joined(*children: object) -> Markup:
     """Children one after the other, escaped where they are no Markup; None and empty ones add nothing."""
-    return Markup("".join(_escaped(child) for child in children if child is not None))
+    shown = (c if isinstance(c, Markup) else html.escape(_plain(c)) for c in children if c is not None)
+    return Markup("".join(shown))
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
@@ -51,10 +45,6 @@ def _attribute(key: str, value: object) -> str:
         return ""
     name = key.rstrip("_").replace("_", "-")
     return f" {name}" if value is True else f' {name}="{html.escape(_plain(value))}"'
-
-
-def _escaped(child: object) -> str:
-    return child if isinstance(child, Markup) else html.escape(_plain(child))
 
 
 def _plain(value: object) -> str:

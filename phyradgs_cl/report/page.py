@@ -1,7 +1,5 @@
 """A reconstruction as one HTML page that needs nothing but itself."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,16 +10,16 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.reconstructors.frame_pairs import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, element, joined, raw_text
 from phyradgs_cl.report.pictures.png import base64_of
-from phyradgs_cl.report.pictures.projections import View, computed_views
+from phyradgs_cl.report.pictures.projections import computed_views
 from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
-_HEADINGS = ("slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance")
 
 
 @np.errstate(all="ignore")  # absurd values are shown as they are
@@ -33,20 +31,11 @@ def write_report(
     scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page of a volume file, whole or not at all; returns what was found for it.
-
-    Args:
-        volume: a volume file of ours.
-        output: the page.
-        make_runtime: gives the device that projects the volume; not asked without a scan or with ``views`` 0.
-        scan: its scan; None takes the one that the volume's provenance names, if it is there unchanged.
-        views: frames that are projected from the volume and compared with the measurement.
-
-    Raises:
-        InputError: files that cannot be read, or are of another kind; an output that is one of them.
-        OutputError: the page cannot be written.
-        DeviceError: no device to project with.
-    """
+    """Writes the page ``output`` of a volume file, whole or not at all; returns what was found for it. ``scan`` None takes
+    the one that the volume's provenance names, if it is there unchanged; ``views`` frames of it are projected from the
+    volume, on the device of ``make_runtime``, which is not asked without any. InputError: files that cannot be read, or are
+    of another kind; an output that is one of them. OutputError: the page cannot be written. DeviceError: none to project
+    with."""
     check_writable(output)
     run = load_run(volume, scan)
     for path in (volume, run.scan_path):
@@ -59,19 +48,22 @@ def write_report(
     return run
 
 
-def report_page(run: Run, views: Sequence[View] = ()) -> str:
+def report_page(run: Run, views: Sequence[FramePair] = ()) -> str:
     """The page as text; ``views`` as from ``computed_views``."""
+    of_scan = {} if run.scan is None else {
+        "projections": sections.projections_section(run.scan, views),
+        "scan": sections.scan_section(run),
+        "geometry": sections.geometry_section(run.scan),
+        "shutter": sections.shutter_section(run, run.scan),
+    }  # fmt: skip
     parts = {
         "slices": sections.slices_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
-        "projections": sections.projections_section(run, views),
-        "scan": sections.scan_section(run),
-        "geometry": sections.geometry_section(run),
-        "shutter": sections.shutter_section(run),
+        **of_scan,
         "provenance": sections.provenance_section(run),
     }
-    there = {name: part for name in _HEADINGS if (part := parts[name]) is not None}
+    there = {name: part for name, part in parts.items() if part is not None}
     links = [element("a", name.capitalize(), href=f"#{name}") for name in there]
     skip = element("a", "To the content", href="#slices", class_="skip")
     body = joined(
@@ -80,7 +72,9 @@ def report_page(run: Run, views: Sequence[View] = ()) -> str:
         element("main", *_in_pairs(there)),
         element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
     )
-    return "<!doctype html>\n" + element("html", _head(_title(run)), _body(body), lang="en") + "\n"
+    title = f"{run.path.name} – {run.stored.provenance.get('method', 'volume')}"
+    page = element("body", body, raw_text("script", _file("page.js")))
+    return "<!doctype html>\n" + element("html", _head(title), page, lang="en") + "\n"
 
 
 def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
@@ -107,15 +101,6 @@ def _head(title: str) -> Markup:
     )
 
 
-def _body(content: Markup) -> Markup:
-    return element("body", content, raw_text("script", _file("page.js")))
-
-
-def _title(run: Run) -> str:
-    method = run.stored.provenance.get("method", "volume")
-    return f"{run.path.name} – {method}"
-
-
 def _top(run: Run) -> list[Markup]:
     title = run.scan.title if run.scan is not None else run.path.name
     motion = f", motion {motion_facts(run.motion)['name']}" if run.motion is not None else ""
@@ -129,7 +114,6 @@ def _top(run: Run) -> list[Markup]:
 
 
 def _tiles(run: Run) -> list[tuple[str, str]]:
-    """The numbers that one asks for first."""
     tiles = [("method", str(run.stored.provenance.get("method", "unknown"))[:40])]
     psnr, ssim = run.metrics.get("psnr_db"), run.metrics.get("ssim")
     if isinstance(psnr, int | float):

@@ -1,7 +1,5 @@
 """What a report is about: a stored volume, the scan that it comes from, and how the two compare."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,6 +14,7 @@ from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
+from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.text import plain_text
@@ -25,11 +24,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction with what is known about it.
-
-    scan, scan_path, scan_facts: where the scan was found; it has the volume's grid. reference (nz, ny, nx) 1/mm: the truth
-    on that. metrics: numbers by name. notes: what a reader should know about the page itself, a sentence each.
-    """
+    """A reconstruction and what is known of it. scan, scan_path, scan_facts: its scan, on the volume's grid, where found.
+    reference (nz, ny, nx) 1/mm: the truth on that. metrics: by name. notes: what to know about the page itself."""
 
     path: Path
     stored: StoredVolume
@@ -67,15 +63,12 @@ class Run:
     def record(self) -> list[dict[str, float]]:
         """The convergence record: finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
-        return [{k: float(v) for k, v in line.items() if _is_number(v)} for line in lines]
+        return [{k: float(v) for k, v in line.items() if NUMBER.fits(v)} for line in lines]
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
     """Reads a volume file and its scan: ``scan_path``, or the one that the provenance names if it is still the same.
-
-    Raises:
-        InputError: not a volume file of ours; a scan that is named and cannot be read.
-    """
+    InputError: not a volume file of ours; a scan that is named and cannot be read."""
     if (kind := file_kind(path)) != "volume":
         remedy = "reconstruct one with 'phyradgs reconstruct'"
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", remedy)
@@ -87,7 +80,6 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list[str]) -> Run:
-    """The run with its scan; what is missing is told in ``notes``."""
     found = scan_path or _scan_of(path, stored.provenance, notes)
     if found is None:
         return Run(path, stored, metrics=stored.metrics or {}, notes=tuple(notes))
@@ -96,9 +88,7 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
     known = stored.provenance.get("scan_sha256")
     facts = scan_summary(found, str(known) if scan_path is None else None)
     if known is not None and facts["sha256"] != known:
-        notes.append(
-            "The scan shown here is not the file that this volume was reconstructed from: its hash differs."
-        )
+        notes.append("The scan shown here is not the file that this volume was reconstructed from: its hash differs.")
     whole = read_scan(found, counts_to_attenuation)
     scan = whole.on_grid(stored.grid)
     if whole.reference is not None and scan.reference is None:
@@ -121,7 +111,3 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
                 return place
     notes.append(f"The scan {plain_text(named)} was not found, or has changed since; --scan names it.")
     return None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < 1e300)

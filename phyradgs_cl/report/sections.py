@@ -1,20 +1,18 @@
 """The sections of a page, each from a run to HTML; a section that has nothing to show is None."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow
+from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.reconstructors.frame_pairs import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report.charts.curve import convergence_charts
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
 from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
-from phyradgs_cl.report.pictures.projections import TIMES_PER_LINE, View
 from phyradgs_cl.report.pictures.slices import planes_of, windows_of
 from phyradgs_cl.report.pictures.viewer import viewer
 from phyradgs_cl.report.run import Run
@@ -34,7 +32,7 @@ def slices_section(run: Run) -> Markup:
     return _section("slices", "Slices", element("p", told + ".", class_="note"), viewer(planes, windows))
 
 
-def metrics_section(run: Run, views: Sequence[View]) -> Markup | None:
+def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
     """Numbers against the truth, and against the measurement where frames were computed."""
     facts: dict[str, object] = dict(run.metrics)
     if run.reference is not None:
@@ -51,61 +49,43 @@ def metrics_section(run: Run, views: Sequence[View]) -> Markup | None:
 
 def convergence_section(run: Run) -> Markup | None:
     charts = convergence_charts(run.record)
-    if not charts:
-        return None
-    return _section("convergence", "Convergence", _charts(charts))
+    return _section("convergence", "Convergence", _charts(charts)) if charts else None
 
 
-def scan_section(run: Run) -> Markup | None:
-    if run.scan is None:
-        return None
+def scan_section(run: Run) -> Markup:
     facts = {k: v for k, v in run.scan_facts.items() if k != "sha256"}
     return _section("scan", "Scan", element("div", facts_table(facts), class_="columns"))
 
 
-def geometry_section(run: Run) -> Markup | None:
-    if run.scan is None:
-        return None
-    above = "From above: where the source stands in the middle of every frame"
-    above += (
-        ", and the arc through which it moves in the first; grey, the panel at the arc's end."
-        if run.scan.is_fly
-        else "."
-    )
-    charts = [
-        (above, orbit_drawing(run.scan)),
-        ("From the side: the cone of the first frame.", side_drawing(run.scan)),
-    ]
-    return _section("geometry", "Geometry", _charts(charts))
+def geometry_section(scan: Scan) -> Markup:
+    arc = ", and the arc through which it moves in the first; grey, the panel at the arc's end"
+    above = f"From above: where the source stands in the middle of every frame{arc if scan.is_fly else ''}."
+    side = "From the side: the cone of the first frame."
+    return _section("geometry", "Geometry", _charts([(above, orbit_drawing(scan)), (side, side_drawing(scan))]))
 
 
-def shutter_section(run: Run) -> Markup | None:
-    if run.scan is None:
-        return None
-    words = shutter_words(run.scan)
+def shutter_section(run: Run, scan: Scan) -> Markup:
+    words = shutter_words(scan)
     one = words[0].upper() + words[1:] + "."
     if run.motion is not None:
         one += f" {_motion_words(run.motion)}"
     several = "The first frames on one axis of time."
-    charts = [(one, shutter_drawing(run.scan, run.motion)), (several, frames_drawing(run.scan))]
+    charts = [(one, shutter_drawing(scan, run.motion)), (several, frames_drawing(scan))]
     return _section("shutter", "Shutter in space and time", _charts(charts))
 
 
-def projections_section(run: Run, views: Sequence[View]) -> Markup | None:
+def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None:
     """Measured, computed and residual frames; one range of grey values for all, one of residuals."""
-    if not views or run.scan is None:
+    if not views:
         return None
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
-    shape = run.scan.geometry.detector_shape
-    proportion = (
-        shape[1] * run.scan.geometry.pixel_size_mm[1],
-        shape[0] * run.scan.geometry.pixel_size_mm[0],
-    )
+    shape, pitch_mm = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
+    proportion = shape[1] * pitch_mm[1], shape[0] * pitch_mm[0]
     told = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
     told += f"blue −{number(limit)}, red +{number(limit)}. "
-    if run.scan.is_fly:
+    if scan.is_fly:
         told += f"Every line is computed from the volume at {TIMES_PER_LINE} times of its own exposure."
     else:
         told += "Every frame is computed from its one pose."
@@ -126,13 +106,12 @@ def provenance_section(run: Run) -> Markup:
 
 def facts_table(facts: Mapping[str, object]) -> Markup:
     """A row per fact: name, value with unit."""
-    rows = list(flattened(facts))[:_MOST_ROWS]
-    cells = [(label(key), shown(value, unit(key))) for key, value in rows]
+    cells = [(label(key), shown(value, unit(key))) for key, value in list(flattened(facts))[:_MOST_ROWS]]
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in cells]
     return element("table", element("tbody", *lines))
 
 
-def _view(view: View, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
+def _view(view: FramePair, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
     residual = png_bytes(top_row_first(bytes_of(view.residual, -limit, limit)), diverging())
     pictures = [
         ("measured", png_bytes(top_row_first(bytes_of(view.measured, *window)))),
@@ -143,9 +122,8 @@ def _view(view: View, window: tuple[float, float], limit: float, proportion: tup
     figures = []
     for words, png in pictures:
         image = element("img", src=data_uri(png), alt=f"frame {view.frame}, {words}", style=style)
-        figures.append(
-            element("figure", element("div", image, class_="picture"), element("figcaption", words))
-        )
+        picture = element("div", image, class_="picture")
+        figures.append(element("figure", picture, element("figcaption", words)))
     return element("div", element("h3", f"Frame {view.frame}"), *figures, class_="view")
 
 

@@ -11,7 +11,10 @@ from phyradgs_cl.runtime.memory import (
     Room,
     SameArray,
     Traffic,
+    adopted,
     bytes_of,
+    is_cl_array,
+    lent,
     with_smaller_bricks,
 )
 from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
@@ -34,8 +37,11 @@ __all__ = [
     "SameArray",
     "Space",
     "Traffic",
+    "adopted",
     "bytes_of",
     "choose_device",
+    "is_cl_array",
+    "lent",
     "list_devices",
     "profile_text",
     "with_smaller_bricks",

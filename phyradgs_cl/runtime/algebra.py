@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 from typing import Protocol as Interface
@@ -70,6 +70,10 @@ class Space(Interface, Generic[A]):
         """√Σ x²."""
         ...
 
+    def sum_squares(self, arrays: Iterable[A]) -> float:
+        """Σ ‖x‖² over arrays that may be made on the way; one number comes back at the end."""
+        ...
+
     def largest(self, x: A, *, absolute: bool = False) -> float:
         """The largest x, or |x|."""
         ...
@@ -119,6 +123,9 @@ class HostSpace:
     def norm(self, x: np.ndarray) -> float:
         return norm(x)
 
+    def sum_squares(self, arrays: Iterable[np.ndarray]) -> float:
+        return sum(inner(x, x) for x in arrays)
+
     def largest(self, x: np.ndarray, *, absolute: bool = False) -> float:
         return float((np.abs(x) if absolute else x).max(initial=-np.inf))
 
@@ -137,6 +144,11 @@ class DeviceSpace:
 
     @cached_property
     def _whole(self) -> DeviceArray:
+        return self.rt.empty(1, np.float64)
+
+    @cached_property
+    def _total(self) -> DeviceArray:
+        """That of a sum over arrays, between which others are summed."""
         return self.rt.empty(1, np.float64)
 
     def empty(self, shape: Shape) -> DeviceArray:
@@ -190,17 +202,22 @@ class DeviceSpace:
 
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """x − ``step`` y/‖y‖, and x where y is 0; nothing comes back."""
-        self._sum(y, y)
+        self._sum(y, y, self._whole)
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
     def inner(self, x: DeviceArray, y: DeviceArray) -> float:
-        self._sum(x, y)
-        whole = self.rt.download(self._whole)
-        return float(whole[0] if self.rt.fp64 else whole.view(np.float32).astype(np.float64).sum())
+        self._sum(x, y, self._whole)
+        return self._read(self._whole)
 
     def norm(self, x: DeviceArray) -> float:
         return self.inner(x, x) ** 0.5
+
+    def sum_squares(self, arrays: Iterable[DeviceArray]) -> float:
+        count = 0
+        for count, x in enumerate(arrays, start=1):
+            self._sum(x, x, self._total, add=count > 1)
+        return self._read(self._total) if count else 0.0
 
     def largest(self, x: DeviceArray, *, absolute: bool = False) -> float:
         groups = self._reduce("largest_parts", x, np.int32(absolute), scratch=4)
@@ -216,13 +233,17 @@ class DeviceSpace:
         )
         return result
 
-    def _sum(self, x: DeviceArray, y: DeviceArray) -> None:
-        """Σ x y into ``_whole``, on the device alone."""
+    def _read(self, number: DeviceArray) -> float:
+        values = self.rt.download(number)
+        return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
+
+    def _sum(self, x: DeviceArray, y: DeviceArray, whole: DeviceArray, *, add: bool = False) -> None:
+        """Σ x y into a number, or onto it, on the device alone."""
         groups = self._reduce("dot_parts", x, y, scratch=8)
         group = self.rt.group(1, _GPU_GROUP)
         kernel = self.rt.kernel("algebra", "dot_whole")
         scratch = self.rt.local(8 * group)
-        self.rt.launch(kernel, group, self._parts, np.int32(groups), scratch, self._whole, group=group)
+        self.rt.launch(kernel, group, self._parts, np.int32(groups), np.int32(add), scratch, whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
         """The first level of a sum over the first array: how many groups have a result in ``_parts``."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import re
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -162,3 +163,35 @@ def with_smaller_bricks(what: str, attempt: Callable[[float], T]) -> T:
         said = str(error)  # a log that kept the error itself would keep the buffers of the attempt
     log.warning("%s: %s; trying again with smaller bricks", what, said)
     return attempt(_SMALLER)
+
+
+def is_cl_array(value: object) -> bool:
+    """Whether a value is an Array of pyopencl, which who has one has loaded."""
+    module = sys.modules.get("pyopencl.array")
+    return module is not None and isinstance(value, module.Array)
+
+
+def adopted(name: str, array: Any, queue: cl.CommandQueue) -> DeviceArray:
+    """A float32 Array of pyopencl (C order) as a DeviceArray on its own memory; a part of another is copied on the device.
+
+    Raises InputError for one of another context, queue or type, of which ``name`` is the culprit.
+    """
+    remedy = "make it with the operator's to_device, or on its queue"
+    if array.context != queue.context:
+        raise InputError(name, "an Array of another OpenCL context", "one of the operator's own", remedy)
+    if array.queue not in (None, queue):
+        raise InputError(name, "an Array on another queue", "one on the operator's own", remedy)
+    if array.dtype != np.float32 or not array.flags.c_contiguous:
+        order = "" if array.flags.c_contiguous else ", not in C order"
+        raise InputError(name, f"an Array of {array.dtype}{order}", "float32 in C order", "convert it on the device")
+    whole = array.with_queue(queue).copy() if array.offset else array
+    return DeviceArray(whole.base_data, tuple(array.shape), array.dtype)
+
+
+def lent(array: DeviceArray, queue: cl.CommandQueue) -> Any:
+    """A DeviceArray as an Array of pyopencl on the same memory, which the ledger counts for as long as the Array lives."""
+    import pyopencl.array
+
+    shared = pyopencl.array.Array(queue, array.shape, array.dtype, data=array.buffer)
+    shared.memory_of = array  # type: ignore[attr-defined]
+    return shared

@@ -1,7 +1,5 @@
 """From two volumes to numbers and a picture."""
 
-from __future__ import annotations
-
 import logging
 import math
 from pathlib import Path
@@ -13,9 +11,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.io.volume import interruption
 from phyradgs_cl.metrics import compare, resampled, slices_png
-from phyradgs_cl.reconstructors.interrupt import (
-    finish_despite_interrupt,
-)
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
 
@@ -24,10 +20,8 @@ log = logging.getLogger(__name__)
 
 @np.errstate(all="ignore")
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
-    """Compares a volume with a scan's reference or another volume and writes the picture of slices.
-
-    On another grid it is resampled onto the reference's; values without a grid are compared voxel by voxel.
-    """
+    """Compares a volume with a scan's reference or another volume, onto whose grid it is resampled, and writes the
+    picture of slices; values without a grid are compared voxel by voxel."""
     refuse_overwriting("--picture", picture, volume_path, reference_path)
     if picture.suffix.lower() != ".png":
         raise InputError("--picture", str(picture), "a file name that ends in .png")
@@ -48,8 +42,11 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
     metrics = compare(volume, reference)
     title = f"{provenance.get('method', 'volume')}: {volume_path.name}"
-    with finish_despite_interrupt():
-        _write_picture(picture, volume, reference, title)
+    with finish_despite_interrupt(), written_beside(picture) as temporary:
+        try:
+            slices_png(temporary, volume, reference, title)
+        except OutputError as error:  # names the temporary file; what the disk says is behind it
+            raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
     return {**metrics, **known, **interruption(provenance), **told, **files}
@@ -61,12 +58,3 @@ def _place(grid: Grid) -> str:
     digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
     words = f"{'×'.join(map(str, counts))} voxels of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
     return f"{words} about ({', '.join(f'{round(o, digits) + 0.0:g}' for o in offsets)}) mm"
-
-
-def _write_picture(picture: Path, volume: np.ndarray, reference: np.ndarray, title: str) -> None:
-    """The picture, whole or not at all."""
-    with written_beside(picture) as temporary:
-        try:
-            slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # names the temporary file; what the disk says is behind it
-            raise error.__cause__ or error from None

@@ -1,7 +1,5 @@
 """Files by what they are: scans, references and volumes, and what each says of itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,13 +11,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import (
-    file_kind,
-    read_scan,
-    read_volume,
-    scan_summary,
-    volume_summary,
-)
+from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 from phyradgs_cl.io.hdf5.source import open_hdf5
 
@@ -88,9 +80,8 @@ def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
-            raise InputError(
-                f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth"
-            )
+            expected = "a scan with a known truth"
+            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
         return scan.reference, scan.grid
     volume, grid, _ = load_result(path)
     return volume, grid

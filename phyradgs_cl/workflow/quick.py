@@ -1,13 +1,11 @@
 """A first comparison on one's own machine: a sweep over fly-scans of two built-in phantoms, in a minute or two."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
 from phyradgs_cl import checks
-from phyradgs_cl.errors import OutputError
-from phyradgs_cl.reconstructors import METHODS
+from phyradgs_cl.io.output import make_folder
+from phyradgs_cl.reconstructors import usual_preset
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import scanner_for, scanner_options
 from phyradgs_cl.workflow.simulate import SimulationJob, run_simulation
@@ -28,24 +26,17 @@ _ROWS: tuple[tuple[str, Table], ...] = (
 def quick_grid(
     folder: Path, make_runtime: Callable[[], Runtime], *, seed: int = 0, iterations: int = ITERATIONS
 ) -> SweepGrid:
-    """Simulates what is missing of the scans in ``folder``/scans; every method, with and without motion, on each.
-
-    seed: of noise, cloud and frame order. iterations: of the splatting methods. Raises OutputError for a folder that cannot
-    be made.
-    """
+    """Simulates what is missing of the scans in ``folder``/scans; every method, with and without motion, on each. seed:
+    of noise, cloud and frame order; iterations: of splats. OutputError for a folder that cannot be made."""
     checks.within("--iterations", iterations, 0, 10_000_000)
     settings = []
     for method, motion in _ROWS:
         splats = {"iterations": iterations} if method in ("r2", "phyradgs") else {}
-        settings.append(Setting(method, next(iter(METHODS[method].presets)), {**motion, **splats}, {}))
+        settings.append(Setting(method, usual_preset(method), {**motion, **splats}, {}))
     scans = {name: folder / "scans" / f"{name}_seed{seed}.h5" for name in PHANTOMS}
     missing = [name for name, path in scans.items() if not path.exists()]
     if missing:
-        try:
-            (folder / "scans").mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise OutputError(str(folder), found, "a folder that can be written") from error
+        make_folder(folder / "scans", folder)
         rt = make_runtime()
         for name in missing:
             _simulate(scans[name], name, seed, rt)

@@ -1,7 +1,5 @@
 """From a scan file to a volume file, with checkpoints on the way."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -9,7 +7,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +37,11 @@ from phyradgs_cl.reconstructors import (
     ProgressReport,
     Reconstruction,
     State,
+    method_of,
     method_options,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.interrupt import (
-    finish_despite_interrupt,
-    keep_finished_work,
-)
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
@@ -57,7 +53,7 @@ _FOREIGN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".npy", ".npz", ".tif", 
 
 @dataclass(frozen=True)
 class ReconstructionJob:
-    """Which scan to reconstruct by which method, a name of METHODS, into which file."""
+    """Which scan to reconstruct by which method, as from ``method_name``, into which file."""
 
     scan: Path
     output: Path
@@ -75,11 +71,8 @@ class ReconstructionJob:
 
 
 class _Keeper:
-    """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end.
-
-    There is one checkpoint per run: it is replaced in one step, so that a kill at any moment leaves the last whole one.
-    Where it cannot be written the run goes on, since that is what the work is worth.
-    """
+    """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end. It is replaced
+    in one step, so that a kill leaves the last whole one; where it cannot be written the run goes on."""
 
     def __init__(self, path: Path, fingerprint: str, every_s: float, report: ProgressReport) -> None:
         self.path, self.fingerprint, self.every_s, self.report = path, fingerprint, every_s, report
@@ -126,10 +119,9 @@ def run_reconstruction(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
 
-    An interrupted run leaves what is at ``output`` alone: it writes the volume as far as it got to ``io.partial_path``, and
-    a checkpoint that ``resume`` continues; both go when a run has come to its end. A run that is killed leaves its last
-    checkpoint. Raises OutputError while another run is at work on the same output.
-    Of ``ranks``, which the runtime must have too, rank 0 alone writes; the others have no metrics.
+    An interrupted run leaves ``output`` alone: what it has goes to ``io.partial_path``, and a checkpoint that ``resume``
+    continues; both go when a run ends. One that is killed leaves its last checkpoint. Of ``ranks``, which the runtime must
+    have too, rank 0 alone writes and has metrics. Raises OutputError while another run is at work on the output.
     """
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes)
@@ -167,7 +159,9 @@ def _reconstructed(
                 return result, metrics
             with finish_despite_interrupt():
                 metrics = _metrics(scan, result)
-                _write_result(job, result, metrics, _provenance(result, scan_hash, job, rt))
+                path = job.output if result.state is None else partial_path(job.output)
+                told = _provenance(result, scan_hash, job, rt)
+                write_volume(path, result.volume, result.grid, told, result.gaussians, metrics or None)
                 _keep_checkpoint(job, result, fingerprint)
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
@@ -185,12 +179,9 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     """Says what can be reconstructed, but is hardly what was meant."""
-    motion = options.motion
-    if (
-        scan.detector_model == "intensity"
-        and not hasattr(options, "detector_model")
-        and _averages(scan, options)
-    ):
+    motion = getattr(options, "motion", None)
+    is_ignored = scan.detector_model == "intensity" and not hasattr(options, "detector_model")
+    if is_ignored and _averages(scan, options):
         found = "%s averages intensity over an exposure; --method %s averages line integrals"
         log.warning(found, job.scan, job.method)
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
@@ -202,9 +193,7 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
         log.warning(found, job.scan, job.method)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:
-        found = (
-            "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
-        )
+        found = "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
         log.warning(found, job.scan, late[0] + 1, late[0])
     if (largest := float(scan.projections.max())) <= 0:
         found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
@@ -213,15 +202,16 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
 
 def _averages(scan: Scan, options: Any) -> bool:
     """Whether the method merges several poses into a line: of one pose, both detector models are the same."""
+    if not hasattr(options, "motion"):
+        return False
     cells = options.motion.cells(scan, 0)
     return cells.is_moving or cells.averages
 
 
 def profile_report(rt: Runtime, result: Reconstruction) -> str:
     """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
-    uses = rt.kernel_uses()
     pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
-    return profile_text(uses, float(result.facts["seconds"]), rt.best_rates(), pairs)
+    return profile_text(rt.kernel_uses(), float(result.facts["seconds"]), rt.best_rates(), pairs)
 
 
 def _refuse_foreign_suffix(output: Path) -> None:
@@ -230,13 +220,6 @@ def _refuse_foreign_suffix(output: Path) -> None:
     if ending is not None:
         remedy = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as volume.h5", remedy)
-
-
-def _write_result(
-    job: ReconstructionJob, result: Reconstruction, metrics: dict[str, float], provenance: dict[str, object]
-) -> None:
-    path = job.output if result.state is None else partial_path(job.output)
-    write_volume(path, result.volume, result.grid, provenance, result.gaussians, metrics or None)
 
 
 def _provenance(
@@ -263,11 +246,10 @@ def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
 
 
 def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
-    resumable = [name for name, method in METHODS.items() if method.is_resumable]
-    if job.method not in resumable:
-        raise InputError(
-            "--resume", f"--method {job.method}", f"a method with checkpoints: {', '.join(resumable)}"
-        )
+    if not method_of(job.method).is_resumable:
+        resumable = [name for name, method in METHODS.items() if method.is_resumable]
+        expected = f"a method with checkpoints: {', '.join(resumable)}"
+        raise InputError("--resume", f"--method {job.method}", expected)
     return read_checkpoint(checkpoint_path(job.output), fingerprint)
 
 
@@ -289,3 +271,23 @@ def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint
                 outdated.unlink()
     else:
         write_checkpoint(path, dict(result.state), fingerprint)
+
+
+def go_on(
+    job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
+) -> tuple[Reconstruction, dict[str, float]]:
+    """As ``run_reconstruction``; a checkpoint of another scan or other options, or a damaged one, is set aside."""
+    checkpoint = checkpoint_path(job.output)
+    if checkpoint.is_file() and method_of(job.method).is_resumable:
+        try:
+            return run_reconstruction(replace(job, resume=True), make_runtime, report)
+        except InputError as error:
+            named = ("--resume", str(checkpoint))
+            if error.culprit not in named and not error.culprit.startswith("checkpoint"):
+                raise
+    return run_reconstruction(replace(job, resume=False), make_runtime, report)
+
+
+def is_whole(result: Reconstruction) -> bool:
+    """Whether the run came to its end; a stopped one has left a checkpoint."""
+    return result.facts.get("interrupted_at") is None

@@ -1,7 +1,5 @@
 """From a phantom or volume to a scan file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +10,7 @@ from phyradgs_cl.acquisition import PROTOCOLS, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import LoadedVolume, Scanner, check_writable, only_run, write_scan
-from phyradgs_cl.reconstructors.interrupt import (
-    finish_despite_interrupt,
-)
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
 from phyradgs_cl.workflow.files import expecting, refuse_overwriting
@@ -67,15 +63,9 @@ def run_simulation(
         if job.volume is not None:
             with expecting(job.volume, "plain-volume", "volume"):
                 of = load_attenuation(job.volume)
+        name = f"volume {job.volume}"
         scan = simulated_scan(
-            rt,
-            of,
-            scanner,
-            options,
-            size=job.size,
-            pixel_samples=job.pixel_samples,
-            name=f"volume {job.volume}",
-            report=report,
+            rt, of, scanner, options, size=job.size, pixel_samples=job.pixel_samples, name=name, report=report
         )
         with finish_despite_interrupt():
             write_scan(job.output, scan)

@@ -47,29 +47,20 @@ def micro_views(strips: int, sub_intervals: int):
     return micro_view_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, strips, sub_intervals)
 
 
-def test_cells_that_only_touch_share_a_layer() -> None:
+def test_layers_hold_every_lines_weights_once_and_no_cell_needs_none() -> None:
+    """Cells that only touch share a layer."""
     np.testing.assert_array_equal(micro_views(3, 1).layer_numbers, 0)
-    table = micro_views(2, 3)
-    assert sorted(table.layer_numbers) == [0, 0, 1, 1, 2, 2]
-
-
-@pytest.mark.parametrize(
-    "table", [micro_views(3, 2), exact_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, 4)]
-)
-def test_layers_hold_every_lines_weights_once(table) -> None:
-    numbers = table.layer_numbers
-    weights = table.layer_weights
-    assert weights.shape == (numbers.max() + 1, LINES)
-    np.testing.assert_allclose(weights.sum(0), table.line_weights(), rtol=0, atol=FLOAT64)
-    for line in range(LINES):
-        serving = [c for c in range(table.count) if table.line_start[c] <= line < table.line_stop[c]]
-        assert len({int(numbers[c]) for c in serving}) == len(serving)
-        for cell in serving:
-            share = 1.0 if table.line_times is None else table.line_times[cell, 2, line]
-            assert weights[numbers[cell], line] == table.weight[cell] * share
-
-
-def test_no_cell_needs_no_layer() -> None:
+    assert sorted(micro_views(2, 3).layer_numbers) == [0, 0, 1, 1, 2, 2]
+    for table in (micro_views(3, 2), exact_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES, 4)):
+        numbers, weights = table.layer_numbers, table.layer_weights
+        assert weights.shape == (numbers.max() + 1, LINES)
+        np.testing.assert_allclose(weights.sum(0), table.line_weights(), rtol=0, atol=FLOAT64)
+        for line in range(LINES):
+            serving = [c for c in range(table.count) if table.line_start[c] <= line < table.line_stop[c]]
+            assert len({int(numbers[c]) for c in serving}) == len(serving)
+            for cell in serving:
+                share = 1.0 if table.line_times is None else table.line_times[cell, 2, line]
+                assert weights[numbers[cell], line] == table.weight[cell] * share
     none = np.zeros(0, np.int32)
     one = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
     empty = replace(one, line_start=none, line_stop=none, weight=np.zeros(0))
@@ -149,13 +140,13 @@ def in_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """The panel turned about its normal."""
     u, v = pose[:, 6:9] / 0.5, pose[:, 9:12] / 0.6
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return np.concatenate([0.5 * (cos * u + sin * v), 0.6 * (cos * v - sin * u)], 1)
+    return np.concatenate([pose[:, :6], 0.5 * (cos * u + sin * v), 0.6 * (cos * v - sin * u)], 1)
 
 
 def tipped(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """The panel turned about its rows."""
     v = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
-    return np.concatenate([pose[:, 6:9], 0.6 * v], 1)
+    return np.concatenate([pose[:, :9], 0.6 * v], 1)
 
 
 def in_a_tilted_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -165,90 +156,54 @@ def in_a_tilted_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return in_plane(tilted, angle)
 
 
-@pytest.mark.parametrize("steps", [in_plane, tipped, in_a_tilted_plane])
+def source_alone(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    return np.concatenate([GEOMETRY.pose(0.1 + 0.75 + angle)[:, :3], pose[:, 3:]], 1)
+
+
+@pytest.mark.parametrize("steps", [in_plane, tipped, in_a_tilted_plane, source_alone])
 def test_a_panel_that_turns_about_itself_needs_segments_too(steps) -> None:
-    """By 0.25 rad/s, as the orbit; the source stands. The number follows from the turn, 0.35 rad, and the bound."""
+    """By 0.25 rad/s, as the orbit, or the source alone. The number follows from the turn, 0.35 rad, and the bound."""
 
     class Turning:
         def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
             pose = np.tile(GEOMETRY.pose(0.0), (np.size(time_s), 1))
-            pose[:, 6:] = steps(pose, 0.25 * (np.asarray(time_s) - 3.0))
-            return pose
+            return steps(pose, 0.25 * (np.asarray(time_s) - 3.0))
 
     where = (Shutter(0.8, 0.6), 0, 3.0, 0.001)
-    assert (
-        segments_for(Turning(), *where)
-        == segments_for(ORBIT, *where)
-        == np.ceil(0.35 * np.sqrt(0.32 / 0.001))
-    )
+    count = np.ceil(0.35 * np.sqrt(0.32 / 0.001))
+    assert segments_for(Turning(), *where) == segments_for(ORBIT, *where) == count
 
 
-def test_a_source_that_turns_alone_needs_as_many_segments() -> None:
-    class Turning:
-        def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-            pose = ORBIT.pose(frame, time_s)
-            pose[:, 3:] = GEOMETRY.pose(0.0)[3:]
-            return pose
-
-    where = (Shutter(0.8, 0.6), 0, 3.0, 0.001)
-    assert segments_for(Turning(), *where) == segments_for(ORBIT, *where)
-
-
-def test_one_segment_of_a_gantry_at_rest() -> None:
+def test_a_gantry_at_rest_is_one_cell_of_all_lines() -> None:
     at_rest = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0))
     assert exact_cells(at_rest, Shutter(0.8, 0.6), 0, 3.0, LINES, 1).end_poses is None
+    table = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
+    assert (table.count, table.line_start[0], table.line_stop[0], table.weight[0]) == (1, 0, LINES, 1.0)
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        GEOMETRY,
-        ORBIT,
-        ORBIT.kinematics,
-        SpeedRamp(0.0, 1.0, 0.5),
-        EncoderTable(np.arange(2.0), np.arange(2.0)),
-        FrameSweeps(np.zeros(1), 1.0, np.zeros(1), np.ones(1)),
-        PoseTable(np.arange(2.0), GEOMETRY.pose(np.arange(2.0))),
-        MicroViews(),
-        Protocol(),
-        Shutter(0.8),
-        a_scan(),
-        static_cells(ORBIT, Shutter(0.8), 0, 3.0, LINES),
-    ],
-)
-def test_geometry_and_timing_are_values(value) -> None:
-    with pytest.raises(FrozenInstanceError):
-        setattr(value, fields(value)[0].name, None)
-
-
-def test_what_holds_arrays_is_compared_by_what_it_is() -> None:
-    """Equality of arrays is an array: these are equal to themselves alone, and can be keys."""
+def test_geometry_and_timing_are_values() -> None:
+    """What holds arrays, whose equality is an array, is equal to itself alone; all can be keys."""
     times = np.array([0.0, 1.0])
-    made = [lambda: EncoderTable(times, times), lambda: FrameSweeps(times, 1.0, times, times)]
-    made += [
+    arrays = [
+        lambda: EncoderTable(times, times), lambda: FrameSweeps(times, 1.0, times, times), a_scan,
         lambda: PoseTable(times, GEOMETRY.pose(times)),
         lambda: CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0)),
         lambda: static_cells(ORBIT, Shutter(0.8), 0, 3.0, LINES),
-        a_scan,
-    ]
-    for make in made:
+    ]  # fmt: skip
+    for make in arrays:
         one, other = make(), make()
         assert one == one and one != other and len({one, other}) == 2
-
-
-def test_a_static_table_is_one_cell_of_all_lines() -> None:
-    table = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
-    assert (table.count, table.line_start[0], table.line_stop[0], table.weight[0]) == (1, 0, LINES, 1.0)
+    plain = [GEOMETRY, ORBIT.kinematics, SpeedRamp(0.0, 1.0, 0.5), MicroViews(), Protocol(), Shutter(0.8)]
+    for value in [*plain, *(make() for make in arrays)]:
+        with pytest.raises(FrozenInstanceError):
+            setattr(value, fields(value)[0].name, None)
 
 
 def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
     assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
     for model, name, lowest, highest in (
-        (MicroViews, "strips", 1, 10_000),
-        (MicroViews, "sub_intervals", 1, 10_000),
-        (PerRow, "sub_intervals", 1, 10_000),
-        (Exact, "segments", 0, 1000),
-        (Exact, "time_error", 1e-6, 1),
+        (MicroViews, "strips", 1, 10_000), (MicroViews, "sub_intervals", 1, 10_000),
+        (PerRow, "sub_intervals", 1, 10_000), (Exact, "segments", 0, 1000), (Exact, "time_error", 1e-6, 1),
     ):
         for inside in (lowest, highest):
             assert getattr(model(**{name: inside}), name) == inside

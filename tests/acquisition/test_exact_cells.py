@@ -24,11 +24,8 @@ START_S = 3.0
 SPEED_RAD_PER_S = 0.25
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, SPEED_RAD_PER_S))
 SHUTTERS = {
-    "rolling": Shutter(0.8, 0.6),
-    "backwards": Shutter(0.8, 0.6, "rows", -1),
-    "slow readout": Shutter(0.2, 1.6),
-    "global": Shutter(0.8, 0.0),
-    "a moment": Shutter(0.0, 0.6),
+    "rolling": Shutter(0.8, 0.6), "backwards": Shutter(0.8, 0.6, "rows", -1),
+    "slow readout": Shutter(0.2, 1.6), "global": Shutter(0.8, 0.0), "a moment": Shutter(0.0, 0.6),
     "pulsed": Shutter(0.8, 0.6, pulse_s=(0.5, 0.4)),
     "pulse that misses lines": Shutter(0.2, 0.6, pulse_s=(0.3, 0.1)),
 }
@@ -60,6 +57,8 @@ def test_segments_hold_every_window_once(shutter, segments) -> None:
 def test_poses_are_those_of_the_middle_and_both_ends() -> None:
     table = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 4)
     length_s = 1.4 / 4
+    assert table.layer_numbers.max() > 0  # segments begin at different lines and still meet in one
+    assert exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 1).layer_numbers.max() == 0
     np.testing.assert_allclose(table.pose, ORBIT.pose(0, table.time_s), rtol=0, atol=FLOAT64)
     for end, sign in ((0, -1), (1, 1)):
         expected = ORBIT.pose(0, table.time_s + sign * length_s / 2)
@@ -71,59 +70,39 @@ def test_what_does_not_move_is_one_static_cell() -> None:
     for orbit, shutter in ((at_rest, Shutter(0.8, 0.6)), (ORBIT, Shutter(0.0, 0.0))):
         table = exact_cells(orbit, shutter, 0, START_S, LINES, 5)
         expected = static_cells(orbit, shutter, 0, START_S, LINES)
-        assert table.end_poses is None and table.count == 1
+        assert table.end_poses is None and table.count == 1 and table.layer_numbers.max() == 0
         np.testing.assert_array_equal(table.pose, expected.pose)
 
 
-def test_segments_follow_from_bound_and_turn() -> None:
+def test_segments_follow_from_bound_turn_and_contrast() -> None:
     where = (Shutter(0.8, 0.6), 0, START_S)
     counts = [segments_for(ORBIT, *where, bound) for bound in (1.0, 0.02, 0.005, 0.00125)]
     assert counts[0] == 1 and counts == sorted(counts) and counts[3] == pytest.approx(2 * counts[2], abs=1)
     faster = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 3 * SPEED_RAD_PER_S))
     assert segments_for(faster, *where, 0.005) == pytest.approx(3 * counts[2], abs=2)
     assert segments_for(CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0)), *where, 0.005) == 1
+    assert segments_for(ORBIT, *where, 1e-9) == 1000  # there are never more
+    where = (ORBIT, Shutter(0.8, 0.6), 0, START_S, 0.0005)
+    counts = [segments_for(*where, peak) for peak in (0.0, 4.0, 8.0, 16.0)]
+    assert counts[0] == counts[1] < counts[2] < counts[3] <= 2 * counts[0]
 
 
-def test_the_fastest_part_of_a_frame_counts() -> None:
+def test_the_fastest_of_32_parts_of_a_frame_counts() -> None:
     times_s = np.array([0.0, START_S + 0.7, START_S + 1.4, 10.0])
     angles_rad = np.array([0.0, 0.0, 0.35, 0.35])  # at rest, then twice the mean speed, then at rest
     jerky = CircularOrbit(GEOMETRY, EncoderTable(times_s, angles_rad))
     steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 0.5))
     where = (Shutter(0.8, 0.6), 0, START_S, 0.002)
     assert segments_for(jerky, *where) == segments_for(steady, *where) > 1
-
-
-def test_the_fastest_is_sought_in_32_parts() -> None:
-    """A gantry that speeds up from rest turns by a/2 (1 − (31/32)²) in the last part; 64 parts would give 76 segments."""
     ramp = CircularOrbit(GEOMETRY, SpeedRamp(0.0, 0.0, 3.0))
     fastest_rad = 32 * 1.5 * (1 - (31 / 32) ** 2)
     assert segments_for(ramp, Shutter(0.4, 0.6), 0, 0.0, 0.0005) == 75
     assert 74 < fastest_rad * np.sqrt(0.32 / 0.0005) < 75
 
 
-def test_there_are_never_more_than_1000_segments() -> None:
-    assert segments_for(ORBIT, Shutter(0.8, 0.6), 0, START_S, 1e-9) == 1000
-
-
-@pytest.mark.parametrize(
-    ("change", "option"), [({"segments": -1}, "--segments"), ({"time_error": 0.0}, "--time-error")]
-)
-def test_impossible_numbers_are_named(change, option) -> None:
-    with pytest.raises(InputError, match=option):
-        Exact(**change)
+def test_impossible_numbers_are_named() -> None:
+    for option in ("segments", "time_error"):
+        with pytest.raises(InputError, match=f"--{option.replace('_', '-')}"):
+            Exact(**{option: -1 if option == "segments" else 0.0})
     with pytest.raises(InputError, match="segments"):
         exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 0)
-
-
-def test_averaged_intensities_take_more_segments_where_contrast_is_high() -> None:
-    where = (ORBIT, Shutter(0.8, 0.6), 0, START_S, 0.0005)
-    counts = [segments_for(*where, peak) for peak in (0.0, 4.0, 8.0, 16.0)]
-    assert counts[0] == counts[1] < counts[2] < counts[3] <= 2 * counts[0]
-
-
-def test_segments_that_begin_at_different_lines_still_meet_in_one_line() -> None:
-    """What decides whether a detector's averaging matters: not where cells begin, but whether a line has two."""
-    meeting = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 4)
-    assert meeting.layer_numbers.max() > 0
-    alone = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 1)
-    assert alone.layer_numbers.max() == 0

@@ -22,73 +22,45 @@ RIGID_TOLERANCE_MM = 1e-9  # slerp in float64 at 1.5 m
 TIMES_S = np.array([0.0, 0.4, 1.3, 2.9])
 
 
-def test_constant_speed_and_ramp() -> None:
+def test_constant_speed_ramps_and_sweeps_that_go_on_through_the_readout() -> None:
     np.testing.assert_allclose(ConstantSpeed(0.5, -0.2).angle_rad(3, TIMES_S), [0.5, 0.42, 0.24, -0.08])
     ramp = SpeedRamp(0.5, 0.2, 0.1).angle_rad(0, TIMES_S)
     np.testing.assert_allclose(ramp, [0.5, 0.588, 0.8445, 1.5005])
-    np.testing.assert_array_equal(
-        SpeedRamp(0.5, 0.2, 0.0).angle_rad(0, TIMES_S), ConstantSpeed(0.5, 0.2).angle_rad(0, TIMES_S)
-    )
-
-
-def test_encoder_is_linear_between_its_samples() -> None:
-    table = EncoderTable([0.0, 1.0, 3.0], [0.0, 0.2, 1.0])
-    np.testing.assert_allclose(
-        table.angle_rad(0, np.array([0.0, 0.5, 1.0, 2.0, 3.0])), [0, 0.1, 0.2, 0.6, 1.0]
-    )
-
-
-@pytest.mark.parametrize("time_s", [-0.01, 3.01])
-def test_tables_are_never_continued(time_s) -> None:
-    encoder = EncoderTable([0.0, 1.0, 3.0], [0.0, 0.2, 1.0], "scan.h5:/kinematics")
-    poses = PoseTable([0.0, 1.0, 3.0], GEOMETRY.pose(np.array([0.0, 0.2, 1.0])), "scan.h5:/poses")
-    with pytest.raises(InputError, match=r"scan.h5:/kinematics: found frame 5 needs"):
-        encoder.angle_rad(5, np.array([1.0, time_s]))
-    with pytest.raises(InputError, match=r"scan.h5:/poses: found frame 5 needs"):
-        poses.pose(5, np.array([1.0, time_s]))
-
-
-def test_rounding_of_stored_times_is_forgiven() -> None:
-    time_s = np.array([0.1, 3.3])
-    encoder, poses = EncoderTable(time_s, [0.0, 1.0]), PoseTable(time_s, GEOMETRY.pose(np.array([0.0, 1.0])))
-    asked_s = np.array([0.1 - 1e-10, 3.3 + 1e-10])
-    np.testing.assert_allclose(encoder.angle_rad(0, asked_s), [0, 1])
-    np.testing.assert_allclose(poses.pose(0, asked_s), poses.table, atol=RIGID_TOLERANCE_MM)
-
-
-@pytest.mark.parametrize(("times_s", "slack_s"), [([0.0, 0.25, 0.5], 1e-9), ([0.0, 1.0, 1000.0], 1e-6)])
-def test_the_slack_is_a_billionth_of_the_last_time_and_at_least_a_nanosecond(times_s, slack_s) -> None:
-    encoder = EncoderTable(times_s, [0.0, 0.1, 0.2])
-    last_s = times_s[-1]
-    for share in (0.9, 1.0):
-        asked_s = np.array([-share * slack_s, last_s + share * slack_s])
-        np.testing.assert_array_equal(encoder.angle_rad(0, asked_s), [0.0, 0.2])
-    for beyond_s in (-1.1 * slack_s, last_s + 1.1 * slack_s):
-        with pytest.raises(InputError, match="encoder table"):
-            encoder.angle_rad(0, np.array([beyond_s]))
-
-
-@pytest.mark.parametrize(
-    "time_s, angle",
-    [
-        ([0.0], [0.0]),
-        ([0.0, 1.0], [0.0]),
-        ([0.0, 0.0], [0.0, 1.0]),
-        ([1.0, 0.0], [0.0, 1.0]),
-        ([0.0, np.nan], [0, 1]),
-    ],
-)
-def test_bad_encoder_tables_are_refused(time_s, angle) -> None:
-    with pytest.raises(InputError, match="encoder table"):
-        EncoderTable(time_s, angle)
-
-
-def test_frame_sweeps_go_on_through_the_readout() -> None:
+    steady = SpeedRamp(0.5, 0.2, 0.0), ConstantSpeed(0.5, 0.2)
+    np.testing.assert_array_equal(*(kinematics.angle_rad(0, TIMES_S) for kinematics in steady))
     sweeps = FrameSweeps(np.array([0.0, 10.0]), 2.0, np.array([0.1, 0.5]), np.array([0.3, 0.1]))
     np.testing.assert_allclose(sweeps.angle_rad(0, np.array([0.0, 1.0, 2.0, 3.0])), [0.1, 0.2, 0.3, 0.4])
     np.testing.assert_allclose(sweeps.angle_rad(1, np.array([10.0, 12.0, 13.0])), [0.5, 0.1, -0.1])
     at_rest = FrameSweeps(np.zeros(1), 0.0, np.array([0.7]), np.array([0.9]))
     np.testing.assert_array_equal(at_rest.angle_rad(0, np.array([0.0, 5.0])), [0.7, 0.7])
+
+
+def test_tables_are_linear_between_their_samples_and_never_continued() -> None:
+    encoder = EncoderTable([0.0, 1.0, 3.0], [0.0, 0.2, 1.0], "scan.h5:/kinematics")
+    poses = PoseTable([0.0, 1.0, 3.0], GEOMETRY.pose(np.array([0.0, 0.2, 1.0])), "scan.h5:/poses")
+    found = encoder.angle_rad(0, np.array([0.0, 0.5, 1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(found, [0, 0.1, 0.2, 0.6, 1.0])
+    for time_s in (-0.01, 3.01):
+        with pytest.raises(InputError, match=r"scan.h5:/kinematics: found frame 5 needs"):
+            encoder.angle_rad(5, np.array([1.0, time_s]))
+        with pytest.raises(InputError, match=r"scan.h5:/poses: found frame 5 needs"):
+            poses.pose(5, np.array([1.0, time_s]))
+
+
+def test_rounding_of_stored_times_is_forgiven_up_to_a_slack() -> None:
+    time_s = np.array([0.1, 3.3])
+    encoder, poses = EncoderTable(time_s, [0.0, 1.0]), PoseTable(time_s, GEOMETRY.pose(np.array([0.0, 1.0])))
+    asked_s = np.array([0.1 - 1e-10, 3.3 + 1e-10])
+    np.testing.assert_allclose(encoder.angle_rad(0, asked_s), [0, 1])
+    np.testing.assert_allclose(poses.pose(0, asked_s), poses.table, atol=RIGID_TOLERANCE_MM)
+    for times_s, slack_s in [([0.0, 0.25, 0.5], 1e-9), ([0.0, 1.0, 1000.0], 1e-6)]:
+        encoder, last_s = EncoderTable(times_s, [0.0, 0.1, 0.2]), times_s[-1]
+        for share in (0.9, 1.0):
+            asked_s = np.array([-share * slack_s, last_s + share * slack_s])
+            np.testing.assert_array_equal(encoder.angle_rad(0, asked_s), [0.0, 0.2])
+        for beyond_s in (-1.1 * slack_s, last_s + 1.1 * slack_s):
+            with pytest.raises(InputError, match="encoder table"):
+                encoder.angle_rad(0, np.array([beyond_s]))
 
 
 def test_an_orbit_asks_geometry_and_kinematics() -> None:
@@ -121,9 +93,8 @@ def test_interpolation_commutes_with_moving_the_whole_machine() -> None:
 
     asked_s = np.array([0.25, 1.5, 3.9])
     ours = PoseTable(time_s, turned(circle)).pose(0, asked_s)
-    np.testing.assert_allclose(
-        ours, turned(PoseTable(time_s, circle).pose(0, asked_s)), atol=RIGID_TOLERANCE_MM
-    )
+    expected = turned(PoseTable(time_s, circle).pose(0, asked_s))
+    np.testing.assert_allclose(ours, expected, atol=RIGID_TOLERANCE_MM)
 
 
 def test_a_table_returns_its_own_samples() -> None:
@@ -135,16 +106,19 @@ def test_a_table_returns_its_own_samples() -> None:
     assert poses.pose(0, np.array(2.5)).shape == (12,)
 
 
-def test_bad_pose_tables_are_refused() -> None:
+def test_bad_tables_are_refused() -> None:
     good = GEOMETRY.pose(np.linspace(0, 1, 3))
     flat = good.copy()
     flat[1, 9:12] = flat[1, 6:9]
-    for time_s, table in (
-        ([0.0, 1.0], good),
-        ([0.0, 1.0, 2.0], good[:, :11]),
-        ([0.0, 1.0, 1.0], good),
-        ([0.0, 1.0, 2.0], good * np.nan),
-        ([0.0, 1.0, 2.0], flat),
-    ):
+    for time_s, table in [
+        ([0.0, 1.0], good), ([0.0, 1.0, 2.0], good[:, :11]), ([0.0, 1.0, 1.0], good),
+        ([0.0, 1.0, 2.0], good * np.nan), ([0.0, 1.0, 2.0], flat),
+    ]:  # fmt: skip
         with pytest.raises(InputError, match="pose table"):
             PoseTable(time_s, table)
+    for time_s, angle in [
+        ([0.0], [0.0]), ([0.0, 1.0], [0.0]), ([0.0, 0.0], [0.0, 1.0]), ([1.0, 0.0], [0.0, 1.0]),
+        ([0.0, np.nan], [0, 1])
+    ]:  # fmt: skip
+        with pytest.raises(InputError, match="encoder table"):
+            EncoderTable(time_s, angle)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -16,12 +17,7 @@ from phyradgs_cl.acquisition import (
     Shutter,
     Static,
 )
-from phyradgs_cl.acquisition.cells import (
-    micro_view_cells,
-    per_line_cells,
-    static_cells,
-    static_start_cells,
-)
+from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells, static_start_cells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -33,7 +29,7 @@ TIME_TOLERANCE_S = 1e-12
 DARK_FROM = Shutter(0.8, 1.2, pulse_s=(0.1, 0.9))  # the last lines open after 1.0 s
 
 
-def test_a_window_is_cut_by_the_pulse() -> None:
+def test_a_window_is_cut_by_the_pulse_or_missed() -> None:
     shutter = Shutter(0.8, 0.6, pulse_s=(0.3, 0.7))
     expected = [[max(0.1 * r, 0.3), min(0.1 * r + 0.8, 1.0)] for r in range(7)]
     np.testing.assert_allclose(shutter.line_windows_s(7), expected, atol=TIME_TOLERANCE_S)
@@ -41,6 +37,9 @@ def test_a_window_is_cut_by_the_pulse() -> None:
     assert shutter.middle_s == pytest.approx(0.65)
     seen = np.diff(expected)[:, 0]
     np.testing.assert_allclose(shutter.lit_share(7), seen / seen.max(), rtol=1e-12)
+    windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
+    np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
+    np.testing.assert_array_equal(windows_s[5:], 1.0)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -56,21 +55,11 @@ def test_a_pulse_over_the_whole_span_changes_nothing(direction) -> None:
         np.testing.assert_array_equal(ours.time_s, theirs.time_s)
 
 
-def test_lines_that_the_pulse_misses_have_no_share_and_one_moment() -> None:
-    windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
-    np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
-    np.testing.assert_array_equal(windows_s[5:], 1.0)
-
-
-@pytest.mark.parametrize("exposure_s", [1.0, 4.0])
-@pytest.mark.parametrize(("seen", "share"), [(0.5e-9, 0.0), (1.5e-9, 1.5e-9)])
-def test_a_billionth_of_a_window_is_rounding(exposure_s, seen, share) -> None:
-    """The last line opens when the pulse has all but ended."""
-    lit = Shutter(exposure_s, exposure_s, pulse_s=(0.0, exposure_s * (1 + seen))).lit_share(3)
-    np.testing.assert_allclose(lit, [1.0, 0.5, share], rtol=1e-6)
-
-
-def test_exactly_a_billionth_is_dark() -> None:
+def test_a_billionth_of_a_window_is_rounding() -> None:
+    """The last line opens when the pulse has all but ended; exactly a billionth is dark."""
+    for exposure_s, (seen, share) in product((1.0, 4.0), [(0.5e-9, 0.0), (1.5e-9, 1.5e-9)]):
+        lit = Shutter(exposure_s, exposure_s, pulse_s=(0.0, exposure_s * (1 + seen))).lit_share(3)
+        np.testing.assert_allclose(lit, [1.0, 0.5, share], rtol=1e-6)
     seen_s = 2.0**-40
     shutter = Shutter(1.0, 1.0, pulse_s=(1 - seen_s, seen_s + seen_s / 1e-9))
     first_s, last_s = np.diff(shutter.line_windows_s(2))[:, 0]
@@ -78,24 +67,19 @@ def test_exactly_a_billionth_is_dark() -> None:
     np.testing.assert_array_equal(shutter.lit_share(2), [0.0, 1.0])
 
 
-@pytest.mark.parametrize("motion", ["micro-views", "per-row", "static", "static-start"])
 @pytest.mark.parametrize("direction", [1, -1])
-def test_every_time_lies_in_the_pulse_and_weights_stay_whole(motion, direction) -> None:
-    shutter = replace(DARK_FROM, direction=direction)
-    cells = {
-        "micro-views": lambda: micro_view_cells(ORBIT, shutter, 0, START_S, 7, 4, 3),
-        "per-row": lambda: per_line_cells(ORBIT, shutter, 0, START_S, 7, 3),
-        "static": lambda: static_cells(ORBIT, shutter, 0, START_S, 7),
-        "static-start": lambda: static_start_cells(ORBIT, shutter, 0, START_S, 7),
-    }[motion]()
-    np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
-    assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S
-    assert cells.time_s.max() <= START_S + 1.0 + TIME_TOLERANCE_S
-
-
-def test_static_stands_in_the_middle_of_the_light() -> None:
-    assert static_cells(ORBIT, DARK_FROM, 0, START_S, 7).time_s[0] == pytest.approx(START_S + 0.55)
-    assert static_start_cells(ORBIT, DARK_FROM, 0, START_S, 7).time_s[0] == pytest.approx(START_S + 0.1)
+def test_every_time_lies_in_the_pulse_and_weights_stay_whole(direction) -> None:
+    where = (ORBIT, replace(DARK_FROM, direction=direction), 0, START_S, 7)
+    tables = (
+        micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where),
+        static_start_cells(*where),
+    )
+    for cells in tables:
+        np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+        assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S
+        assert cells.time_s.max() <= START_S + 1.0 + TIME_TOLERANCE_S
+    middle, start = tables[2:]  # of the light
+    assert (middle.time_s[0], start.time_s[0]) == pytest.approx((START_S + 0.55, START_S + 0.1))
 
 
 def test_sub_intervals_share_the_lit_part_of_a_strips_window() -> None:
@@ -108,15 +92,8 @@ def test_sub_intervals_share_the_lit_part_of_a_strips_window() -> None:
 
 
 def scan(shutter: Shutter, **changes: object) -> Scan:
-    fields = {
-        "projections": np.zeros((2, *SHAPE), np.float32),
-        "geometry": GEOMETRY,
-        "trajectory": ORBIT,
-        "shutter": shutter,
-        "frame_start_s": np.array([0.0, START_S]),
-        "grid": Grid.cube(4, 2.0),
-    }
-    return Scan(**(fields | changes))
+    frames, start_s = np.zeros((2, *SHAPE), np.float32), np.array([0.0, START_S])
+    return Scan(frames, GEOMETRY, ORBIT, shutter, start_s, Grid.cube(4, 2.0), **changes)
 
 
 def test_dark_lines_join_the_mask_of_a_scan() -> None:
@@ -137,26 +114,23 @@ def test_a_pulsed_scan_knows_when_it_needs_a_pose(is_fly) -> None:
     pulsed = scan(DARK_FROM, is_fly=is_fly)
     pulsed.check_timing()
     assert Static().cells(pulsed, 1).time_s[0] == pytest.approx(START_S + 0.55)
-
-
-@pytest.mark.parametrize("is_fly", [True, False])
-def test_a_protocol_pulses_in_shares_of_the_exposure(is_fly) -> None:
+    # a protocol pulses in shares of the exposure
     protocol = Protocol(views=4, exposure_deg=10.0, readout_ratio=0.5, pulse=(0.5, 0.4), is_fly=is_fly)
     assert protocol.shutter().pulse_s == (0.5, 0.4)
     angle = protocol.orbit(GEOMETRY).angle_rad(1, protocol.frame_start_s()[1] + np.array([0.7]))
     assert np.rad2deg(angle[0]) == pytest.approx(97.0)  # moving there, or standing there
 
 
-@pytest.mark.parametrize(
-    "pulse", [(0.0, 0.0), (0.0, -1.0), (1.5, 1.0), (2.0, 1.0), (-3.0, 1.0), (np.nan, 1.0), (0.0, np.inf)]
-)
-def test_pulses_that_no_frame_sees_are_refused(pulse) -> None:
-    with pytest.raises(InputError, match="pulse"):
-        Protocol(readout_ratio=0.5, pulse=pulse)
-    with pytest.raises(InputError, match="pulse_s"):
-        Shutter(1.0, 0.5, pulse_s=pulse)
-
-
-def test_a_pulse_between_the_windows_of_two_lines_is_refused() -> None:
+def test_pulses_that_no_frame_sees_are_refused() -> None:
+    for pulse in [
+        (0.0, 0.0), (0.2, 0.0), (0.0, -1.0), (0.2, -0.1), (1.5, 1.0), (2.0, 1.0), (-0.5, 0.5), (-3.0, 1.0),
+        (np.nan, 1.0), (0.0, np.inf),
+    ]:  # fmt: skip
+        with pytest.raises(InputError, match="pulse"):
+            Protocol(readout_ratio=0.5, pulse=pulse)
+        with pytest.raises(InputError, match="pulse_s"):
+            Shutter(1.0, 0.5, pulse_s=pulse)
+    for pulse in ((-0.5, 0.6), (1.4, 5.0)):  # that meet the window are kept
+        assert Protocol(readout_ratio=0.5, pulse=pulse).shutter().pulse_s == pulse
     with pytest.raises(InputError, match="no line is open"):
         Shutter(0.1, 10.0, pulse_s=(0.5, 0.2)).lit_share(3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -42,53 +44,51 @@ DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
 
 @AXES
 @DIRECTIONS
-@pytest.mark.parametrize("strips", [1, 2, 3, 7, 8, 10, 25])
-@pytest.mark.parametrize("sub_intervals", [1, 3, 5])
-def test_micro_views_have_the_times_of_eq_2_on_every_line(axis, direction, strips, sub_intervals) -> None:
+def test_micro_views_have_the_times_of_eq_2_on_every_line(axis, direction) -> None:
     shutter = Shutter(0.8, 0.3, axis, direction)
     lines = shutter.lines(SHAPE)
-    cells = micro_view_cells(ORBIT, shutter, 0, START_S, lines, strips, sub_intervals)
-    assert cells.axis == axis and cells.lines == lines
-    assert cells.count == min(strips, lines) * sub_intervals  # none for strips without a line
-    np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
-    for line in range(lines):
-        reading_order = line if direction > 0 else lines - 1 - line
-        j = reading_order * strips // lines
-        expected_s = [
-            START_S + (j + 0.5) / strips * 0.3 + (k + 0.5) / sub_intervals * 0.8 for k in range(sub_intervals)
-        ]
-        serving = (cells.line_start <= line) & (line < cells.line_stop)
-        np.testing.assert_allclose(np.sort(cells.time_s[serving]), expected_s, atol=TIME_TOLERANCE_S)
-        np.testing.assert_allclose(cells.weight[serving], 1 / sub_intervals)
+    for strips, sub_intervals in product([1, 2, 3, 7, 8, 10, 25], [1, 3, 5]):
+        cells = micro_view_cells(ORBIT, shutter, 0, START_S, lines, strips, sub_intervals)
+        assert cells.axis == axis and cells.lines == lines
+        assert cells.count == min(strips, lines) * sub_intervals  # none for strips without a line
+        assert np.all(np.diff(cells.line_start) >= 0)  # cells of a line are neighbours
+        np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+        for line in range(lines):
+            reading_order = line if direction > 0 else lines - 1 - line
+            opens_s = START_S + (reading_order * strips // lines + 0.5) / strips * 0.3
+            expected_s = opens_s + (np.arange(sub_intervals) + 0.5) / sub_intervals * 0.8
+            serving = (cells.line_start <= line) & (line < cells.line_stop)
+            np.testing.assert_allclose(np.sort(cells.time_s[serving]), expected_s, atol=TIME_TOLERANCE_S)
+            np.testing.assert_allclose(cells.weight[serving], 1 / sub_intervals)
 
 
 @AXES
 @DIRECTIONS
-@pytest.mark.parametrize("samples", [1, 4])
-def test_per_line_cells_sample_each_lines_own_exposure(axis, direction, samples) -> None:
+def test_per_line_cells_sample_each_lines_own_exposure(axis, direction) -> None:
     shutter = Shutter(0.8, 0.3, axis, direction)
     lines = shutter.lines(SHAPE)
-    cells = per_line_cells(ORBIT, shutter, 0, START_S, lines, samples)
-    np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
-    np.testing.assert_array_equal(cells.line_stop - cells.line_start, 1)
-    for line in range(lines):
-        reading_order = line if direction > 0 else lines - 1 - line
-        opens_s = START_S + reading_order / (lines - 1) * 0.3
-        middles_s = opens_s + 0.8 * (np.arange(samples) + 0.5) / samples
-        np.testing.assert_allclose(cells.time_s[cells.line_start == line], middles_s, atol=TIME_TOLERANCE_S)
+    for samples in (1, 4):
+        cells = per_line_cells(ORBIT, shutter, 0, START_S, lines, samples)
+        np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+        np.testing.assert_array_equal(cells.line_stop - cells.line_start, 1)
+        for line in range(lines):
+            reading_order = line if direction > 0 else lines - 1 - line
+            opens_s = START_S + reading_order / (lines - 1) * 0.3
+            middles_s = opens_s + 0.8 * (np.arange(samples) + 0.5) / samples
+            found_s = cells.time_s[cells.line_start == line]
+            np.testing.assert_allclose(found_s, middles_s, atol=TIME_TOLERANCE_S)
 
 
-def test_poses_are_those_of_the_times() -> None:
+def test_poses_and_times_of_micro_views() -> None:
     cells = micro_view_cells(ORBIT, Shutter(0.8, 0.3), 0, START_S, 7, 3, 2)
     angles_rad = 0.1 + SPEED_RAD_PER_S * cells.time_s
     np.testing.assert_allclose(cells.pose[:, 0], 50 * np.cos(angles_rad), atol=1e-12)
     np.testing.assert_allclose(cells.pose[:, 1], 50 * np.sin(angles_rad), atol=1e-12)
-
-
-@DIRECTIONS
-def test_cells_of_a_line_are_neighbours(direction) -> None:
-    cells = micro_view_cells(ORBIT, Shutter(0.8, 0.3, direction=direction), 0, START_S, 7, 3, 4)
-    assert np.all(np.diff(cells.line_start) >= 0)
+    shutter, lines = Shutter(0.8, 0.3), 200
+    micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
+    exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
+    np.testing.assert_array_equal(micro.line_start, exact.line_start)
+    assert np.abs(micro.time_s - exact.time_s).max() <= 0.3 / lines / 2 * (1 + 1e-9)
 
 
 def test_static_cells_stand_mid_window_and_at_the_start() -> None:
@@ -111,15 +111,6 @@ def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_i
         np.testing.assert_array_equal(cells.pose, np.broadcast_to(static.pose, cells.pose.shape))
 
 
-def test_many_micro_views_meet_the_per_line_times() -> None:
-    """With one strip per line, mean times differ from the exact ones by at most half a strip's readout."""
-    shutter, lines = Shutter(0.8, 0.3), 200
-    micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
-    exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
-    np.testing.assert_array_equal(micro.line_start, exact.line_start)
-    assert np.abs(micro.time_s - exact.time_s).max() <= 0.3 / lines / 2 * (1 + 1e-9)
-
-
 def test_counts_below_one_are_refused() -> None:
     for strips, sub_intervals in ((0, 1), (1, 0), (-1, 5)):
         with pytest.raises(InputError, match="strips|sub-intervals"):
@@ -131,48 +122,31 @@ def test_counts_below_one_are_refused() -> None:
 
 
 def scan(is_fly: bool) -> Scan:
-    return Scan(
-        projections=np.zeros((2, *SHAPE), np.float32),
-        geometry=GEOMETRY,
-        trajectory=ORBIT,
-        shutter=Shutter(0.8, 0.3, "columns"),
-        frame_start_s=np.array([0.0, START_S]),
-        grid=Grid.cube(4, 2.0),
-        is_fly=is_fly,
-    )
+    shutter, start_s = Shutter(0.8, 0.3, "columns"), np.array([0.0, START_S])
+    frames = np.zeros((2, *SHAPE), np.float32)
+    return Scan(frames, GEOMETRY, ORBIT, shutter, start_s, Grid.cube(4, 2.0), is_fly=is_fly)
 
 
-@pytest.mark.parametrize(
-    "motion, fly_count, still_count",
-    [
-        (Static(), 1, 1),
-        (StaticStart(), 1, 1),
-        (MicroViews(4, 3), 12, 1),
-        (PerRow(sub_intervals=3), 30, 1),
-        (Exact(segments=5), 5, 1),
-    ],
-)
-def test_motion_models_of_fly_and_stop_and_shoot_scans(motion, fly_count, still_count) -> None:
-    assert motion.cells(scan(True), 1).count == fly_count
-    still = motion.cells(scan(False), 1)
-    assert still.count == still_count
-    moving = motion.cells(scan(True), 1)
-    assert moving.lines == 10 and moving.axis == "columns"
-    first_s, last_s = moving.time_s.min(), moving.time_s.max()
-    assert START_S <= first_s <= last_s <= START_S + 1.1
-
-
-@pytest.mark.parametrize("peak", [0.0, 40.0])
-def test_without_a_number_segments_follow_from_the_time_error(peak) -> None:
-    fly = scan(True)
-    where = (ORBIT, fly.shutter, 1, START_S)
-    segments = segments_for(*where, 0.001, peak)
-    expected = exact_cells(*where[:3], START_S, 10, segments)
-    found = Exact(time_error=0.001).cells(fly, 1, peak)
-    np.testing.assert_array_equal(found.line_times, expected.line_times)
-    np.testing.assert_array_equal(found.pose, expected.pose)
-
-
-def test_unknown_motion_is_refused() -> None:
+def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
+    counts = {
+        Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 30,
+        Exact(segments=5): 5,
+    }
+    for motion, count in counts.items():
+        moving = motion.cells(scan(True), 1)
+        assert moving.count == count and motion.cells(scan(False), 1).count == 1
+        assert moving.lines == 10 and moving.axis == "columns"
+        first_s, last_s = moving.time_s.min(), moving.time_s.max()
+        assert START_S <= first_s <= last_s <= START_S + 1.1
     with pytest.raises(InputError, match="micro-views"):
         motion_of("micro-view")
+
+
+def test_without_a_number_segments_follow_from_the_time_error() -> None:
+    fly = scan(True)
+    for peak in (0.0, 40.0):
+        segments = segments_for(ORBIT, fly.shutter, 1, START_S, 0.001, peak)
+        expected = exact_cells(ORBIT, fly.shutter, 1, START_S, 10, segments)
+        found = Exact(time_error=0.001).cells(fly, 1, peak)
+        np.testing.assert_array_equal(found.line_times, expected.line_times)
+        np.testing.assert_array_equal(found.pose, expected.pose)

@@ -1,109 +1,275 @@
-"""Projectors from Python: two routes to one number, transposes, gradients, scipy."""
+"""Operators from Python: two routes to one number, transposes, gradients, scipy, arrays of host and device."""
 
 from __future__ import annotations
 
+import gc
 import sys
+from collections.abc import Callable
 
 import numpy as np
+import pyopencl
+import pyopencl.array
 import pytest
-from scipy.sparse.linalg import lsqr
+from scipy.sparse.linalg import LinearOperator as ScipyOperator
+from scipy.sparse.linalg import cg, lsqr
 from tolerances import FINITE_DIFFERENCE_STEP, FLOAT32, GRADIENT
 
 from phyradgs_cl.api import (
     Gaussians,
     MicroViews,
+    Operator,
     PerRow,
-    Projector,
-    as_linear_operator,
+    Scan,
     as_torch,
+    initial_gaussians,
     ray_operator,
+    splat_operator,
+    voxel_operator,
+    voxelise,
 )
+from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import voxelise
-from phyradgs_cl.operators.twins.splat import splat_frame
+from phyradgs_cl.operators import SplatProjector
+from phyradgs_cl.operators.rays.cell_layers import layered
+from phyradgs_cl.operators.twins.splat import splat_frame, voxel_field
+from phyradgs_cl.runtime import Runtime
 
 VOXELS = 5e-3  # of the peak: linear between voxels of a quarter σ and less: 0.3 % measured
 ADJOINT = 1e-4  # float32 sums in two orders
+Make = Callable[[], tuple[Operator, np.ndarray]]
+
+
+@pytest.fixture(params=["rays", "ray intensity", "splats", "splat intensity", "voxels", "densities"])
+def operator_and_x(rt, scan, cloud, request) -> tuple[Operator, np.ndarray]:
+    """Every kind of operator with a point of its domain."""
+    volume = np.random.default_rng(0).random(scan.grid.shape).astype(np.float32)
+    rows, kind = cloud.rows().astype(np.float32), request.param
+    if "ray" in kind:
+        rays = ray_operator(scan, PerRow(2), device=rt)
+        return (rays.intensity if "intensity" in kind else rays), volume
+    if kind == "voxels":
+        return voxel_operator(scan.grid, cutoff_sigma=0, device=rt), rows
+    splats = splat_operator(scan, MicroViews(2, 2), cutoff_sigma=0, device=rt)  # differentiable
+    if kind == "densities":
+        return splats.of_densities(cloud), rows[10]
+    return (splats.intensity if "intensity" in kind else splats), rows
+
+
+def test_the_transpose_is_that_of_the_derivative(operator_and_x) -> None:
+    operator, x = operator_and_x
+    rng = np.random.default_rng(1)
+    direction, step = rng.normal(size=x.shape).astype(np.float32) * (np.abs(x) + 0.05), 2e-3
+    y = operator(x)
+    h = rng.random(y.shape).astype(np.float32)
+    back = operator.T(h)
+    assert y.dtype == back.dtype == np.float32 and back.shape == x.shape
+    assert y.shape == operator.range_shape == operator.T.domain_shape
+    assert operator.T.range_shape == operator.domain_shape
+    up, down = operator(x + step * direction), operator(x - step * direction)
+    expected = float(((up.astype(float) - down) * h).sum()) / (2 * step)
+    assert float((back.astype(float) * direction).sum()) == pytest.approx(expected, rel=2e-3)
+    _, pull = operator.vjp(x)
+    operator(2 * x)
+    assert np.array_equal(pull(h), back), "vjp is of its own x, whatever comes between"
+
+
+def test_arrays_of_the_device_stay_there(operator_and_x, monkeypatch) -> None:
+    operator, x = operator_and_x
+    y, pull = operator.vjp(x)
+    there, h = operator.to_device(x), operator.to_device(y)
+    operator(there)  # tables of the device's own go up once
+    for name in ("upload", "write", "download"):
+        monkeypatch.setattr(Runtime, name, lambda *_, name=name: pytest.fail(f"{name} within a call"))
+    y_there = operator(there)
+    back_there = operator.T(h)
+    monkeypatch.undo()
+    assert isinstance(y_there, pyopencl.array.Array) and isinstance(back_there, pyopencl.array.Array)
+    assert np.allclose(y_there.get(), y, rtol=FLOAT32, atol=FLOAT32 * y.max())
+    assert np.allclose(back_there.get(), pull(y), rtol=1e-4, atol=1e-4 * np.abs(pull(y)).max())
+
+
+def test_frames_are_rows_of_the_whole(operator_and_x) -> None:
+    operator, x = operator_and_x
+    if len(operator.range_shape) != 3 or operator.range_shape == (12, 12, 12):
+        with pytest.raises(InputError, match="frames"):
+            operator.frames([0])
+        return
+    some = operator.frames([3, 1])
+    assert np.array_equal(some(x), operator(x)[[3, 1]]) and some.range_shape[0] == 2
+    h = np.random.default_rng(2).random(some.range_shape).astype(np.float32)
+    whole = np.zeros(operator.range_shape, np.float32)
+    whole[[3, 1]] = h
+    expected = operator.T(whole)
+    assert np.allclose(some.T(h), expected, rtol=ADJOINT, atol=ADJOINT * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("which", ["rows", "columns"])
 def test_gaussians_and_their_voxels_make_the_same_frames(rt, scan, columns_scan, cloud, which) -> None:
     scan = scan if which == "rows" else columns_scan
     motion, grid = PerRow(sub_intervals=4), Grid.cube(120, 2.4)
-    volume = voxelise(rt, cloud.rows(), grid, cutoff_sigma=0.0)
-    by_rays = ray_operator(scan, motion, grid=grid, device=rt).forward(volume)
-    by_splats = Projector(scan, motion, cutoff_sigma=0.0, device=rt)(cloud)
-    assert by_splats.shape == scan.projections.shape
-    assert np.abs(by_splats - by_rays).max() <= VOXELS * by_rays.max()
+    volume = voxelise(cloud, grid, cutoff_sigma=0.0, device=rt)
+    rays = ray_operator(scan, motion, grid=grid, device=rt)
+    splats = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt)
+    for by_rays, by_splats in ((rays(volume), splats(cloud)), (rays.intensity(volume), splats.intensity(cloud))):
+        assert by_splats.shape == scan.projections.shape
+        assert np.abs(by_splats - by_rays).max() <= VOXELS * by_rays.max()
 
 
-def test_a_projector_is_the_twin_in_millimetres(rt, scan, cloud) -> None:
-    projector = Projector(scan, frames=[4, 1], cutoff_sigma=0.0, device=rt)
-    frames, motion = projector(cloud), MicroViews()
+def test_splats_are_the_twin_in_millimetres(rt, scan, cloud) -> None:
+    motion = MicroViews()
+    frames = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt).frames([4, 1])(cloud)
     expected = np.stack(
         [splat_frame(cloud.rows(), motion.cells(scan, f), scan.geometry.detector_shape) for f in (4, 1)]
     )
     assert np.abs(frames - expected).max() <= FLOAT32 * expected.max()
 
 
+def test_intensity_is_what_the_detector_averages(rt, scan, cloud) -> None:
+    motion = PerRow(3)
+    volume = voxelise(cloud, scan.grid, device=rt) * 20
+    ones, weights = layered([motion.cells(scan, f) for f in range(scan.frames)])
+    parts = [ray_operator(scan, _Given(tables), device=rt)(volume) for tables in ones]
+    expected = intensity_average(parts, weights)[0]
+    found = ray_operator(scan, motion, device=rt).intensity(volume)
+    assert np.allclose(found, expected, atol=FLOAT32 * expected.max())
+    assert np.abs(ray_operator(scan, motion, device=rt)(volume) - found).max() > 0.01
+
+
+class _Given:
+    """A motion whose cells are given."""
+
+    def __init__(self, tables) -> None:
+        self.tables = tables
+
+    def cells(self, scan: Scan, frame: int):
+        return self.tables[frame]
+
+
 @pytest.mark.parametrize("which", ["rows", "columns"])
-def test_gradients_are_those_of_the_twin(rt, scan, columns_scan, cloud, finite_differences, which) -> None:
+def test_gradients_are_those_of_the_twins(rt, scan, columns_scan, cloud, finite_differences, which) -> None:
     scan = scan if which == "rows" else columns_scan
-    shape, frame = scan.geometry.detector_shape, 2
-    h = np.random.default_rng(1).normal(size=(1, *shape)).astype(np.float32)
+    shape, frame, grid = scan.geometry.detector_shape, 2, Grid((7, 9, 8), (0.2, 0.2, 0.25))
     rows, cells = cloud.rows()[:, :2], MicroViews().cells(scan, frame)
     longer = rows.copy()
     longer[6:10] *= 3.0  # lengths of quaternions mean nothing
-    found = Projector(scan, frames=[frame], cutoff_sigma=0.0, device=rt).rows_gradient(longer, h)
+    splats = splat_operator(scan, MicroViews(), cutoff_sigma=0.0, device=rt).frames([frame])
+    voxels = voxel_operator(grid, cutoff_sigma=0.0, device=rt)
+    for operator, twin in (
+        (splats, lambda unit: splat_frame(unit, cells, shape)[None]),
+        (voxels, lambda unit: voxel_field(unit, *grid.axes_mm())),
+    ):
+        h = np.random.default_rng(1).normal(size=operator.range_shape).astype(np.float32)
+        operator(longer)
+        found = operator.T(h)
 
-    def loss(r: np.ndarray) -> float:
-        unit = r.copy()
-        unit[6:10] /= np.linalg.norm(unit[6:10], axis=0)
-        return float((h[0] * splat_frame(unit, cells, shape)).sum())
+        def loss(r: np.ndarray, twin=twin, h=h) -> float:
+            unit = r.copy()
+            unit[6:10] /= np.linalg.norm(unit[6:10], axis=0)
+            return float((h * twin(unit)).sum())
 
-    expected = finite_differences(loss, longer, FINITE_DIFFERENCE_STEP)
-    for part in (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11)):
-        error = np.linalg.norm(found[part] - expected[part])
-        assert error <= GRADIENT * np.linalg.norm(expected[part]), part
+        expected = finite_differences(loss, longer, FINITE_DIFFERENCE_STEP)
+        for part in (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11)):
+            error = np.linalg.norm(found[part] - expected[part])
+            assert error <= GRADIENT * np.linalg.norm(expected[part]), part
+
+
+def test_a_gradient_renders_nothing_again(rt, scan, cloud, monkeypatch) -> None:
+    calls: list[str] = []
+    for name in ("draw", "prepare"):
+        whole = getattr(SplatProjector, name)
+        monkeypatch.setattr(
+            SplatProjector, name, lambda *a, whole=whole, name=name: (calls.append(name), whole(*a))[1]
+        )
+    splats = splat_operator(scan, device=rt)
+    for operator, prepared in ((splats.frames([2]), 0), (splats.frames([0, 3]), 2), (splats.intensity.frames([1]), 0)):
+        misfit = operator(cloud)
+        calls.clear()
+        operator.T(misfit)
+        assert calls == ["prepare"] * prepared
 
 
 @pytest.mark.parametrize("kind", ["rays", "densities"])
-def test_linear_operators_keep_scipy_law(rt, scan, cloud, kind) -> None:
-    operator = (
-        ray_operator(scan, device=rt) if kind == "rays" else Projector(scan, device=rt).of_densities(cloud)
-    )
-    matrix = as_linear_operator(operator)
+def test_linear_operators_keep_scipys_law(rt, scan, cloud, kind) -> None:
+    splats = splat_operator(scan, device=rt)
+    matrix = ray_operator(scan, device=rt) if kind == "rays" else splats.of_densities(cloud)
     rng = np.random.default_rng(2)
     x, y = rng.random(matrix.shape[1]), rng.random(matrix.shape[0])
-    assert matrix.dtype == np.float32 and matrix.shape[0] == scan.projections.size
+    assert isinstance(matrix, ScipyOperator) and matrix.dtype == np.float32
+    assert matrix.shape[0] == scan.projections.size
     forward, back = matrix @ x, matrix.T @ y
     assert forward.shape == (matrix.shape[0],) and back.shape == (matrix.shape[1],)
-    assert forward.dtype == np.float32
+    assert forward.dtype == np.float32 and np.array_equal(back, matrix.H @ y)
     assert float(forward @ y) == pytest.approx(float(x @ back), rel=ADJOINT)
     pair = np.stack([x, 2 * x], -1)
     assert np.allclose(matrix @ pair, np.stack([forward, 2 * forward], -1), rtol=1e-5)
+    assert np.allclose((matrix.T @ matrix) @ x, matrix.T @ forward, rtol=1e-5)
 
 
 def test_scipy_solves_for_densities(rt, scan, cloud) -> None:
-    projector = Projector(scan, device=rt)
-    frames = projector(cloud)
-    solved = lsqr(as_linear_operator(projector.of_densities(cloud)), frames.ravel(), iter_lim=30)[0]
-    assert np.allclose(solved, cloud.density, rtol=1e-3)
+    splats = splat_operator(scan, device=rt)
+    frames, matrix = splats(cloud), splats.of_densities(cloud)
+    assert np.allclose(lsqr(matrix, frames.ravel(), iter_lim=30)[0], cloud.density, rtol=1e-3)
+    assert np.allclose(cg(matrix.T @ matrix, matrix.T @ frames.ravel())[0], cloud.density, rtol=1e-2)
 
 
-def test_what_does_not_fit_is_named(rt, scan, cloud, monkeypatch) -> None:
-    with pytest.raises(InputError, match="still cells"):
-        ray_operator(scan, "exact", device=rt)
-    with pytest.raises(InputError, match="expected a RayOperator"):
-        as_linear_operator(Projector(scan, device=rt))
-    with pytest.raises(InputError, match=r"rows.*\(11, any\)"):
-        Projector(scan, device=rt).project_rows(np.zeros((10, 3)))
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(InputError, match="pip install torch"):
-        as_torch(ray_operator(scan, device=rt))
+def test_the_first_cloud_is_that_of_the_method(rt, scan) -> None:
+    cloud = initial_gaussians(scan, 40, seed=2, device=rt)
+    assert cloud.count == 40 and cloud.density.min() > 0
+    assert np.array_equal(cloud.rows(), initial_gaussians(scan, 40, seed=2, device=rt).rows())
+    volume = voxelise(cloud, scan.grid, device=rt)
+    assert np.corrcoef(volume.ravel(), scan.reference.ravel())[0, 1] > 0.5
+    assert initial_gaussians(scan, device=rt).count > 40
+
+
+class _Foreign:
+    """An array of another library, known by DLPack alone."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __dlpack__(self, **options: object) -> object:
+        return self.values.__dlpack__(**options)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self.values.__dlpack_device__()
+
+
+def test_arrays_of_others_come_by_dlpack_without_a_copy(rt, scan, monkeypatch) -> None:
+    operator = ray_operator(scan, device=rt)
+    volume = np.random.default_rng(0).random(scan.grid.shape).astype(np.float32)
+    expected, seen = operator(volume), []
+    entered = np.from_dlpack
+
+    def noted(values: object) -> np.ndarray:
+        seen.append(entered(values))
+        return seen[-1]
+
+    monkeypatch.setattr(np, "from_dlpack", noted)
+    assert np.array_equal(operator(_Foreign(volume)), expected)
+    assert len(seen) == 1 and np.shares_memory(seen[0], volume)
+
+
+def test_arrays_of_the_device_may_be_parts_and_are_counted(rt, scan) -> None:
+    operator = ray_operator(scan, device=rt)
+    volumes = operator.to_device(np.random.default_rng(0).random((2, *scan.grid.shape)))
+    assert np.array_equal(operator(volumes[1]).get(), operator(volumes.get()[1]))
+    gc.collect()
+    before = rt.ledger.held_bytes
+    frames = operator(volumes[0])
+    assert rt.ledger.held_bytes == before + frames.nbytes
+    del frames
+    gc.collect()
+    assert rt.ledger.held_bytes == before
 
 
 def test_an_empty_cloud_makes_empty_frames(rt, scan) -> None:
     nothing = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))
-    assert not Projector(scan, device=rt)(nothing).any()
+    splats = splat_operator(scan, device=rt)
+    assert not splats(nothing).any() and splats.T(np.ones(splats.range_shape)).shape == (11, 0)
+
+
+def test_without_pytorch_its_installation_is_named(rt, scan, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(InputError, match="pip install 'torch'"):
+        as_torch(ray_operator(scan, device=rt))

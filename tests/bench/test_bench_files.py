@@ -7,6 +7,7 @@ import os
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ from tables import (
     run_bench,
 )
 from tables import rows as bench_rows
+from tables.case import FLY, STILL
 from tables.figures import read_slices, slices_path, write_slices
+from tables.gains import gain_over_static
 from tables.published import TABLE1, TABLE2
 from tables.results import _MEASURED, KEY, Present, append_line, read_lines
 from tables.summary import summarise
@@ -40,25 +43,18 @@ FACTS = {
 }
 
 
-def test_a_damaged_last_line_is_skipped_and_closed_off(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "results.jsonl"
+def test_a_damaged_last_line_is_closed_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, notes = tmp_path / "results.jsonl", tmp_path / "notes.jsonl"
+    assert read_lines(path) == []
     append_line(path, {**FACTS, "run": "a"})
     with open(path, "a") as file:
         file.write('{"run": "b", "seed": 1, "metr')
-    assert [line["run"] for line in read_lines(path)] == ["a"]
-    assert "line 2 is damaged" in caplog.text
+    assert [line["run"] for line in read_lines(path)] == ["a"] and "line 2 is damaged" in caplog.text
     append_line(path, {**FACTS, "run": "c"})
     assert [line["run"] for line in read_lines(path)] == ["a", "c"]
-
-
-def test_a_file_without_any_result_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "results.jsonl"
-    assert read_lines(path) == []
-    path.write_text("these are\nnotes\n")
+    notes.write_text("these are\nnotes\n")
     with pytest.raises(InputError, match="no result in any line"):
-        read_lines(path)
+        read_lines(notes)
     with pytest.raises(OutputError, match="missing"):
         append_line(tmp_path / "missing" / "results.jsonl", {})
 
@@ -77,29 +73,26 @@ def test_devices_and_pipes_are_no_results_files(tmp_path: Path) -> None:
         run_bench(BenchJob("table1", folder, rows=["FDK"]), pytest.fail)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("damage", ["cut off", "a bomb", "objects", "other names", "not there"])
-def test_damaged_slices_are_none_at_all(tmp_path: Path, damage: str) -> None:
+def test_damaged_slices_are_none_at_all(tmp_path: Path) -> None:
     images = [np.full((3, 4), float(n), np.float32) for n in range(3)]
     facts = {**FACTS, "volume": "jaw"}
     write_slices(tmp_path, facts, images)
     np.testing.assert_array_equal(read_slices(tmp_path, facts), images)
     path = slices_path(tmp_path, facts)
-    if damage == "cut off":
-        path.write_bytes(path.read_bytes()[:200])
-    elif damage == "a bomb":
-        with (
-            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
-            archive.open("arr_0.npy", "w") as member,
-        ):
-            for _ in range(300):
-                member.write(b"\0" * (1 << 20))
-    elif damage == "objects":
-        np.savez(path, np.array([path], object))
-    elif damage == "other names":
-        np.savez(path, volume=images[0])
-    else:
-        path.unlink()
-    assert read_slices(tmp_path, facts) is None
+
+    def bomb(path: Path) -> None:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("arr_0.npy", b"\0" * (300 << 20))
+
+    for damage in (
+        lambda path: path.write_bytes(path.read_bytes()[:200]),
+        bomb,
+        lambda path: np.savez(path, np.array([path], object)),
+        lambda path: np.savez(path, volume=images[0]),
+        Path.unlink,
+    ):
+        damage(path)
+        assert read_slices(tmp_path, facts) is None
 
 
 def test_a_run_is_present_with_the_same_identity_and_options() -> None:
@@ -124,33 +117,32 @@ def test_of_a_volume_twice_the_size_is_taken_else_the_largest(tmp_path: Path) ->
 
 
 def test_folders_without_volumes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no \.h5 file in"):
-        find_volumes(tmp_path, None, 64)
-    with pytest.raises(InputError, match="a folder of HDF5 volumes"):
-        find_volumes(tmp_path / "missing", None, 64)
+    for folder, said in ((tmp_path, r"no \.h5 file in"), (tmp_path / "missing", "a folder of HDF5 volumes")):
+        with pytest.raises(InputError, match=said):
+            find_volumes(folder, None, 64)
 
 
 def test_rows_are_the_papers_and_more() -> None:
-    assert set(TABLE1) <= {row.label for row in rows_of("table1")}
-    assert set(TABLE2) == {row.label for row in rows_of("table2")}
+    labels = {kind: [row.label for row in rows_of(kind)] for kind in KINDS}
+    assert set(TABLE1) <= set(labels["table1"]) and set(TABLE2) == set(labels["table2"])
     for kind in KINDS:
-        labels = [row.label for row in rows_of(kind)]
-        assert len(set(labels)) == len(labels)
-
-
-def test_tables_share_the_run_of_the_default_strips() -> None:
-    full = next(row for row in rows_of("table1") if row.label == "PhyRadGS")
-    assert full.run == next(row for row in rows_of("table2") if row.label == "M=8 N=5").run
-    assert full.static().run == next(r for r in rows_of("table1") if r.label == "PhyRadGS w/o ST").run
+        assert len(set(labels[kind])) == len(labels[kind])
+        assert all(row.options(100, 10).motion.name == row.motion for row in rows_of(kind))
+    # tables share the run of the default strips
+    row = {row.label: row for kind in ("table1", "table2") for row in rows_of(kind)}
+    full = row["PhyRadGS"]
+    assert (full.run, full.static().run) == (row["M=8 N=5"].run, row["PhyRadGS w/o ST"].run)
 
 
 def test_a_row_of_an_unknown_name_or_method_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--rows: found 'PhyRad'; .*did you mean 'PhyRadGS'"):
         BenchJob("table1", tmp_path, rows=["PhyRad"])
-    with pytest.raises(InputError, match="row 'Magic': found the method 'magic'; expected one of phyradgs"):
-        Row("Magic", "magic").options(10, 10)
-    with pytest.raises(InputError, match="row 'R2 exact': --motion"):
-        Row("R2 exact", "r2", "per-row").options(10, 10)
+    for row, said in (
+        (Row("Magic", "magic"), "row 'Magic': found the method 'magic'; expected one of phyradgs"),
+        (Row("R2 exact", "r2", "per-row"), "row 'R2 exact': --motion"),
+    ):
+        with pytest.raises(InputError, match=said):
+            row.options(10, 10)
 
 
 def test_a_method_of_ones_own_has_rows_under_its_name(
@@ -167,16 +159,9 @@ def test_stop_and_shoot_is_planned_once_for_the_rows_that_share_it(tmp_path: Pat
     rows = ["PhyRadGS", "PhyRadGS w/o ST", "R2-Gaussian w/ ST"]
     job = BenchJob("table1", tmp_path, rows=rows, names=["foot"], protocols=["rapid"], iterations=7)
     planned = [(run.acquisition, run.row.label) for run in plan_runs(job)]
-    assert sorted(planned) == [
-        ("fly-scan", "PhyRadGS"),
-        ("fly-scan", "PhyRadGS w/o ST"),
-        ("fly-scan", "R2-Gaussian w/ ST"),
-        ("stop-and-shoot", "PhyRadGS w/o ST"),
-        ("stop-and-shoot", "R2-Gaussian"),
-    ]
-    options = [run.options for run in plan_runs(job)]
-    assert {o.iterations for o in options} == {7}
-    assert {o.gaussians for o in options} == {job.gaussians}
+    still = [("stop-and-shoot", label) for label in ("PhyRadGS w/o ST", "R2-Gaussian")]
+    assert sorted(planned) == sorted([*(("fly-scan", label) for label in rows), *still])
+    assert {(run.options.iterations, run.options.gaussians) for run in plan_runs(job)} == {(7, job.gaussians)}
 
 
 def test_a_plan_runs_over_seeds_volumes_and_protocols(tmp_path: Path) -> None:
@@ -205,9 +190,9 @@ def test_neural_rows_run_where_their_machine_is(
     assert {run.row.method for run in plan_runs(job)} == methods
 
 
-@pytest.mark.parametrize(
-    ("changes", "culprit"),
-    [
+def test_wrong_jobs_are_refused(tmp_path: Path) -> None:
+    job = BenchJob("table1", tmp_path, rows=["FDK"])
+    for changes, culprit in (
         ({"kind": "table3"}, "benchmark: found 'table3'"),
         ({"protocols": ["static"]}, "--protocols: found 'static'"),
         ({"seeds": (-1,)}, "--seeds: found -1"),
@@ -217,11 +202,11 @@ def test_neural_rows_run_where_their_machine_is(
         ({"axis": "diagonal"}, "--readout: found 'diagonal'"),
         ({"names": ["hand"]}, r"--names \(without --volumes\): found 'hand'"),
         ({"kind": "phantom", "names": ["foot"]}, "given for phantom"),
-    ],
-)
-def test_wrong_jobs_are_refused(tmp_path: Path, changes: dict[str, object], culprit: str) -> None:
-    with pytest.raises(InputError, match=culprit):
-        plan_runs(replace(BenchJob("table1", tmp_path, rows=["FDK"]), **changes))  # type: ignore[arg-type]
+    ):
+        with pytest.raises(InputError, match=culprit):
+            plan_runs(replace(job, **changes))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="voxels of a benchmark size"):
+        BenchSize("T", 1, 8, 1)
 
 
 def test_lists_of_the_command_line() -> None:
@@ -233,17 +218,6 @@ def test_lists_of_the_command_line() -> None:
             listed("--names", text)
     with pytest.raises(InputError, match="--seeds: found '1,x'"):
         listed_seeds("--seeds", "1,x")
-
-
-def test_every_default_row_has_options() -> None:
-    for kind in KINDS:
-        for row in rows_of(kind):
-            assert row.options(100, 10).motion.name == row.motion
-
-
-def test_sizes_of_ones_own_are_checked() -> None:
-    with pytest.raises(InputError, match="voxels of a benchmark size"):
-        BenchSize("T", 1, 8, 1)
 
 
 def test_a_spread_tells_of_seeds_and_not_of_volumes() -> None:
@@ -259,3 +233,52 @@ def test_a_spread_tells_of_seeds_and_not_of_volumes() -> None:
     apart = summarise([lines[1], lines[3]])  # seeds of different volumes: their difference is that of volumes
     assert apart is not None and apart.spread == {}
     assert summarise([]) is None
+
+
+# --- what a model of the motion gives: pairs of the same volume and seed, and nothing else ------------------------------
+
+ROWS = {row.label: row for row in rows_of("table1")}
+MOVING, STATIC = ROWS["SART per-row"], ROWS["SART"]
+
+
+def line(row: Row, volume: str, seed: int, psnr_db: float, **others: Any) -> dict[str, Any]:
+    """A line of a results file as far as a gain looks at it."""
+    facts = {"run": row.run, "protocol": "rapid", "acquisition": FLY, "processor_s": 2.0, **others}
+    return {**facts, "volume": volume, "seed": seed, "metrics": {"psnr_db": psnr_db, "ssim": 0.5}}
+
+
+LINES = [
+    *(line(STATIC, *where) for where in (("a", 0, 20.0), ("a", 1, 22.0), ("b", 0, 30.0))),
+    *(line(MOVING, *where) for where in (("a", 0, 21.0), ("a", 1, 25.0))),
+    line(MOVING, "b", 0, 30.5, processor_s=8.0),
+]
+
+
+def test_a_gain_is_the_mean_over_volumes_of_the_means_over_their_seeds() -> None:
+    gain = gain_over_static(LINES, "rapid", MOVING)
+    assert gain is not None
+    assert (gain.least_db, gain.greatest_db) == (0.5, 2.0)
+    assert gain.mean_db == pytest.approx(1.25)
+    assert gain.mean_db == pytest.approx(gain.moving.mean["psnr_db"] - gain.static.mean["psnr_db"])
+    assert gain.moving.mean["processor_s"] == 5.0
+    assert (gain.volumes, gain.still) == (2, None)
+
+
+def test_scans_without_a_partner_and_perfect_volumes_do_not_count() -> None:
+    gain = gain_over_static(LINES, "rapid", MOVING)
+    alone = [line(STATIC, "c", 0, 90.0), line(MOVING, "a", 2, 90.0), line(MOVING, "d", 0, 90.0)]
+    for more in (alone, [line(MOVING, "a", 0, 90.0, protocol="standard")]):
+        assert gain_over_static([*LINES, *more], "rapid", MOVING) == gain
+    assert gain_over_static([line(STATIC, "a", 0, 20.0), line(MOVING, "a", 1, 21.0)], "rapid", MOVING) is None
+    assert gain_over_static(LINES, "rapid", ROWS["CGLS per-row"]) is None
+    perfect = {**line(MOVING, "b", 0, 0.0), "metrics": {"psnr_db": None, "ssim": 1.0}}
+    gain = gain_over_static([*LINES[:5], perfect], "rapid", MOVING)
+    assert gain is not None and (gain.volumes, gain.mean_db) == (1, 2.0)
+
+
+def test_a_static_row_has_no_gain_and_stop_and_shoot_is_of_the_same_scans() -> None:
+    assert gain_over_static(LINES, "rapid", STATIC) is None
+    still = [line(STATIC, volume, 0, psnr, acquisition=STILL) for volume, psnr in (("a", 40.0), ("c", 90.0))]
+    gain = gain_over_static([*LINES, *still], "rapid", MOVING)
+    assert gain is not None and gain.still is not None
+    assert gain.still.mean["psnr_db"] == 40.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
@@ -10,11 +12,22 @@ from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 
 @pytest.fixture(scope="session")
-def clean(rt) -> Scan:
+def scan_of(rt) -> Callable[..., Scan]:
+    """A noisy fly-scan of a phantom with this cone; keywords go to the protocol."""
+
+    def make(
+        geometry: ConeGeometry, phantom: str = "jaw", size: int = 24, axis: str = "rows", **protocol: object
+    ) -> Scan:
+        scene = phantom_scene(rt, phantom, geometry, Grid.cube(size, 2.0), size, axis, 0)
+        options = SimulationOptions(
+            make_protocol("rapid", **protocol), axis, noise="tigre", dose=1e6, time_samples=8
+        )
+        return simulate(scene.source, geometry, scene.grid, options)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def clean(scan_of) -> Scan:
     geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
-    protocol = make_protocol("rapid", views=15, exposure_deg=24.0, readout_ratio=0.5)
-    options = SimulationOptions(
-        protocol=protocol, noise="tigre", dose=1e6, electronic_noise=10.0, time_samples=8
-    )
-    return simulate(scene.source, geometry, scene.grid, options)
+    return scan_of(geometry, views=15, exposure_deg=24.0, readout_ratio=0.5)

@@ -8,19 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
 from phyradgs_cl.check.questions.exposure import check_exposure
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 from phyradgs_cl.workflow import load_scan
 
 
 def verdicts(found):
     return {finding.question: finding.verdict for finding in found.findings}
+
+
+def suspected(found):
+    return [finding.question for finding in found.suspicious]
 
 
 def stated(scan, **geometry):
@@ -44,31 +46,27 @@ def test_a_clean_scan_has_nothing_suspicious(rt, clean) -> None:
     assert seen == [(n, 11, question) for n, question in enumerate([*verdicts(found), ""])]
 
 
-def test_the_wrong_sign_of_rotation(rt, clean) -> None:
+def test_the_wrong_sign_of_rotation_and_scans_at_rest(rt, clean) -> None:
     found = check(negative(clean), rt)
-    assert [f.question for f in found.suspicious] == ["sign of rotation"]
+    assert suspected(found) == ["sign of rotation"]
+    asked = verdicts(check(replace(clean, is_fly=False), rt))
+    assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 10
 
 
 @pytest.mark.parametrize(
     ("rows", "columns", "verdict"),
     [(64, 1, CANNOT_TELL), (64, 4, CANNOT_TELL), (64, 8, OK), (1, 64, OK), (1, 1, CANNOT_TELL)],
 )
-def test_strips_of_a_panel_raise_no_false_alarm(rt, rows, columns, verdict) -> None:
+def test_strips_of_a_panel_raise_no_false_alarm(rt, scan_of, rows, columns, verdict) -> None:
     """Blocks are no larger than the panel's shorter side, and few columns say nothing about the axis."""
-    geometry = ConeGeometry(5.0, 7.0, (rows, columns), (0.0625, 0.0625))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid"), noise="tigre", time_samples=8)
-    found = check(simulate(scene.source, geometry, scene.grid, options), rt)
+    found = check(scan_of(ConeGeometry(5.0, 7.0, (rows, columns), (0.0625, 0.0625))), rt)
     assert verdicts(found)["sign of rotation"] == verdicts(found)["centre of rotation"] == verdict
     assert np.isnan(found.offset_mm) == (verdict == CANNOT_TELL)
 
 
-def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt) -> None:
-    geometry = ConeGeometry(500.0, 700.0, (32, 32), (0.125, 0.125))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
-    protocol = make_protocol("rapid", views=15, exposure_deg=24.0, readout_ratio=0.5)
-    options = SimulationOptions(protocol=protocol, noise="tigre", time_samples=8)
-    scan = simulate(scene.source, geometry, scene.grid, options)
+def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt, scan_of) -> None:
+    narrow = ConeGeometry(500.0, 700.0, (32, 32), (0.125, 0.125))
+    scan = scan_of(narrow, views=15, exposure_deg=24.0, readout_ratio=0.5)
     for one in (scan, negative(scan)):
         found = verdicts(check(one, rt))
         assert found["sign of rotation"] == found["sign of readout"] == CANNOT_TELL
@@ -78,7 +76,7 @@ def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt) -> None:
 def test_an_offset_is_estimated_with_its_uncertainty(rt, clean, pixels) -> None:
     pitch_mm = clean.geometry.pixel_size_mm[1]
     found = check(stated(clean, detector_offset_mm=(0.0, pixels * pitch_mm)), rt)
-    assert [f.question for f in found.suspicious] == ["centre of rotation"]
+    assert suspected(found) == ["centre of rotation"]
     assert found.offset_mm == pytest.approx(-pixels * pitch_mm, abs=0.1 * pitch_mm)
     assert 0 < found.offset_spread_mm < 0.1 * pitch_mm
 
@@ -88,13 +86,9 @@ def test_a_drift_of_the_gain(rt, clean, change) -> None:
     gain = np.log1p(change) * np.arange(clean.frames) / (clean.frames - 1)
     drifted = (clean.projections - gain[:, None, None]).astype(np.float32)
     found = check(replace(clean, projections=drifted), rt)
-    assert [f.question for f in found.suspicious] == ["gain drift"]
+    assert suspected(found) == ["gain drift"]
     value = next(f.value for f in found.findings if f.question == "gain drift")
     assert value == pytest.approx(change, abs=0.01)
-
-
-def lexical(count):
-    return np.array(sorted(range(count), key=str))
 
 
 def black(p):
@@ -110,18 +104,17 @@ def elsewhere(p):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (black, "frame 7 is unlike all others"),
-        (elsewhere, "frame 9 "),
+        (black, "frame 7 is unlike all others"), (elsewhere, "frame 9 "),
         (lambda p: p[[*range(6), 5, *range(7, 15)]], "frame 6 is frame 5 recorded twice"),
         (lambda p: p[[0, 1, 2, 10, *range(4, 10), 3, *range(11, 15)]], "frames 3 and 10 (from 0) fit if"),
-        (lambda p: p[lexical(15)], "names without leading zeros"),
+        (lambda p: p[sorted(range(15), key=str)], "names without leading zeros"),
         (lambda p: p[np.random.default_rng(3).permutation(15)], "cause not found"),
     ],
 )
 def test_frames_that_do_not_fit_together_are_named(rt, clean, change, said) -> None:
     """And nothing else is blamed: a black frame moves no panel."""
     found = check(replace(clean, projections=change(clean.projections.copy())), rt)
-    assert "consistency" in [f.question for f in found.suspicious] and len(found.suspicious) <= 1 + (change is black)
+    assert "consistency" in suspected(found) and len(found.suspicious) <= 1 + (change is black)
     assert said in found.suspicious[-1].text and found.suspicious[-1].advice
 
 
@@ -139,7 +132,7 @@ def test_counts_that_begin_again_at_zero(rt, clean) -> None:
     counts = np.round(7e4 * np.exp(-clean.projections)) % 65536
     wrapped = np.log(7e4 / np.maximum(counts, 0.5)).astype(np.float32)
     found = check(replace(clean, projections=wrapped), rt)
-    assert [f.question for f in found.suspicious] == ["saturation"] and "overflow" in found.suspicious[0].advice
+    assert suspected(found) == ["saturation"] and "overflow" in found.suspicious[0].advice
     assert verdicts(found)["centre of rotation"] == CANNOT_TELL and not found.is_consistent
 
 
@@ -169,20 +162,12 @@ def test_a_mask_that_leaves_a_few_pixels(rt, clean, left) -> None:
     assert found.suspicious == [] and verdicts(found)["consistency"] == CANNOT_TELL
 
 
-def test_the_wrong_sign_of_readout(rt) -> None:
+def test_the_wrong_sign_of_readout(rt, scan_of) -> None:
     """Columns that are read in the wrong order bend the object, which shows; in a wide cone."""
-    geometry = ConeGeometry(3.0, 4.5, (48, 48), (0.125, 0.125))
-    scene = phantom_scene(rt, "foot", geometry, Grid.cube(32, 2.0), 32, "columns", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid", views=25), readout_axis="columns", time_samples=8)
-    scan = simulate(scene.source, geometry, scene.grid, options)
+    scan = scan_of(ConeGeometry(3.0, 4.5, (48, 48), (0.125, 0.125)), "foot", 32, "columns", views=25)
     other = replace(scan, shutter=replace(scan.shutter, direction=-1))
     assert verdicts(check(scan, rt))["sign of readout"] == OK
     assert verdicts(check(other, rt))["sign of readout"] == SUSPICIOUS
-
-
-def test_scans_at_rest_are_not_asked_about_lines(rt, clean) -> None:
-    asked = verdicts(check(replace(clean, is_fly=False), rt))
-    assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 10
 
 
 def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
@@ -223,32 +208,28 @@ def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None
 
 def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
-    data = np.concatenate([np.full((1, 32, 32), 60000.0), 60000 * np.exp(-clean.projections)]).astype(
-        np.uint16
-    )
+    light = np.concatenate([np.zeros((1, 32, 32)), clean.projections])
+    data = (60000 * np.exp(-light)).astype(np.uint16)
     key = np.r_[1, np.zeros(clean.frames, int)]
     write_scan(path, clean, data=data, image_key=key, quantity="counts")
     cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)])
     held = []
-
-    def keep(frames, keys, quantity):
-        held.append((frames, quantity))
-        return clean.projections, None
-
-    read_scan(fixed, keep)
+    read_scan(
+        fixed, lambda frames, keys, quantity: held.append((frames, quantity)) or (clean.projections, None)
+    )
     assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
 
 
-@pytest.mark.parametrize("options", [["--fix-offset"], ["-o", "new.h5"], ["--fix-offset", "-o", "SCAN"]])
-def test_options_that_do_not_go_together(cli, clean, tmp_path, monkeypatch, capsys, options) -> None:
+def test_options_that_do_not_go_together(cli, clean, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     write_scan(tmp_path / "SCAN", clean)
-    assert cli.run(["check", "SCAN", *options]) == 2
-    assert capsys.readouterr().err.startswith("phyradgs: ")
-    assert [p.name for p in tmp_path.iterdir()] == ["SCAN"]
+    for options in (["--fix-offset"], ["-o", "new.h5"], ["--fix-offset", "-o", "SCAN"]):
+        assert cli.run(["check", "SCAN", *options]) == 2
+        assert capsys.readouterr().err.startswith("phyradgs: ")
+        assert [p.name for p in tmp_path.iterdir()] == ["SCAN"]
 
 
-def test_masked_pixels_hold_anything_but_not_all_may_be_masked(rt, clean) -> None:
+def test_masked_pixels_and_pulsed_beams(rt, clean) -> None:
     p, mask = clean.projections.copy(), np.zeros(clean.geometry.detector_shape, bool)
     mask[5, 7] = True
     p[:, 5, 7] = np.nan
@@ -258,10 +239,6 @@ def test_masked_pixels_hold_anything_but_not_all_may_be_masked(rt, clean) -> Non
         check(replace(clean, projections=p), rt)
     with pytest.raises(InputError, match="every pixel masked"):
         check(replace(clean, pixel_mask=np.ones_like(mask)), rt)
-
-
-def test_of_a_pulsed_beam_the_exposure_tells_nothing(rt, clean) -> None:
-    """Half the exposure would leave other lines in the dark: their residuals cannot be compared."""
     scan = replace(clean, shutter=replace(clean.shutter, pulse_s=(0.5, 0.5)))
     finding = check_exposure(rt, scan)
     assert finding.verdict == CANNOT_TELL and "pulse" in finding.text and "pulse" in finding.advice

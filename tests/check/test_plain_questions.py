@@ -21,9 +21,7 @@ def some_frames(scan, chosen):
     sweeps = scan.trajectory.kinematics
     kept = {name: getattr(sweeps, name)[chosen] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
     return replace(
-        scan,
-        projections=scan.projections[chosen],
-        frame_start_s=scan.frame_start_s[chosen],
+        scan, projections=scan.projections[chosen], frame_start_s=scan.frame_start_s[chosen],
         trajectory=CircularOrbit(scan.geometry, replace(sweeps, **kept)),
     )
 
@@ -31,46 +29,33 @@ def some_frames(scan, chosen):
 def test_a_clean_scan_is_left_in_peace(clean) -> None:
     finding, dead = check_dead_pixels(clean)
     findings = [
-        check_timing(clean),
-        check_angles(clean),
-        check_coverage(clean),
-        check_saturation(clean),
-        finding,
+        check_timing(clean), check_angles(clean), check_coverage(clean), check_saturation(clean), finding,
     ]
     assert [f.verdict for f in findings] == [OK] * 5
     assert not dead.any() and not any(f.advice for f in findings)
 
 
-@pytest.mark.parametrize("name", ["exposure_s", "readout_s"])
-def test_a_line_cannot_open_twice_nor_two_frames_be_read_at_once(clean, name) -> None:
-    period_s = float(np.diff(clean.frame_start_s)[0])
-    scan = replace(clean, shutter=replace(clean.shutter, **{name: 2 * period_s}))
-    finding = check_timing(scan)
-    assert finding.verdict == SUSPICIOUS and name.split("_")[0] in finding.text
-    assert finding.value == pytest.approx(2.0)
-
-
-def test_speed_within_frames_that_does_not_fit_the_steps_between_them(clean) -> None:
-    sweeps = clean.trajectory.kinematics
-    slower = replace(sweeps, angle_end_rad=(sweeps.angle_start_rad + sweeps.angle_end_rad) / 2)
-    finding = check_timing(replace(clean, trajectory=CircularOrbit(clean.geometry, slower)))
-    assert finding.verdict == SUSPICIOUS and "12° from frame to frame, the angles say 24°" in finding.advice
-
-
 def test_frames_must_follow_each_other(clean) -> None:
+    """A line cannot open twice, nor two frames be read at once."""
+    period_s = float(np.diff(clean.frame_start_s)[0])
+    for name in ("exposure_s", "readout_s"):
+        finding = check_timing(replace(clean, shutter=replace(clean.shutter, **{name: 2 * period_s})))
+        assert finding.verdict == SUSPICIOUS and name.split("_")[0] in finding.text
+        assert finding.value == pytest.approx(2.0)
     start_s = clean.frame_start_s.copy()
     start_s[3] = start_s[2]
     assert check_timing(replace(clean, frame_start_s=start_s)).verdict == SUSPICIOUS
 
 
-def test_an_encoder_that_wanders_is_no_fault(clean) -> None:
+def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean) -> None:
+    sweeps = clean.trajectory.kinematics
+    slower = replace(sweeps, angle_end_rad=(sweeps.angle_start_rad + sweeps.angle_end_rad) / 2)
+    finding = check_timing(replace(clean, trajectory=CircularOrbit(clean.geometry, slower)))
+    assert finding.verdict == SUSPICIOUS and "12° from frame to frame, the angles say 24°" in finding.advice
     time_s = np.linspace(0, 30, 301)
     table = EncoderTable(time_s, np.deg2rad(24 * time_s) + 0.02 * np.sin(time_s))
     scan = replace(clean, trajectory=CircularOrbit(clean.geometry, table))
     assert check_timing(scan).verdict == OK
-
-
-def test_the_arc_of_an_exposure(clean) -> None:
     assert np.rad2deg(exposure_arc_rad(clean)) == pytest.approx(24.0)
     assert exposure_arc_rad(replace(clean, is_fly=False)) == 0
 
@@ -90,17 +75,14 @@ def cropped(scan, columns, offset_mm):
     """A narrower panel, said to stand at ``offset_mm``."""
     p = scan.projections[:, :, columns]
     geometry = replace(scan.geometry, detector_shape=p.shape[1:], detector_offset_mm=(0.0, offset_mm))
-    return replace(
-        scan, projections=p, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics)
-    )
+    orbit = CircularOrbit(geometry, scan.trajectory.kinematics)
+    return replace(scan, projections=p, geometry=geometry, trajectory=orbit)
 
 
 def test_a_panel_that_cuts_the_object(clean) -> None:
+    """A displaced one may, on its short side."""
     finding = check_coverage(cropped(clean, slice(9, 23), 0.0))
     assert finding.verdict == SUSPICIOUS and finding.value > finding.threshold
-
-
-def test_a_displaced_panel_may_cut_it_on_its_short_side(clean) -> None:
     right_half = slice(14, 32)
     assert check_coverage(cropped(clean, right_half, 0.875)).verdict == OK
     assert check_coverage(cropped(clean, right_half, -0.875)).verdict == SUSPICIOUS
@@ -116,9 +98,11 @@ def test_saturated_areas_but_not_noise_that_is_cut_off(clean) -> None:
     noise = np.random.default_rng(0).normal(0.1, 0.01, clean.projections.shape)
     noisy = np.maximum(noise, 0.1).astype(np.float32)  # every second pixel at the end
     assert check_saturation(replace(clean, projections=noisy)).verdict == OK
+    finding = check_saturation(replace(clean, projections=np.ones_like(clean.projections)))
+    assert finding.verdict == SUSPICIOUS and finding.text.startswith("100 % of the pixels")  # no power of ten
 
 
-def test_counts_at_the_ceiling_are_seen_on_reading(clean) -> None:
+def test_counts_at_the_ceiling_are_seen_on_reading_or_believed_of_an_import(clean) -> None:
     p = clean.projections
     bright, flat = np.minimum(7e4 * np.exp(-p), 65535), np.full((1, *p.shape[1:]), 65535.0)
     data = np.concatenate([flat, bright]).astype(np.uint16)
@@ -131,10 +115,6 @@ def test_counts_at_the_ceiling_are_seen_on_reading(clean) -> None:
     noise = np.random.default_rng(0).poisson(data * 0.1)
     counts(noise.astype(np.uint16), key, "counts")
     assert check_saturation(clean, counts).verdict == OK
-
-
-def test_what_an_import_saw_in_the_counts_is_believed(clean) -> None:
-    """The pixels themselves are masked by then, and line integrals show nothing."""
     finding = check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.25)))
     assert finding.verdict == SUSPICIOUS and "25 % of the pixels lie together at 40000 counts" in finding.text
     assert check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.0))).verdict == OK
@@ -151,9 +131,7 @@ def test_dead_pixels_are_found_where_they_are(clean, value) -> None:
     assert finding.verdict == SUSPICIOUS and np.array_equal(dead, planted)
     masked, _ = check_dead_pixels(replace(clean, projections=p, pixel_mask=planted))
     assert masked.verdict == OK
-
-
-def test_a_pixel_of_the_wrong_gain_is_as_bad(clean) -> None:
+    # a pixel of the wrong gain is as bad
     p = clean.projections.copy()
     p[:, 12, 13] += 0.5
     finding, dead = check_dead_pixels(replace(clean, projections=p))
@@ -173,20 +151,11 @@ def test_air_without_noise_is_not_dead(clean) -> None:
     assert finding.verdict == SUSPICIOUS and list(zip(*np.nonzero(dead), strict=True)) == [(5, 28), (8, 9)]
 
 
-@pytest.mark.parametrize("factor", [0.0, -1.0])
-def test_frames_without_an_object_or_of_another_sign(clean, factor) -> None:
-    finding = check_coverage(replace(clean, projections=factor * clean.projections))
-    assert (
-        finding.verdict == SUSPICIOUS and "no object" in finding.text and "line integrals" in finding.advice
-    )
-
-
-def test_a_share_is_never_written_as_a_power_of_ten(clean) -> None:
-    finding = check_saturation(replace(clean, projections=np.ones_like(clean.projections)))
-    assert finding.verdict == SUSPICIOUS and finding.text.startswith("100 % of the pixels")
-
-
-def test_counts_that_are_taken_for_line_integrals(clean) -> None:
+def test_frames_that_are_no_line_integrals_of_an_object(clean) -> None:
+    for factor in (0.0, -1.0):
+        finding = check_coverage(replace(clean, projections=factor * clean.projections))
+        assert finding.verdict == SUSPICIOUS
+        assert "no object" in finding.text and "line integrals" in finding.advice
     counts = (1000 * np.exp(-clean.projections)).astype(np.float32)
     finding = check_coverage(replace(clean, projections=counts))
     assert finding.verdict == SUSPICIOUS and "--quantity" in finding.advice

@@ -1,4 +1,4 @@
-"""Warnings where they belong and nowhere else, and files that are taken for others."""
+"""Warnings where they belong and nowhere else, files that are taken for others, and what surrounds a command."""
 
 from __future__ import annotations
 
@@ -13,129 +13,81 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Static
-from phyradgs_cl.errors import OutputError
+from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.runtime import device, pocl
 from phyradgs_cl.workflow import evaluate, load_scan, reconstruct
 
-TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
-
 
 @pytest.fixture(scope="module")
-def scan(simulated) -> Path:
-    return simulated(*TINY, "--jitter-deg", "0.1")
+def volume(cli, scan, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("fdk") / "volume.h5"
+    assert cli.run(["reconstruct", str(scan), "-o", str(path), "--method", "fdk"]) == 0
+    return path
 
 
 @pytest.fixture
 def warned(cli, scan, tmp_path, caplog):
     """What a reconstruction of a scan warns of."""
 
-    def reconstruct(*options: str, scan: Path = scan) -> list[str]:
+    def reconstruct(*options: str, scan: Path = scan) -> str:
         caplog.clear()
         assert cli.run(["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), *options]) == 0
-        return [record.getMessage() for record in caplog.records]
+        return caplog.text
 
     return reconstruct
 
 
-def test_a_threshold_above_everything_is_said(warned):
+def test_doubtful_options_are_said_and_others_not(warned) -> None:
     few = ["--iterations", "1"]
-    assert (
-        "no voxel of the first volume is above initial_threshold 5"
-        in warned(*few, "--set", "initial_threshold=5")[0]
-    )
-    assert warned(*few) == []
+    threshold = warned(*few, "--set", "initial_threshold=5")
+    assert "no voxel of the first volume is above initial_threshold 5" in threshold
+    assert "13 strips are more than the 12 lines of " in warned(*few, "--strips", "13")
+    assert warned(*few, "--strips", "12") == warned(*few) == warned("--method", "fdk") == ""
 
 
-def test_more_strips_than_lines_are_said(warned):
-    few = ["--iterations", "1"]
-    assert warned(*few, "--strips", "12") == []
-    assert warned(*few, "--strips", "13")[0].startswith("13 strips are more than the 12 lines of ")
-
-
-def test_fdk_of_one_angle_is_said(cli, warned, tmp_path):
-    path = tmp_path / "one.h5"
-    assert cli.run(["simulate", *TINY, "--views", "1", "-o", str(path)]) == 0
-    assert "all views are from one angle" in warned("--method", "fdk", scan=path)[0]
-
-
-def test_frames_that_do_not_follow_each_other_are_said(warned, scan, tmp_path):
-    path = tmp_path / "swapped.h5"
-    path.write_bytes(scan.read_bytes())
-    with h5py.File(path, "r+") as file:
+def test_doubtful_frames_are_said(cli, warned, scan, tiny, tmp_path) -> None:
+    one, swapped = tmp_path / "one.h5", tmp_path / "swapped.h5"
+    assert cli.run(["simulate", *tiny, "--views", "1", "-o", str(one)]) == 0
+    assert "all views are from one angle" in warned("--method", "fdk", scan=one)
+    swapped.write_bytes(scan.read_bytes())
+    with h5py.File(swapped, "r+") as file:
         times = file["entry/instrument/detector/frame_start_time"]
         times[...] = np.sort(times[()])[[0, 2, 1, 3]]
-    assert any(
-        "frame 2 starts no later than frame 1" in line for line in warned("--method", "fdk", scan=path)
-    )
-    assert warned("--method", "fdk") == []
+    assert "frame 2 starts no later than frame 1" in warned("--method", "fdk", scan=swapped)
 
 
-@pytest.mark.parametrize(
-    ("motion", "is_fly", "expected"),
-    [
+def test_detector_models_differ_only_where_poses_are_averaged(scan) -> None:
+    """A method of one's own without the intensity model is warned of there; of one pose per line both are the same."""
+    loaded = load_scan(scan)
+    for motion, is_fly, expected in (
         (MicroViews(), True, True),
         (Exact(), True, True),
         (Static(), True, False),
-        (LineMiddles(), True, False),  # one pose per line: there is nothing to average
+        (LineMiddles(), True, False),
         (MicroViews(), False, False),
-    ],
-)
-def test_detector_models_differ_only_where_poses_are_averaged(scan, motion, is_fly, expected):
-    loaded = load_scan(scan)
-    object.__setattr__(loaded, "is_fly", is_fly)
-    options = SimpleNamespace(motion=motion)
-    assert reconstruct._averages(loaded, options) == expected
+    ):
+        object.__setattr__(loaded, "is_fly", is_fly)
+        assert reconstruct._averages(loaded, SimpleNamespace(motion=motion)) == expected, (motion, is_fly)
 
 
-def test_files_of_another_kind_are_called_by_their_kind(cli, scan, tmp_path, capfd):
-    volume, bare = tmp_path / "volume.h5", tmp_path / "bare.h5"
-    assert cli.run(["reconstruct", str(scan), "-o", str(volume), "--method", "fdk"]) == 0
+def test_files_of_another_kind_are_called_by_their_kind(refused, scan, volume, tmp_path) -> None:
+    bare, output = tmp_path / "bare.h5", ["-o", tmp_path / "out.h5"]
     with h5py.File(bare, "w") as file:
         file["volume"] = np.ones((4, 4, 4), np.uint8)
-    output = ["-o", str(tmp_path / "out.h5")]
-    for command, expected in (
-        (["reconstruct", str(volume), *output], f"{volume}: found a volume of phyradgs-cl; expected a scan"),
-        (
-            ["reconstruct", str(bare), *output],
-            f"{bare}: found a bare volume (dataset /volume); expected a scan",
-        ),
-        (["evaluate", str(scan), "--reference", str(scan)], f"{scan}: found a scan; expected a volume"),
-        (["simulate", "--volume", str(scan), *output], f"{scan}: found a scan; expected a bare volume"),
+    damaged = Path(f"{output[1]}.checkpoint.npz")
+    damaged.write_text("no archive")
+    for words, expected in (
+        (["reconstruct", volume, *output], f"{volume}: found a volume of phyradgs-cl; expected a scan"),
+        (["reconstruct", bare, *output], f"{bare}: found a bare volume (dataset /volume); expected a scan"),
+        (["evaluate", scan, "--reference", scan], f"{scan}: found a scan; expected a volume"),
+        (["simulate", "--volume", scan, *output], f"{scan}: found a scan; expected a bare volume"),
+        (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a whole one"),
     ):
-        capfd.readouterr()
-        assert cli.run(command) == 2
-        error = capfd.readouterr().err
-        assert error.startswith(f"phyradgs: {expected}")
-        assert error.count("\n") == 1
+        refused(words, expected)
 
 
-def test_a_volume_at_the_resolution_of_its_grid_is_said(cli, tmp_path, caplog):
-    bare = tmp_path / "bare.h5"
-    with h5py.File(bare, "w") as file:
-        file["volume"] = np.pad(np.full((4, 4, 4), 200, np.uint8), 2)
-    command = ["simulate", "--volume", str(bare), "--detector", "8", "--views", "2", "-o"]
-    assert cli.run([*command, str(tmp_path / "s.h5"), "--size", "4"]) == 0
-    assert "inverse crime" not in caplog.text
-    assert cli.run([*command, str(tmp_path / "s.h5")]) == 0
-    assert "8×8×8 voxels are projected and a grid of 8×8×8 is to be reconstructed" in caplog.text
-
-
-def test_a_damaged_checkpoint_is_called_damaged(cli, scan, tmp_path, capfd):
-    output = tmp_path / "v.h5"
-    Path(f"{output}.checkpoint.npz").write_text("no archive")
-    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--resume"]) == 2
-    error = capfd.readouterr().err
-    assert "found a damaged checkpoint; expected a whole one; start without --resume" in error
-
-
-def test_one_voxel_is_too_few_for_a_phantom(cli, tmp_path, capfd):
-    assert cli.run(["simulate", "--size", "1", "--detector", "8", "-o", str(tmp_path / "s.h5")]) == 2
-    assert capfd.readouterr().err == "phyradgs: --size: found 1; expected a number from 2 to 4096\n"
-
-
-def test_a_picture_without_room_is_not_left_in_part(cli, scan, tmp_path, capfd, monkeypatch):
-    volume, picture = tmp_path / "volume.h5", tmp_path / "p.png"
-    assert cli.run(["reconstruct", str(scan), "-o", str(volume), "--method", "fdk"]) == 0
+def test_a_picture_without_room_is_not_left_in_part(refused, scan, volume, tmp_path, monkeypatch) -> None:
+    picture = tmp_path / "p.png"
     picture.write_bytes(b"an older picture")
 
     def full(path: Path, *_: object) -> None:
@@ -143,48 +95,66 @@ def test_a_picture_without_room_is_not_left_in_part(cli, scan, tmp_path, capfd, 
         raise OutputError(str(path), "no room") from OSError(28, "No space left on device")
 
     monkeypatch.setattr(evaluate, "slices_png", full)
-    capfd.readouterr()
-    command = ["evaluate", str(volume), "--reference", str(scan), "--picture", str(picture)]
-    assert cli.run(command) == 4
-    assert capfd.readouterr().err.startswith(f"phyradgs: {picture}: found no room left in folder")
-    assert picture.read_bytes() == b"an older picture"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["p.png", "volume.h5"]
+    words = ["evaluate", volume, "--reference", scan, "--picture", picture]
+    refused(words, f"phyradgs: {picture}: found no room left in folder", status=4)
+    assert picture.read_bytes() == b"an older picture" and list(tmp_path.iterdir()) == [picture]
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="POSIX")
-@pytest.mark.parametrize("where", [{"HOME": "/dev/null"}, {"POCL_CACHE_DIR": "/dev/null/cache"}])
-def test_a_cache_that_cannot_be_written_is_replaced(tmp_path, where):
-    kept = {k: v for k, v in os.environ.items() if k not in ("POCL_CACHE_DIR", "XDG_CACHE_HOME")}
-    command = [sys.executable, "-m", "phyradgs_cl", "devices"]
-    environment = {**kept, "TMPDIR": str(tmp_path), **where}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    if "PoCL" in done.stdout:
-        assert "cannot be written: kernels are kept in" in done.stderr
-        assert "set POCL_CACHE_DIR" in done.stderr
-
-
-def test_no_device_for_want_of_a_cache_is_said(cli, capfd, monkeypatch):
+def test_no_device_for_want_of_a_cache_is_said(refused, monkeypatch) -> None:
     monkeypatch.setattr(pocl, "_unwritable", Path("/full/cache"))
     monkeypatch.setattr(device, "list_devices", list)
-    assert cli.run(["devices"]) == 5
-    assert capfd.readouterr().err == (
-        "phyradgs: OpenCL: found no device, and PoCL's cache /full/cache cannot be written; expected at least one; "
-        "set POCL_CACHE_DIR to a folder that can be written\n"
-    )
+    refused(["devices"], "/full/cache cannot be written", "set POCL_CACHE_DIR to a folder that can", status=5)
 
 
-def test_a_reader_that_goes_away_is_no_error(scan):
-    for command in ("info", "devices", "--help"):
-        arguments = [
-            sys.executable,
-            "-m",
-            "phyradgs_cl",
-            command,
-            *([str(scan)] if command == "info" else []),
-        ]
-        started = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        assert started.stdout is not None and started.stderr is not None
+def test_a_reader_that_goes_away_is_no_error(scan) -> None:
+    for words in (["info", str(scan)], ["devices"], ["--help"]):
+        command = [sys.executable, "-m", "phyradgs_cl", *words]
+        started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         started.stdout.close()
-        assert started.stderr.read() == ""
-        assert started.wait(60) == 0
+        assert started.stderr.read() == "" and started.wait(60) == 0
+
+
+# --- homes that cannot be written, variables of drivers, a standard error that is closed ---------------------------------
+
+COMMAND = [sys.executable, "-m", "phyradgs_cl"]
+POSIX = pytest.mark.skipif(os.name != "posix", reason="a shell and devices of POSIX")
+
+
+def run(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run([*COMMAND, *words], env=environment, capture_output=True, text=True, check=False)
+
+
+@POSIX
+def test_a_cache_that_cannot_be_written_costs_a_warning(tiny, tmp_path: Path) -> None:
+    """PoCL's users are told of its cache."""
+    usual = {name: os.environ[name] for name in os.environ.keys() - {"POCL_CACHE_DIR", "XDG_CACHE_HOME"}}
+    for where in ({"HOME": "/dev/null"}, {"POCL_CACHE_DIR": "/dev/null/cache"}):
+        output = tmp_path / f"{next(iter(where))}.h5"
+        done = run("simulate", *tiny, "-o", str(output), **usual | {"TMPDIR": str(tmp_path)} | where)
+        told = [line for line in done.stderr.splitlines() if not line.startswith("frame ")]
+        assert done.returncode == 0 and len(told) <= 1 and output.exists(), (where, done.stderr)
+        for line in told:
+            assert "cannot be written: kernels are kept in" in line and "set POCL_CACHE_DIR" in line
+
+
+def test_a_number_of_threads_that_pocl_would_crash_on_is_refused(monkeypatch) -> None:
+    monkeypatch.setenv(pocl.CACHE_VARIABLE, os.environ.get(pocl.CACHE_VARIABLE, ""))
+    for wish in ("-1", "0", "abc", "1.5", "1e3", "1025", "99999999999999999999"):
+        monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
+        with pytest.raises(InputError, match=f"POCL_MAX_PTHREAD_COUNT: found '{wish}'; expected a whole"):
+            pocl.prepare_environment()
+    for wish in ("", "1", "1024"):
+        monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
+        pocl.prepare_environment()
+        assert os.environ[pocl.THREADS_VARIABLE] == wish
+    done = run("devices", **os.environ | {pocl.THREADS_VARIABLE: "-1"})  # before the driver sees it
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("phyradgs: POCL_MAX_PTHREAD_COUNT: found '-1'")
+
+
+@POSIX
+def test_without_standard_error_the_status_is_right() -> None:
+    for words in ("info none.h5", "reconstruct --nonsense", "nonsense"):
+        shell = ["sh", "-c", f'"$0" -m phyradgs_cl {words} 2>&-', sys.executable]
+        done = subprocess.run(shell, capture_output=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (2, b"", b""), words

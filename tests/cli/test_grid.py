@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -14,14 +13,8 @@ from phyradgs_cl.io import read_volume
 from phyradgs_cl.report.run import load_run
 from phyradgs_cl.workflow import load_scan
 
-TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
 INSIDE = "-0.5,0.5,-0.5,0.75,-0.75,0.5"  # of a box of ±1 mm in voxels of 0.25 mm
 SIRT = ["--method", "sirt", "--iterations", "2"]
-
-
-@pytest.fixture(scope="module")
-def scan(simulated) -> Path:
-    return simulated(*TINY)
 
 
 def test_what_is_chosen_is_in_the_result_and_told(cli, scan, tmp_path, capsys, caplog) -> None:
@@ -60,28 +53,21 @@ def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_pa
     assert "--method sirt puts what lies beyond into it" in line
 
 
-def test_a_run_does_not_go_on_with_another_grid(cli, scan, tmp_path, capfd, monkeypatch) -> None:
-    output = tmp_path / "v.h5"
+def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, monkeypatch) -> None:
+    output, kept = tmp_path / "v.h5", tmp_path / "kept"
     command = ["reconstruct", str(scan), "-o", str(output), *SIRT]
-    (tmp_path / "kept").mkdir()
-    kept = tmp_path / "kept" / "checkpoint"
-    monkeypatch.setattr("phyradgs_cl.workflow.reconstruct._Keeper.__call__", _keeping(kept))
-    assert cli.run([*command, "--size", "6"]) == 0
-    os.replace(kept, f"{output}.checkpoint.npz")
-    assert cli.run([*command, "--size", "7", "--resume"]) == 2
-    assert "a run with other input.size (6, now 7)" in capfd.readouterr().err
-    assert cli.run([*command, "--size", "6", "--resume"]) == 0
-
-
-def _keeping(path: Path):
-    """A keeper's report that leaves the checkpoint of the first iteration at ``path``."""
 
     def keep(keeper, progress) -> None:
+        """Leaves the checkpoint of the first iteration."""
         if progress.iteration == 1:
             keeper._keep(dict(progress.state()), 1)
-            os.replace(keeper.path, path)
+            os.replace(keeper.path, kept)
 
-    return keep
+    monkeypatch.setattr("phyradgs_cl.workflow.reconstruct._Keeper.__call__", keep)
+    assert cli.run([*command, "--size", "6"]) == 0
+    os.replace(kept, f"{output}.checkpoint.npz")
+    refused([*command, "--size", "7", "--resume"], "a run with other input.size (6, now 7)")
+    assert cli.run([*command, "--size", "6", "--resume"]) == 0
 
 
 def test_an_estimate_is_of_the_grid_that_is_chosen(cli, scan, capsys) -> None:

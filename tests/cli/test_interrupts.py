@@ -15,14 +15,8 @@ from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import evaluate, reconstruct, simulate
 
-TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
 NOTHING = "phyradgs: interrupted, nothing written\n"
 COMPLETE = "phyradgs: interrupted, the output is complete\n"
-
-
-@pytest.fixture(scope="module")
-def scan(simulated):
-    return simulated(*TINY)
 
 
 def interrupted_before(function):
@@ -36,15 +30,15 @@ def interrupted_before(function):
 
 
 COMMANDS = {
-    "simulate": ["simulate", *TINY],
+    "simulate": ["simulate", "--size", "8", "--detector", "12", "--views", "4"],
     "reconstruct": ["reconstruct", "{scan}", "--iterations", "4", "--gaussians", "20"],
     "fdk": ["reconstruct", "{scan}", "--method", "fdk"],
+    "evaluate": ["evaluate", "{volume}", "--reference", "{scan}"],
 }
 STAGES = [
     ("simulate", simulation, "load_scanner"),
     ("simulate", simulate, "check_writable"),
     ("simulate", simulate, "simulated_scan"),
-    ("simulate", Runtime, "kernel"),
     ("reconstruct", reconstruct, "load_scan"),
     ("reconstruct", reconstruct, "hashing"),
     ("fdk", Runtime, "launch"),
@@ -64,38 +58,34 @@ def test_before_the_output_there_is_nothing(cli, scan, tmp_path, capfd, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("command", "step"),
+    ("command", "owner", "step"),
     [
-        ("simulate", "write_scan"),
-        ("reconstruct", "compare"),
-        ("reconstruct", "write_volume"),
-        ("fdk", "write_volume"),
+        ("simulate", simulate, "write_scan"),
+        ("reconstruct", reconstruct, "compare"),
+        ("reconstruct", reconstruct, "write_volume"),
+        ("evaluate", evaluate, "slices_png"),
     ],
 )
-def test_an_output_that_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypatch, command, step):
-    output = tmp_path / "output.h5"
-    owner = simulate if command == "simulate" else reconstruct
+def test_what_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypatch, command, owner, step):
+    volume = tmp_path / "volume.h5"
+    output = volume.with_suffix(".png") if command == "evaluate" else tmp_path / "output.h5"
+    if command == "evaluate":
+        assert cli.run(["reconstruct", str(scan), "--method", "fdk", "-o", str(volume)]) == 0
     monkeypatch.setattr(owner, step, interrupted_before(interrupted_before(getattr(owner, step))))
-    arguments = [a.format(scan=scan) for a in COMMANDS[command]]
-    assert cli.run([*arguments, "-o", str(output)]) == 130
-    captured = capfd.readouterr().err
-    assert captured.splitlines()[-1] == COMPLETE.strip()
-    assert "nothing written" not in captured
-    assert "Traceback" not in captured
-    with h5py.File(output) as file:
-        assert "entry" in file
-    assert list(tmp_path.iterdir()) == [output]
+    words = [word.format(scan=scan, volume=volume) for word in COMMANDS[command]]
+    assert cli.run([*words, "--picture" if command == "evaluate" else "-o", str(output)]) == 130
+    said = capfd.readouterr().err
+    assert said.splitlines()[-1] == COMPLETE.strip()
+    assert "nothing written" not in said and "Traceback" not in said
+    assert output.stat().st_size > 1000 and set(tmp_path.iterdir()) - {volume} == {output}
+    if output.suffix == ".h5":
+        assert "entry" in h5py.File(output)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_picture_that_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypatch):
-    volume, picture = tmp_path / "volume.h5", tmp_path / "volume.png"
-    assert cli.run(["reconstruct", str(scan), "--method", "fdk", "-o", str(volume)]) == 0
-    monkeypatch.setattr(evaluate, "slices_png", interrupted_before(evaluate.slices_png))
-    capfd.readouterr()
-    assert cli.run(["evaluate", str(volume), "--reference", str(scan)]) == 130
-    assert capfd.readouterr().err == COMPLETE
-    assert picture.stat().st_size > 1000
+def at_a_kernel(kernel: str = "press", before: str = "") -> str:
+    """A program that does what ``kernel`` does where a kernel is built."""
+    return f"{textwrap.dedent(before)}\nimport phyradgs_cl.runtime as r\nr.Runtime.kernel = {kernel}\n"
 
 
 # Each program presses Ctrl-C itself, at a stage of its own, in a process that starts as a user's would.
@@ -104,70 +94,53 @@ PROCESSES = {
         class Press:
             def find_spec(self, name, path, target=None):
                 if name == "typer":
-                    signal.raise_signal(signal.SIGINT)
+                    press()
         sys.meta_path.insert(0, Press())
     """,
-    "while a kernel is built": """
-        import phyradgs_cl.runtime as r
-        def kernel(*_, **__):
-            signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = kernel
-    """,
-    "and again while the line is printed": """
+    "while a kernel is built": at_a_kernel(),
+    "as kill asks": at_a_kernel("lambda *_, **__: signal.raise_signal(signal.SIGTERM)"),
+    "and again while the line is printed": at_a_kernel(
+        before="""
         import typer
-        import phyradgs_cl.runtime as r
-        def press(*_, **__):
-            signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = press
         echo = typer.echo
-        def pressed(*arguments, **options):
-            echo(*arguments, **options)
+        typer.echo = lambda *words, **options: (echo(*words, **options), press())
+        """
+    ),
+    "in a destructor, which swallows exceptions": at_a_kernel(
+        "lambda *_, **__: [Thing()].clear()", "class Thing:\n    __del__ = press\n"
+    ),
+    "in a library that swallows whatever comes": at_a_kernel(
+        "kernel",
+        "def kernel(*_, **__):\n    with contextlib.suppress(BaseException):\n        press()\n",
+    ),
+    "while a folder is half written": at_a_kernel(
+        "kernel",
+        """
+        def kernel(*_, **__):
+            from phyradgs_cl import signals
+            signals.unfinished.add(os.path.abspath("volume.part"))
+            os.mkdir("volume.part")
+            open("volume.part/slice", "w").close()
             press()
-        typer.echo = pressed
-    """,
-    "in a destructor, which swallows exceptions": """
-        import phyradgs_cl.runtime as r
-        class Thing:
-            def __del__(self):
-                signal.raise_signal(signal.SIGINT)
-        def kernel(*_, **__):
-            Thing()
-        r.Runtime.kernel = kernel
-    """,
-    "in a library that swallows whatever comes": """
-        import phyradgs_cl.runtime as r
-        def kernel(*_, **__):
-            try:
-                signal.raise_signal(signal.SIGINT)
-            except BaseException:
-                pass
-        r.Runtime.kernel = kernel
-    """,
+        """,
+    ),
     "while the output is half written": """
         import h5py
-        h5py.Group.require_group = h5py.Group.create_group = lambda *_, **__: signal.raise_signal(signal.SIGINT)
+        h5py.Group.require_group = h5py.Group.create_group = press
         import phyradgs_cl.workflow.simulate as w
-        import contextlib
         w.finish_despite_interrupt = contextlib.nullcontext  # as in a command that does not hold signals
     """,
 }
 
 
 @pytest.mark.parametrize("stage", PROCESSES)
-def test_a_process_ends_with_one_line_and_130(tmp_path, stage):
-    output = tmp_path / "scan.h5"
-    done = run_process(["simulate", *TINY, "-o", str(output)], PROCESSES[stage])
-    assert done.returncode == 130, done.stderr
+def test_a_process_ends_with_one_line_and_130(tmp_path, monkeypatch, stage):
+    monkeypatch.chdir(tmp_path)
+    done = run_process([*COMMANDS["simulate"], "-o", str(tmp_path / "scan.h5")], PROCESSES[stage])
+    assert done.returncode == (143 if "SIGTERM" in PROCESSES[stage] else 130), done.stderr
     lines = done.stderr.splitlines(keepends=True)
     assert "".join(line for line in lines if not line.startswith("frame 4/4")) == NOTHING
-    assert done.stdout == ""
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_sigterm_is_answered_as_ctrl_c_is(tmp_path):
-    body = PROCESSES["while a kernel is built"].replace("SIGINT", "SIGTERM")
-    done = run_process(["simulate", *TINY, "-o", str(tmp_path / "scan.h5")], body)
-    assert (done.returncode, done.stderr) == (143, NOTHING)
+    assert done.stdout == "" and list(tmp_path.iterdir()) == []
 
 
 # A signal at the second report of a loop: it comes again at once, as wrappers pass it on.
@@ -183,8 +156,10 @@ AT_A_REPORT = """
 """
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
-@pytest.mark.parametrize("method", ["sart", "phyradgs"])
+@pytest.mark.parametrize(
+    ("name", "status", "method"),
+    [("SIGINT", 130, "sart"), ("SIGTERM", 143, "sart"), ("SIGINT", 130, "phyradgs")],
+)
 def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, capsys, name, status, method):
     output, whole = tmp_path / "volume.h5", tmp_path / "whole.h5"
     output.write_bytes(b"an older result")
@@ -213,32 +188,27 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
 
 
 def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(scan, tmp_path):
-    body = """
-        import phyradgs_cl.reconstructors.voxels.run as i
-        from phyradgs_cl.errors import DeviceError
-        def iterate(run):
-            signal.raise_signal(signal.SIGINT)
-            raise DeviceError("kernel rays.cl", "linker command failed", "a program that builds")
-        i._Iterations.step = iterate
-    """
-    output = tmp_path / "volume.h5"
-    done = run_process(["reconstruct", str(scan), "--method", "sirt", "-o", str(output)], body)
-    assert (done.returncode, done.stderr) == (130, NOTHING)
-    done = run_process(
-        ["reconstruct", str(scan), "--method", "sirt", "-o", str(output)],
-        body.replace("signal.raise_signal(signal.SIGINT)", "pass"),
-    )
-    assert done.returncode == 5 and "linker command failed" in done.stderr
+    command = ["reconstruct", str(scan), "--method", "sirt", "-o", str(tmp_path / "volume.h5")]
+    pressed = "signal.raise_signal(signal.SIGINT)"
+    for first, status, said in ((pressed, 130, NOTHING), ("pass", 5, "linker command failed")):
+        body = f"""
+            import phyradgs_cl.reconstructors.voxels.run as i
+            from phyradgs_cl.errors import DeviceError
+            def iterate(run):
+                {first}
+                raise DeviceError("kernel rays.cl", "linker command failed", "a program that builds")
+            i._Iterations.step = iterate
+        """
+        done = run_process(command, body)
+        assert done.returncode == status and said in done.stderr
+        assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_after_the_last_line_changes_nothing(scan, name):
-    body = f"""
-        import atexit
-        atexit.register(signal.raise_signal, signal.{name})
-    """
-    done = run_process(["info", str(scan)], body)
-    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("kind")
+def test_a_signal_after_the_last_line_changes_nothing(scan):
+    for name in ("SIGINT", "SIGTERM"):
+        body = f"import atexit\natexit.register(signal.raise_signal, signal.{name})"
+        done = run_process(["info", str(scan)], body)
+        assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("kind")
 
 
 def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
@@ -275,34 +245,18 @@ def test_a_signal_in_the_last_iteration_is_not_lost(scan, tmp_path, method):
     assert list(tmp_path.iterdir()) == [output]
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
-@pytest.mark.parametrize(("module", "step"), [("workflow.sweep.run", "make_run"), ("workflow.quick", "run_simulation")])
+@pytest.mark.parametrize(
+    ("name", "status", "module", "step"),
+    [("SIGINT", 130, "sweep.run", "make_run"), ("SIGTERM", 143, "quick", "run_simulation")],
+)
 def test_a_benchmark_ends_with_its_own_line(tmp_path, name, status, module, step):
     body = f"""
-        import phyradgs_cl.{module} as r
+        import phyradgs_cl.workflow.{module} as r
         r.{step} = lambda *_, **__: signal.raise_signal(signal.{name})
     """
     done = run_process(["bench", "quick", "-o", str(tmp_path)], body)
     expected = f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to go on\n"
     assert (done.returncode, done.stderr) == (status, expected)
-
-
-def test_unfinished_folders_go_as_files_do(tmp_path):
-    folder = tmp_path / "volume.part"
-    body = f"""
-        import os
-        from phyradgs_cl import signals
-        import phyradgs_cl.runtime as r
-        def kernel(*_, **__):
-            signals.unfinished.add({str(folder)!r})
-            os.mkdir({str(folder)!r})
-            open({str(folder / "slice")!r}, "w").close()
-            signal.raise_signal(signal.SIGINT)
-        r.Runtime.kernel = kernel
-    """
-    done = run_process(["simulate", *TINY, "-o", str(tmp_path / "scan.h5")], body)
-    assert (done.returncode, done.stderr) == (130, NOTHING)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_signals_are_answered_before_anything_heavy_loads():
@@ -316,8 +270,9 @@ def test_signals_are_answered_before_anything_heavy_loads():
 def run_process(arguments, body):
     """The command line in a process that runs ``body`` first."""
     program = (
-        "import signal, sys\n"
+        "import contextlib, os, signal, sys\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def press(*_, **__):\n    signal.raise_signal(signal.SIGINT)\n"
         f"sys.argv = {['phyradgs', *arguments]!r}\n"
         f"from phyradgs_cl.__main__ import main\n{textwrap.dedent(body)}\nmain()\n"
     )

@@ -31,14 +31,14 @@ def scan(simulated) -> Path:
     return simulated(*TINY, "--noise", "tigre")
 
 
-def volume(path: Path) -> np.ndarray:
-    return read_volume(path).volume
-
-
 def command(scan: Path, output: Path, options: list[str]) -> list[str]:
     """A run that keeps a checkpoint at every report."""
     start = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(output)]
     return [*start, *options, "--checkpoint-every", "1e-6"]
+
+
+def finished(scan: Path, output: Path, options: list[str]) -> subprocess.CompletedProcess:
+    return subprocess.run(command(scan, output, options), capture_output=True, text=True, check=False)
 
 
 def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
@@ -72,7 +72,7 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name)
             kill_in_the_middle(run, killed, 0.0)
     resume = ["--resume"] if checkpoint_path(killed).exists() else []
     subprocess.run([*run, *resume], check=True, capture_output=True)
-    np.testing.assert_array_equal(volume(killed), volume(whole))
+    np.testing.assert_array_equal(read_volume(killed).volume, read_volume(whole).volume)
     told, expected = (
         [line["iteration"] for line in read_volume(path).provenance["record"]] for path in (killed, whole)
     )
@@ -81,19 +81,13 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name)
 
 
 def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
-    output = tmp_path / "volume.h5"
-    first = subprocess.Popen(
-        command(scan, output, ["--iterations", "100000"]),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    output, quiet = tmp_path / "volume.h5", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    first = subprocess.Popen(command(scan, output, ["--iterations", "100000"]), **quiet)
     try:
         deadline = time.monotonic() + 60
         while not checkpoint_path(output).exists() and time.monotonic() < deadline:
             time.sleep(0.02)
-        second = subprocess.run(
-            command(scan, output, ["--method", "fdk"]), capture_output=True, text=True, check=False
-        )
+        second = finished(scan, output, ["--method", "fdk"])
     finally:
         first.kill()
         first.wait()
@@ -101,25 +95,15 @@ def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
     assert second.stderr.count("\n") == 1 and "volume.h5: found another run at work on it" in second.stderr
 
 
-def test_a_checkpoint_that_cannot_be_written_is_a_warning(scan, tmp_path) -> None:
-    output = tmp_path / "volume.h5"
+def test_a_checkpoint_is_neither_needed_nor_lost(scan, tmp_path) -> None:
+    """It is a warning that none can be written, and a run that forgets one sets it aside."""
+    output, short = tmp_path / "volume.h5", ["--method", "sirt", "--iterations", "3"]
     checkpoint_path(output).mkdir()
-    done = subprocess.run(
-        command(scan, output, ["--method", "sirt", "--iterations", "3"]),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0 and done.stderr.count("no checkpoint") == 1
-    assert output.exists()
-
-
-def test_a_checkpoint_is_not_lost_to_a_run_that_forgets_it(scan, tmp_path) -> None:
-    output = tmp_path / "volume.h5"
-    long = ["--method", "sirt", "--iterations", "100000"]
-    kill_in_the_middle(command(scan, output, long), output, 0.01)
+    done = finished(scan, output, short)
+    assert done.returncode == 0 and done.stderr.count("no checkpoint") == 1 and output.exists()
+    checkpoint_path(output).rmdir()
+    kill_in_the_middle(command(scan, output, [*short, "--iterations", "100000"]), output, 0.01)
     kept = checkpoint_path(output).read_bytes()
-    short = command(scan, output, ["--method", "sirt", "--iterations", "3"])
-    done = subprocess.run(short, capture_output=True, text=True, check=False)
+    done = finished(scan, output, short)
     assert done.returncode == 0 and "kept as volume.h5.checkpoint.npz.bak" in done.stderr
     assert checkpoint_path(output).with_name("volume.h5.checkpoint.npz.bak").read_bytes() == kept

@@ -1,5 +1,7 @@
 """What is said on the way: the quantity by its name, Gaussians where there are any, time left."""
 
+from __future__ import annotations
+
 import pytest
 
 from phyradgs_cl import progress
@@ -15,26 +17,23 @@ def now(monkeypatch):
     return seconds
 
 
-def test_a_loss_comes_with_its_gaussians(capsys):
+def test_a_loss_comes_with_its_gaussians_and_a_residual_without(capsys) -> None:
     Ticker("iteration").progress(Progress(50, 50, 0.125, 300, 1.0))
     assert capsys.readouterr().err == "iteration 50/50  loss 0.12500  300 Gaussians\n"
-
-
-def test_a_residual_comes_without(capsys):
     Ticker("iteration").progress(Progress(3, 3, 0.5, 0, 1.0, quantity="residual"))
     assert capsys.readouterr().err == "iteration 3/3  residual 0.50000\n"
 
 
-def test_rate_and_time_left_count_from_the_first_report(capsys, now):
+def test_rate_and_time_left_count_from_the_first_report(capsys, now) -> None:
     ticker = Ticker("frame")
-    now[0] = 20.0
-    ticker.show(10, 100)
-    now[0] = 40.0
-    ticker.show(30, 100)
+    for now[0], done in ((20.0, 10), (40.0, 30)):
+        ticker.show(done, 100)
     assert capsys.readouterr().err == "frame 10/100\nframe 30/100  1.0/s  ETA 1:10\n"
+    times = {0.2: "0:00", 59.6: "1:00", 125: "2:05", 3600: "1:00:00"}
+    assert {seconds: clock(seconds) for seconds in times} == times
 
 
-def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypatch):
+def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypatch) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with Ticker("frame") as ticker:
         ticker.stage("reading scan.h5")
@@ -44,25 +43,15 @@ def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypat
     with Ticker("frame") as ticker:
         ticker.stage("reading")
     assert capsys.readouterr().err == "\r\x1b[Kreading\r\x1b[K"  # a result, or an error, has the line
+    monkeypatch.setattr("sys.stderr", None)
+    with Ticker("frame") as ticker:
+        ticker.show(1, 1)
+    assert not ticker.is_open  # nothing to close where nothing could be written
 
 
-def test_a_file_gets_a_line_every_ten_seconds_and_the_last(capsys, now):
+def test_a_file_gets_a_line_every_ten_seconds_and_the_last(capsys, now) -> None:
     ticker = Ticker("frame")
     for second in range(31):
         now[0] = float(second)
         ticker.show(second, 30)
     assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["10/30", "20/30", "30/30"]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.2, "0:00"), (59.6, "1:00"), (125, "2:05"), (3600, "1:00:00")]
-)
-def test_times_read_as_clocks(seconds, text):
-    assert clock(seconds) == text
-
-
-def test_no_stderr_is_no_trouble(monkeypatch):
-    monkeypatch.setattr("sys.stderr", None)
-    with Ticker("frame") as ticker:
-        ticker.show(1, 1)
-    assert not ticker.is_open  # nothing to close where nothing could be written

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
+from phyradgs_cl.commands.run_options import RUN_OPTIONS, RunRequest, with_run_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import method_options
 from phyradgs_cl.settings import RunSettings, run_settings
@@ -51,14 +54,11 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
     [
         ("iterations = 'many'", "iterations: found 'many'; expected a whole number"),
         ("strips = 2.5", "strips: found 2.5"),
-        ("sub_intervals = 0", "sub_intervals: found 0"),
         ("motion = 'wobble'", "motion: found 'wobble'"),
         ("method = 'magic'", "method: found 'magic'"),
-        ("preset = 'best'", "preset: found 'best'"),
         ("seed = 1.5", "seed: found 1.5; expected a whole number"),
         ("device = -1", "device: found -1"),
         ("median_filter = 4", "median_filter: found 4"),
-        ("gaussians = -1", "gaussians: found -1"),
         ("[control]\nthreshold = -1", "control.threshold: found -1.0"),
         ("[control]\nevry = 3", "control.evry: found no such option of --method phyradgs"),
         ("method = 'fdk'\nwindow = 'round'", "window: found 'round'"),
@@ -83,14 +83,56 @@ def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
     config.write_text("method = 'FISTA-TV'\nsize = [8, 9, 10]\n")
     found = run_settings(config, {"size": None, "voxel_mm": (0.5, 0.5, 0.5)})
     assert (found.method, found.before.size, found.before.voxel_mm) == ("fista-tv", (8, 9, 10), (0.5,) * 3)
-    assert run_settings(config, {"size": 7.0, "method": "Sirt"}).before.size == 7
-    assert run_settings(config, {"size": 7.0, "method": "Sirt"}).method == "sirt"
+    found = run_settings(config, {"size": 7.0, "method": "Sirt"})
+    assert (found.method, found.before.size) == ("sirt", 7)
 
 
 def test_a_method_offers_only_what_it_has() -> None:
-    with pytest.raises(InputError) as caught:
-        method_options("fdk", None, {"length": 1})
-    assert caught.value.expected == "window, motion"
-    with pytest.raises(InputError) as caught:
-        method_options("sart", None, {"length": 1})
-    assert caught.value.expected.endswith("motion, strips, sub_intervals")
+    for method, offered in (("fdk", "window, motion"), ("sart", "motion, strips, sub_intervals")):
+        with pytest.raises(InputError) as caught:
+            method_options(method, None, {"length": 1})
+        assert caught.value.expected.endswith(offered)
+
+
+# --- the options of a reconstruction, as commands get them -------------------------------------------------------------
+
+
+@pytest.fixture
+def asked() -> tuple[typer.Typer, list[object]]:
+    seen: list[object] = []
+    app = typer.Typer()
+
+    @app.command()
+    @with_run_options("seed", "batch")
+    def command(scan: str, request: RunRequest, often: Annotated[float, typer.Option()] = 2.0) -> None:
+        """What it does."""
+        seen.extend([scan, request, often])
+
+    return app, seen
+
+
+def test_a_command_gets_what_was_given_and_none_for_the_rest(asked, tmp_path: Path) -> None:
+    app, seen = asked
+    config = tmp_path / "options.toml"
+    words = ["s.h5", "--method", "sirt", "--motion", "per-row", "--often", "3", "--ignore-lag"]
+    words += ["--set", "relaxation=0.5", "--set", "iterations=3", "--config", str(config), "--memory", "1GiB"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    scan, request, often = seen
+    assert (scan, often, request.config) == ("s.h5", 3.0, config)
+    assert request.assignments == ["relaxation=0.5", "iterations=3"]
+    given = {name: value for name, value in request.given.items() if value is not None}
+    assert given == {"method": "sirt", "motion": "per-row", "ignore_lag": True, "memory": "1GiB"}
+    assert set(request.given) == set(RUN_OPTIONS) - {"seed", "batch", "config", "assignments"}
+    config.write_text("iterations = 7\nseed = 5\n", encoding="utf-8")
+    settings = request.settings()
+    assert (settings.method, settings.seed, settings.memory) == ("sirt", 5, 2**30)
+    assert (settings.changes["iterations"], settings.changes["relaxation"]) == (3, 0.5)
+
+
+def test_nothing_given_is_nothing_given_and_what_is_left_out_is_no_option(asked) -> None:
+    app, seen = asked
+    for option in ("--seed", "--batch"):
+        assert CliRunner().invoke(app, ["s.h5", option, "1"]).exit_code == 2 and seen == []
+    assert CliRunner().invoke(app, ["s.h5"]).exit_code == 0
+    assert seen[1] == RunRequest(None, [], dict.fromkeys(seen[1].given))

@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from corpus import imports
+from corpus.hdf5_damage import put
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import checkpoint_path, write_checkpoint
@@ -105,11 +106,11 @@ def _write_counts(path: Path, fly: Path, rng: np.random.Generator) -> None:
         rows = np.clip(np.cumsum(key == 0) - 1, 0, None)
         starts, angles = f"{detector}/frame_start_time", ("rotation_angle", "rotation_angle_end")
         for name in (starts, *(f"entry/sample/{angle}" for angle in angles)):
-            _replace(file, name, file[name][()][rows])
+            put(file, name, file[name][()][rows])
         del file["entry/phyradgs/kinematics"]
-        _replace(file, f"{detector}/data", data)
+        put(file, f"{detector}/data", data)
         file[f"{detector}/data"].attrs["quantity"] = "counts"
-        _replace(file, f"{detector}/image_key", key)
+        put(file, f"{detector}/image_key", key)
         mask = np.zeros(frames.shape[1:], np.uint8)
         mask[0, 0] = 1
         file[f"{detector}/pixel_mask"] = mask
@@ -120,17 +121,8 @@ def _write_counts(path: Path, fly: Path, rng: np.random.Generator) -> None:
                 extra[name].attrs["units"] = unit
 
 
-def _replace(file: h5py.File, name: str, data: np.ndarray) -> None:
-    attributes = dict(file[name].attrs)
-    del file[name]
-    file.create_dataset(name, data=data).attrs.update(attributes)
-
-
-class _Stop:
-    """A report that presses Ctrl-C once."""
-
-    def __call__(self, progress: Progress) -> None:
-        raise KeyboardInterrupt
+def _stop(progress: Progress) -> None:
+    raise KeyboardInterrupt
 
 
 def _write_checkpoint(folder: Path, method: str) -> None:
@@ -144,7 +136,7 @@ def _write_checkpoint(folder: Path, method: str) -> None:
         scan, folder / method, method=method, changes=settings.changes, before=settings.before
     )
     chosen = workflow.method_options(job.method, job.preset, job.changes)
-    result = reconstruct(load_scan(scan), method, Runtime(), chosen, seed=0, report=_Stop())
+    result = reconstruct(load_scan(scan), method, Runtime(), chosen, seed=0, report=_stop)
     assert result.state is not None
     fingerprint = workflow._fingerprint(sha256_of(scan), job, chosen)
     write_checkpoint(checkpoint_path(folder / method), dict(result.state), fingerprint)

@@ -22,15 +22,17 @@ def on(address: str, change: Change) -> Damage:
     return damage
 
 
-def _put(file: h5py.File, address: str, value: object, **how: object) -> None:
+def put(file: h5py.File, address: str, value: object = None, **how: object) -> h5py.Dataset:
     """Another dataset with the attributes of the old one."""
     attributes = dict(file[address].attrs)
     del file[address]
-    file.create_dataset(address, data=value, **how).attrs.update(attributes)
+    made = file.create_dataset(address, data=value, **how)
+    made.attrs.update(attributes)
+    return made
 
 
 def _changed(change: Callable[[np.ndarray], object]) -> Change:
-    return lambda file, address: _put(file, address, change(np.asarray(file[address][()])))
+    return lambda file, address: put(file, address, change(np.asarray(file[address][()])))
 
 
 def _first(value: float) -> Change:
@@ -44,163 +46,126 @@ def _first(value: float) -> Change:
     return _changed(change)
 
 
-def removed(file: h5py.File, address: str) -> None:
-    del file[address]
+def _instead(make: Change) -> Change:
+    """Something else at the address, or nothing."""
 
+    def change(file: h5py.File, address: str) -> None:
+        del file[address]
+        make(file, address)
 
-def _misspelt(file: h5py.File, address: str) -> None:
-    file.move(address, f"{address}s")
-
-
-def _group(file: h5py.File, address: str) -> None:
-    del file[address]
-    file.create_group(address)
-
-
-def _dataset(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = 1.0
+    return change
 
 
 def _external_link(file: h5py.File, address: str) -> None:
     """To a good dataset of the same name in a good file beside this one."""
-    outside = Path(file.filename).with_name("outside.h5")
-    with h5py.File(outside, "w") as other:
+    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
         file.copy(address, other, name="there")
     del file[address]
     file[address] = h5py.ExternalLink("outside.h5", "/there")
 
 
-def _soft_loop(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = h5py.SoftLink("/loop")
-    file["/loop"] = h5py.SoftLink(address)
-
-
-def _dangling(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = h5py.SoftLink("/nowhere")
-
-
 def _virtual(file: h5py.File, address: str) -> None:
-    shape, dtype = file[address].shape, file[address].dtype
-    outside = Path(file.filename).with_name("outside.h5")
-    with h5py.File(outside, "w") as other:
-        other["there"] = file[address][()]
-    attributes = dict(file[address].attrs)
-    del file[address]
-    layout = h5py.VirtualLayout(shape, dtype)
+    shape, attributes = file[address].shape, dict(file[address].attrs)
+    layout = h5py.VirtualLayout(shape, file[address].dtype)
     layout[...] = h5py.VirtualSource("outside.h5", "there", shape)
+    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
+        other["there"] = file[address][()]
+    del file[address]
     file.create_virtual_dataset(address, layout).attrs.update(attributes)
 
 
 def _stored_outside(file: h5py.File, address: str) -> None:
-    values, attributes = np.atleast_1d(file[address][()]), dict(file[address].attrs)
+    values = np.atleast_1d(file[address][()])
     raw = Path(file.filename).with_suffix(".raw")
     values.tofile(raw)
-    del file[address]
-    made = file.create_dataset(
-        address, values.shape, values.dtype, external=[(str(raw), 0, h5py.h5f.UNLIMITED)]
-    )
-    made.attrs.update(attributes)
-
-
-def _null(file: h5py.File, address: str) -> None:
-    _put(file, address, h5py.Empty("f8"))
+    outside = [(str(raw), 0, h5py.h5f.UNLIMITED)]
+    put(file, address, shape=values.shape, dtype=values.dtype, external=outside)
 
 
 def _references(file: h5py.File, address: str) -> None:
-    shape = file[address].shape
-    values = np.full(shape, file["/"].ref, h5py.ref_dtype) if shape else file["/"].ref
-    _put(file, address, values, dtype=h5py.ref_dtype)
+    shape, root = file[address].shape, file["/"].ref
+    put(file, address, np.full(shape, root, h5py.ref_dtype) if shape else root, dtype=h5py.ref_dtype)
 
 
 def _huge(chunks: bool) -> Change:
     """Far more declared than stored, in the same number of axes."""
 
     def change(file: h5py.File, address: str) -> None:
-        axes, attributes = max(file[address].ndim, 1), dict(file[address].attrs)
-        del file[address]
+        axes = max(file[address].ndim, 1)
         shape = (int(1e12 ** (1 / axes)),) * axes
-        made = file.create_dataset(address, shape, "f8", chunks=(64,) * axes if chunks else None)
-        made.attrs.update(attributes)
+        put(file, address, shape=shape, dtype="f8", chunks=(64,) * axes if chunks else None)
 
     return change
 
 
 def _bomb(file: h5py.File, address: str) -> None:
     """128 MiB of zeros that deflate has shrunk to a thousandth."""
-    axes, attributes = max(file[address].ndim, 1), dict(file[address].attrs)
-    del file[address]
+    axes = max(file[address].ndim, 1)
     shape = {1: (1 << 25,), 2: (1 << 12, 1 << 13), 3: (128, 512, 512)}[axes]
     chunks = {1: (1 << 18,), 2: (32, 1 << 13), 3: (1, 512, 512)}[axes]
-    made = file.create_dataset(address, shape, "f4", chunks=chunks, compression="gzip", compression_opts=9)
+    made = put(file, address, shape=shape, dtype="f4", chunks=chunks, compression="gzip", compression_opts=9)
     piece = np.zeros((1 << 22,) if axes == 1 else (512, 512) if axes == 3 else (512, 1 << 13), np.float32)
     for start in range(0, shape[0], len(piece) if axes < 3 else 1):
         made[start : start + len(piece) if axes < 3 else start + 1] = piece
-    made.attrs.update(attributes)
 
 
 def _many_times_one_text(file: h5py.File, address: str) -> None:
     """A hundred thousand entries that are all one text of a megabyte: 100 GB out of a file of 3 MB."""
-    attributes = dict(file[address].attrs)
-    del file[address]
-    made = file.create_dataset(address, (100_000,), h5py.string_dtype(), chunks=(100_000,))
+    made = put(file, address, shape=(100_000,), dtype=h5py.string_dtype(), chunks=(100_000,))
     made[0] = "a" * (1 << 20)
-    made.attrs.update(attributes)
     one = made.id.read_direct_chunk((0,))[1][:16]
     made.id.write_direct_chunk((0,), one * 100_000)
 
 
+REMOVED = _instead(lambda file, address: None)
+LINKS: dict[str, Change] = {
+    "an external link": _external_link,
+    "a loop of links": _instead(
+        lambda f, a: (f.__setitem__(a, h5py.SoftLink("/loop")), f.__setitem__("/loop", h5py.SoftLink(a)))
+    ),
+    "a dangling link": _instead(lambda f, a: f.__setitem__(a, h5py.SoftLink("/nowhere"))),
+}
 FIELD: dict[str, Change] = {
-    "removed": removed,
-    "misspelt": _misspelt,
-    "a group": _group,
-    "a text": lambda f, a: _put(f, a, "text"),
-    "texts": lambda f, a: _put(f, a, ["a", "b"]),
+    "removed": REMOVED,
+    "misspelt": lambda f, a: f.move(a, f"{a}s"),
+    "a group": _instead(lambda f, a: f.create_group(a)),
+    "a text": lambda f, a: put(f, a, "text"),
+    "texts": lambda f, a: put(f, a, ["a", "b"]),
     "an axis more": _changed(lambda v: np.stack([v, v])),
     "nothing in it": _changed(lambda v: np.zeros((0, *v.shape[1:]), v.dtype)),
     "complex": _changed(lambda v: v.astype(np.complex64)),
     "a compound": _changed(lambda v: np.zeros(v.shape, "f4,f4")),
-    "null": _null,
+    "null": lambda f, a: put(f, a, h5py.Empty("f8")),
     "references": _references,
     "NaN": _first(np.nan),
     "infinite": _first(np.inf),
     "minus infinite": _first(-np.inf),
     "extreme": _first(1e300),
     "minus extreme": _first(-1e300),
-    "an external link": _external_link,
-    "a loop of links": _soft_loop,
-    "a dangling link": _dangling,
+    **LINKS,
     "virtual": _virtual,
     "stored outside": _stored_outside,
     "declared huge": _huge(False),
     "declared huge in chunks": _huge(True),
 }
+_OF_TEXTS = ("removed", "a group", "texts", "null", "an external link", "a loop of links", "virtual")
 TEXT: dict[str, Change] = {
-    **{
-        name: FIELD[name]
-        for name in ("removed", "a group", "texts", "null", "an external link", "a loop of links", "virtual")
-    },
-    "a number": lambda f, a: _put(f, a, 3.5),
-    "another word": lambda f, a: _put(f, a, "whatever"),
-    "not UTF-8": lambda f, a: _put(f, a, np.bytes_(b"\xff\xfe\xfd")),
+    **{name: FIELD[name] for name in _OF_TEXTS},
+    "a number": lambda f, a: put(f, a, 3.5),
+    "another word": lambda f, a: put(f, a, "whatever"),
+    "not UTF-8": lambda f, a: put(f, a, np.bytes_(b"\xff\xfe\xfd")),
     "one text many times": _many_times_one_text,
 }
-GROUP: dict[str, Change] = {
-    "removed": removed,
-    "a dataset": _dataset,
-    "an external link": _external_link,
-    "a loop of links": _soft_loop,
-    "a dangling link": _dangling,
-}
+_dataset = _instead(lambda file, address: file.__setitem__(address, 1.0))
+GROUP: dict[str, Change] = {"removed": REMOVED, "a dataset": _dataset, **LINKS}
 BOMB: Change = _bomb
+
+
+def value(new: object) -> Change:
+    """Another value altogether."""
+    return lambda file, address: put(file, address, new)
 
 
 def attribute(name: str, value: object) -> Change:
     """One attribute of an object."""
-
-    def change(file: h5py.File, address: str) -> None:
-        file[address].attrs[name] = value
-
-    return change
+    return lambda file, address: file[address].attrs.__setitem__(name, value)

@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from corpus.case import Case, filled, truncated
-from corpus.hdf5_damage import BOMB, FIELD, GROUP, TEXT, Change, attribute, on
+from corpus.hdf5_damage import BOMB, FIELD, GROUP, TEXT, Change, attribute, on, value
 
 SCAN = ("reconstruct", "{file}", "--method", "fdk", "-o", "{out}")
 VOLUME = ("export", "{file}", "--to", "npy", "-o", "{out}")
@@ -48,15 +48,7 @@ HARMLESS_COUNTS: Mapping[str, tuple[str, ...]] = {
     f"{_E}/lag": _ABSENT,
     "entry/sample/rotation_angle_end": _ABSENT,  # a gantry that stands
 }
-COUNTS = (
-    f"{_D}/data",
-    f"{_D}/image_key",
-    f"{_D}/pixel_mask",
-    f"{_E}/lag",
-    f"{_E}/pulse_start",
-    f"{_E}/pulse_length",
-    "entry/sample/rotation_angle_end",
-)
+COUNTS = (f"{_D}/data", f"{_D}/image_key", *HARMLESS_COUNTS, f"{_E}/pulse_start", f"{_E}/pulse_length")
 HARMLESS_VOLUME: Mapping[str, tuple[str, ...]] = {
     "entry/gaussians": _ABSENT,
     "entry/metrics": _ABSENT,
@@ -139,12 +131,8 @@ def _whole_files(seed: int) -> Iterator[Case]:
             ("a pickle", b"cos\nsystem\n(S'touch canary'\ntR."),
         ):
             yield Case(f"{of}: {name}", of, filled(data), command)
-    for of, command in (
-        ("volume.h5", SCAN),
-        ("bare.h5", SCAN),
-        ("fly.h5", VOLUME),
-        ("scanner.toml", PHANTOM),
-    ):
+    wrong = (("volume.h5", SCAN), ("bare.h5", SCAN), ("fly.h5", VOLUME), ("scanner.toml", PHANTOM))
+    for of, command in wrong:
         yield Case(f"{of} as another kind: {command[0]}", of, lambda path: None, command)
 
 
@@ -162,45 +150,30 @@ def _numbers() -> Iterator[Case]:
         f"{_E}/pulse_length": (0.0, -1.0),
         f"{_E}/pulse_start": (1e6,),
     }.items():
-        for value in values:
-            of = (
-                "counts.h5"
-                if address.rsplit("/", 1)[1] in ("lag", "pulse_length", "pulse_start")
-                else "fly.h5"
-            )
-            yield Case(f"{of}: {address} = {value}", of, on(address, _value(value)), SCAN)
+        of = "counts.h5" if address.rsplit("/", 1)[1] in ("lag", "pulse_length", "pulse_start") else "fly.h5"
+        for number in values:
+            yield Case(f"{of}: {address} = {number}", of, on(address, value(number)), SCAN)
     for shape in ([0, 8, 8], [-1, 8, 8], [10**7, 10**7, 10**7], [2**62, 2**62, 2**62]):
-        yield Case(f"fly.h5: a grid of {shape}", "fly.h5", on(f"{_E}/grid/shape", _value(shape)), SCAN)
-    for name, key in (
-        ("no projections", [1] * 8),
-        ("no flats", [2, 3, 0, 0, 3, 0, 0, 3]),
-        ("a key of 7", [7] * 8),
-    ):
-        yield Case(f"counts.h5: {name}", "counts.h5", on(f"{_D}/image_key", _value(key)), SCAN)
+        yield Case(f"fly.h5: a grid of {shape}", "fly.h5", on(f"{_E}/grid/shape", value(shape)), SCAN)
+    keys = {"no projections": [1] * 8, "no flats": [2, 3, 0, 0, 3, 0, 0, 3], "a key of 7": [7] * 8}
+    for name, key in keys.items():
+        yield Case(f"counts.h5: {name}", "counts.h5", on(f"{_D}/image_key", value(key)), SCAN)
     for quantity in ("hounsfield", 3, ["counts"] * 2):
         change = attribute("quantity", quantity)
         yield Case(f"fly.h5: quantity {quantity!r}", "fly.h5", on(f"{_D}/data", change), SCAN)
-    yield Case("volume.h5: a truth of -1e30", "volume.h5", on(f"{_R}/volume", _poked(-1e30)), VOLUME)
-    yield Case(
-        "volume.h5: provenance as a list", "volume.h5", on("entry/provenance/json", _value("[1]")), VOLUME
-    )
-    deep = "[" * 100_000
-    yield Case("volume.h5: JSON too deep", "volume.h5", on("entry/provenance/json", _value(deep)), VOLUME)
-    yield Case("fly.h5: JSON too deep", "fly.h5", on(f"{_E}/provenance", _value(deep)), SCAN)
-    yield Case(
-        "volume.h5: no Gaussians to export", "volume.h5", on("entry/gaussians", GROUP["removed"]), CLOUD
-    )
-    yield Case("volume.h5: half a cloud", "volume.h5", on("entry/gaussians/scale", FIELD["removed"]), CLOUD)
-    yield Case(
-        "volume.h5: a cloud of two sizes",
-        "volume.h5",
-        on("entry/gaussians/scale", FIELD["an axis more"]),
-        CLOUD,
-    )
-    yield Case("fly.h5: a group that holds itself", "fly.h5", on("entry", _cycle), SCAN, refused=False)
-    yield Case(
-        "volume.h5: a group that holds itself", "volume.h5", on("entry", _cycle), VOLUME, refused=False
-    )
+    deep = value("[" * 100_000)
+    yield Case("fly.h5: JSON too deep", "fly.h5", on(f"{_E}/provenance", deep), SCAN)
+    for name, address, change, command in (
+        ("a truth of -1e30", f"{_R}/volume", _poked(-1e30), VOLUME),
+        ("provenance as a list", "entry/provenance/json", value("[1]"), VOLUME),
+        ("JSON too deep", "entry/provenance/json", deep, VOLUME),
+        ("no Gaussians to export", "entry/gaussians", GROUP["removed"], CLOUD),
+        ("half a cloud", "entry/gaussians/scale", FIELD["removed"], CLOUD),
+        ("a cloud of two sizes", "entry/gaussians/scale", FIELD["an axis more"], CLOUD),
+    ):
+        yield Case(f"volume.h5: {name}", "volume.h5", on(address, change), command)
+    for of, command in (("fly.h5", SCAN), ("volume.h5", VOLUME)):
+        yield Case(f"{of}: a group that holds itself", of, on("entry", _cycle), command, refused=False)
 
 
 def _bombs() -> Iterator[Case]:
@@ -216,20 +189,8 @@ def _bombs() -> Iterator[Case]:
     yield Case("volume.h5: one array many times", "volume.h5", on("entry/gaussians", _many_links), VOLUME)
 
 
-def _value(value: object) -> Change:
-    def change(file: h5py.File, address: str) -> None:
-        attributes = dict(file[address].attrs)
-        del file[address]
-        file.create_dataset(address, data=value).attrs.update(attributes)
-
-    return change
-
-
-def _poked(value: float) -> Change:
-    def change(file: h5py.File, address: str) -> None:
-        file[address][0, 0, 0] = np.float32(value)
-
-    return change
+def _poked(number: float) -> Change:
+    return lambda file, address: file[address].__setitem__((0, 0, 0), np.float32(number))
 
 
 def _cycle(file: h5py.File, address: str) -> None:

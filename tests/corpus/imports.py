@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from corpus.case import Case
 
@@ -19,11 +18,7 @@ FORMS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "phyradgs-real": ("real", ("--pixel-size-mm", "3.0,2.5"), "REAL"),
     "naf": ("chest.pickle", (), "NAF"),
     "rtk": ("rtk", (), "RTK"),
-    "data-exchange": (
-        "dx.h5",
-        ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800"),
-        "EXCHANGE",
-    ),
+    "data-exchange": ("dx.h5", ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800"), "EXCHANGE"),
     "nxtomo": ("nx.h5", (), "NXTOMO"),
     "tiff": ("tiff", (), "TIFF"),
 }
@@ -44,23 +39,12 @@ def helpers(name: str) -> ModuleType:
 def write_good(folder: Path) -> None:
     """A good file, or folder, of every format."""
     writers, truth_of = helpers("writers"), helpers("conftest").truth
-    writer: dict[str, Any] = {
-        "r2": writers.write_r2,
-        "phyradgs": writers.write_phyradgs,
-        "phyradgs-real": writers.write_phyradgs_real,
-        "naf": writers.write_naf,
-        "rtk": writers.write_rtk,
-        "data-exchange": writers.write_data_exchange,
-        "nxtomo": writers.write_nxtomo,
-        "tiff": writers.write_tiff,
-    }
     geometry = helpers("conftest").GEOMETRY
     centred = replace(geometry, detector_offset_mm=(4.0, 0.0))
     for form, (name, _, _) in FORMS.items():
-        truth = truth_of(
-            fly=form.startswith("phyradgs"), geometry=centred if form == "phyradgs-real" else geometry
-        )
-        writer[form](folder / name, truth)
+        placed = centred if form == "phyradgs-real" else geometry
+        truth = truth_of(fly=form.startswith("phyradgs"), geometry=placed)
+        getattr(writers, f"write_{form.replace('-', '_')}")(folder / name, truth)
 
 
 def cases() -> Iterator[Case]:

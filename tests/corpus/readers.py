@@ -1,4 +1,4 @@
-"""Every reader of the package on one file or folder: what `fuzz_worker` calls, by name."""
+"""Every reader of the package on one file or folder: what `worker` calls, by name."""
 
 from __future__ import annotations
 
@@ -28,10 +28,9 @@ class Reader:
     read: Callable[[Path], object]
     inside: str = ""
 
-
-def _fingerprint(good: Path) -> str:
-    with np.load(good) as archive:
-        return str(archive["fingerprint"])
+    def content(self, good: Path) -> bytes:
+        """What is changed, as it is in the folder ``good``."""
+        return (good / self.of / self.inside if self.inside else good / self.of).read_bytes()
 
 
 def _import(form: str) -> Callable[[Path], object]:
@@ -48,8 +47,8 @@ def _sweep(folder: Path) -> object:
 
 
 def _checkpoint(path: Path) -> object:
-    good = checkpoint_path(path.parents[1] / "good" / "phyradgs")
-    return read_checkpoint(path, _fingerprint(good))
+    with np.load(checkpoint_path(path.parents[1] / "good" / "phyradgs")) as good:
+        return read_checkpoint(path, str(good["fingerprint"]))
 
 
 READERS: dict[str, Reader] = {

@@ -7,7 +7,6 @@ import os
 import select
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,8 +37,8 @@ class Outcome:
 class Runner:
     """A worker process, started anew after one that died or hung."""
 
-    def __init__(self, program: str = "worker.py") -> None:
-        self._program = program
+    def __init__(self, work: str = "commands") -> None:
+        self._work = work
         self._process: subprocess.Popen[str] | None = None
         self.asked = 0
 
@@ -52,22 +51,15 @@ class Runner:
         if not case.beside:
             out.write_bytes(OLD)
         before = _contents(outputs)
-        answer = self.command(case.arguments(good, file, out))
+        answer = self.answer(case.arguments(good, file, out))
+        if answer is None:
+            status = -abs(self._process.wait())  # type: ignore[union-attr]
+            answer = {"status": status, "error": "", "seconds": WATCHDOG_S, "megabytes": 0.0}
         after = _contents(outputs)
-        left = tuple(
-            sorted(str(name) for name in before.keys() | after.keys() if before.get(name) != after.get(name))
-        )
-        return Outcome(**answer, left=left)
+        changed = (str(name) for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+        return Outcome(**answer, left=tuple(sorted(changed)))
 
-    def command(self, arguments: Sequence[str]) -> dict[str, object]:
-        """The worker's answer to one command line."""
-        answer = self.answer(list(arguments))
-        if answer is not None:
-            return answer  # type: ignore[return-value]
-        assert self._process is not None
-        return {"status": -abs(self._process.wait()), "error": "", "seconds": WATCHDOG_S, "megabytes": 0.0}
-
-    def answer(self, question: object) -> object | None:
+    def answer(self, question: object) -> dict[str, object] | None:
         """The worker's answer to any question; None where it died of it, or had to be ended."""
         process = self._alive()
         self.asked += 1
@@ -96,14 +88,9 @@ class Runner:
         if self._process is None or self._process.poll() is not None:
             root = str(Path(phyradgs_cl.__file__ or phyradgs_cl.__path__[0]).resolve().parents[1])
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, *sys.path])}
-            worker = str(Path(__file__).with_name(self._program))
-            self._process = subprocess.Popen(
-                [sys.executable, worker],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-                env=environment,
-            )
+            command = [sys.executable, str(Path(__file__).with_name("worker.py")), self._work]
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+            self._process = subprocess.Popen(command, env=environment, **pipes)
         return self._process
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
-import pytest
 
 from phyradgs_cl.detector import find_saturation
 
@@ -18,34 +19,27 @@ def counts(noisy: bool, seed: int = 0) -> np.ndarray:
     return np.round(np.random.default_rng(seed).normal(expected, np.sqrt(expected))) if noisy else np.round(expected)
 
 
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
-@pytest.mark.parametrize("level", [40_000, 50_100])
-@pytest.mark.parametrize("flat_too", [False, True])
-def test_a_panel_that_clips_is_found(level, flat_too, dtype) -> None:
-    frames = np.minimum(counts(noisy=True) + 400, level).astype(dtype)
-    flat = np.full(SHAPE[1:], min(AIR + 400, level) if flat_too else AIR + 400)
-    found = find_saturation(frames, flat)
-    assert found.level == level and found.share == np.mean(frames == level) > 0.3
+def test_a_panel_that_clips_is_found() -> None:
+    for level, flat_too, dtype in product(
+        (40_000, 50_100), (False, True), (np.uint16, np.float32, np.float64)
+    ):
+        frames = np.minimum(counts(noisy=True) + 400, level).astype(dtype)
+        found = find_saturation(frames, np.full(SHAPE[1:], min(AIR + 400, level) if flat_too else AIR + 400))
+        assert found.level == level and found.share == np.mean(frames == level) > 0.3
 
 
 GOOD = {
-    "noise": (counts(noisy=True), AIR),
-    "no noise": (counts(noisy=False), AIR),
+    "noise": (counts(noisy=True), AIR), "no noise": (counts(noisy=False), AIR),
     "no noise at the end of 16 bits": (np.round(counts(noisy=False) * 65535 / AIR), 65535.0),
     "noise and a hot pixel": (np.where(np.arange(64) == 9, 65535, counts(noisy=True)) * (np.arange(48) == 9)[:, None], AIR),
     "NaN": (np.where(counts(True) > 50_500, np.nan, counts(True)), AIR),
 }
 
 
-@pytest.mark.parametrize("name", GOOD)
-def test_what_is_not_clipped_is_not_found(name) -> None:
-    frames, flat = GOOD[name]
-    found = find_saturation(frames, np.full(SHAPE[1:], flat))
-    assert found.share == 0 and found.level == np.nanmax(frames)
-
-
-def test_noise_without_end_is_clipped_even_where_it_is_all(recwarn) -> None:
-    """A panel that shows nothing but its ceiling, or nothing at all."""
+def test_what_is_not_clipped_is_not_found_and_what_is_all_clipped_is(recwarn) -> None:
+    for name, (frames, flat) in GOOD.items():
+        found = find_saturation(frames, np.full(SHAPE[1:], flat))
+        assert found.share == 0 and found.level == np.nanmax(frames), name
     for frames, share in ((np.full(SHAPE, 4095), 1.0), (np.full(SHAPE, np.nan), 0.0)):
         assert find_saturation(frames, np.full(SHAPE[1:], 4095.0)).share == share
     assert not recwarn

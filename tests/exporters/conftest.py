@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.fields import Gaussians, Grid
-from phyradgs_cl.io import write_volume
+from phyradgs_cl.io import read_volume, write_volume
 
 GRID = Grid((5, 6, 7), (2.0, 1.5, 1.25), (10.0, -4.0, 3.0))
 
@@ -24,12 +24,13 @@ def marked() -> np.ndarray:
 def volume_file(tmp_path) -> Path:
     rng = np.random.default_rng(6)
     quaternion = rng.normal(size=(9, 4))
-    cloud = {
-        "mean": rng.normal(size=(9, 3)).astype(np.float32),
-        "scale": rng.uniform(0.5, 2, (9, 3)).astype(np.float32),
-        "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(np.float32),
-        "density": rng.uniform(0.01, 0.02, 9).astype(np.float32),
-    }
-    path = tmp_path / "volume.h5"
-    write_volume(path, marked(), GRID, {"method": "phyradgs"}, Gaussians(**cloud))
-    return path
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    parts = rng.normal(size=(9, 3)), rng.uniform(0.5, 2, (9, 3)), quaternion, rng.uniform(0.01, 0.02, 9)
+    cloud = Gaussians(*(part.astype(np.float32) for part in parts))
+    write_volume(tmp_path / "volume.h5", marked(), GRID, {"method": "phyradgs"}, cloud)
+    return tmp_path / "volume.h5"
+
+
+@pytest.fixture
+def stored(volume_file):
+    return read_volume(volume_file)

@@ -30,46 +30,33 @@ def test_every_format(run, volume_file, to) -> None:
     assert len(list(volume_file.parent.iterdir())) >= 2
 
 
-def test_hounsfield_units_and_a_name(run, volume_file, tmp_path) -> None:
+def test_the_output_s_suffix_says_the_format(run, volume_file, tmp_path) -> None:
+    """An unknown one lists those that are known."""
+    for name in ("a.nii.gz", "a.TIF", "a.mha", "a.ply"):
+        done = run(volume_file, "-o", tmp_path / name)
+        assert done.exit_code == 0 and (tmp_path / name).exists(), done.exception
+    for output in (("-o", "a.stl"), ("-o", "folder"), ()):
+        error = run(volume_file, *output).exception
+        assert isinstance(error, InputError)
+        assert ".nii, .nii.gz, .mha, .nrrd, .tif, .tiff, .npy, .ply, .npz" in str(error)
     done = run(volume_file, "--to", "nii", "-o", tmp_path / "hu.nii.gz", "--mu-water-per-mm", "0.02")
     assert done.exit_code == 0 and "HU" in done.output and (tmp_path / "hu.nii.gz").exists()
 
 
-@pytest.mark.parametrize("name", ["a.nii.gz", "a.TIF", "a.mha", "a.ply"])
-def test_the_output_s_suffix_says_the_format(run, volume_file, tmp_path, name) -> None:
-    done = run(volume_file, "-o", tmp_path / name)
-    assert done.exit_code == 0 and (tmp_path / name).exists(), done.exception
-
-
-@pytest.mark.parametrize("output", [("-o", "a.stl"), ("-o", "folder"), ()])
-def test_an_unknown_suffix_lists_the_known_ones(run, volume_file, output) -> None:
-    error = run(volume_file, *output).exception
-    assert isinstance(error, InputError) and ".nii, .nii.gz, .mha, .nrrd, .tif, .tiff, .npy, .ply, .npz" in str(error)
-
-
-def test_wrong_input_is_our_error(run, tmp_path) -> None:
-    done = run(tmp_path / "none.h5", "--to", "nii")
-    assert isinstance(done.exception, InputError)
+def test_wrong_input_is_our_error(run, rt, tmp_path) -> None:
+    assert isinstance(run(tmp_path / "none.h5", "--to", "nii").exception, InputError)
     assert run(tmp_path / "none.h5", "--to", "obj").exit_code == 2
-
-
-def test_a_scan_is_no_volume(run, rt, tmp_path) -> None:
-    scan = tmp_path / "scan.h5"
-    save_scan(scan, simulate("foot", size=8, detector=8, views=3, noise="none", device=rt))
+    save_scan(tmp_path / "scan.h5", simulate("foot", size=8, detector=8, views=3, noise="none", device=rt))
     with pytest.raises(InputError, match="found a scan.*expected a volume"):
-        raise run(scan, "--to", "nii").exception
+        raise run(tmp_path / "scan.h5", "--to", "nii").exception
 
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "export.md"
 
 
-def test_formats_are_described() -> None:
-    text = DOCS.read_text(encoding="utf-8")
-    assert not [to for to in EXPORTS if f"| `{to}` |" not in text]
-
-
 def test_the_documentation_s_examples_run(run, volume_file, monkeypatch) -> None:
     text = DOCS.read_text(encoding="utf-8")
+    assert not [to for to in EXPORTS if f"| `{to}` |" not in text]
     monkeypatch.chdir(volume_file.parent)
     for block in re.findall(r"```python\n(.*?)```", text, re.S):
         exec(compile(block, str(DOCS), "exec"), {})

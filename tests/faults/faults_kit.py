@@ -9,7 +9,6 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import checkpoint_path, read_volume
 
 TINY = ["--phantom", "jaw", "--size", "10", "--detector", "12", "--views", "4", "--time-samples", "2"]
@@ -18,17 +17,14 @@ Run = Callable[..., int]
 
 
 @pytest.fixture(scope="session")
-def run() -> Run:
+def run(cli) -> Run:
     """The command line in this process: (arguments...) → exit status."""
-    cli = load_cli()
     return lambda *arguments: cli.run([str(a) for a in arguments])
 
 
 @pytest.fixture(scope="session")
-def scan(run, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("scan") / "scan.h5"
-    assert run("simulate", *TINY, "-o", path) == 0
-    return path
+def scan(simulated) -> Path:
+    return simulated(*TINY)
 
 
 def cl_error(code: int) -> cl.Error:
@@ -38,12 +34,11 @@ def cl_error(code: int) -> cl.Error:
 
 
 class FailingCall:
-    """A function of pyopencl that fails at call number ``at`` and, if ``for_good``, ever after; it counts the calls."""
+    """A function of pyopencl that fails at call number ``at`` and ever after; it counts the calls."""
 
     def __init__(self, function: Callable[..., object]) -> None:
-        self.function, self.calls = function, 0
+        self.function, self.calls, self.code = function, 0, -36
         self.at: int | None = None
-        self.code, self.for_good = -36, True
 
     def arm(self, at: int | None, code: int = -36) -> None:
         """From now on fails at call ``at`` (from 1), or never."""
@@ -76,10 +71,8 @@ def same_bits(one: Path, other: Path) -> None:
     """Volumes and records of two runs agree to the bit."""
     first, second = read_volume(one), read_volume(other)
     np.testing.assert_array_equal(first.volume, second.volume)
-    assert [line["iteration"] for line in first.provenance["record"]] == [  # type: ignore[union-attr]
-        line["iteration"]
-        for line in second.provenance["record"]  # type: ignore[union-attr]
-    ]
+    told = [[line["iteration"] for line in stored.provenance["record"]] for stored in (first, second)]
+    assert told[0] == told[1]
     if first.gaussians is not None:
         np.testing.assert_array_equal(first.gaussians.rows(), second.gaussians.rows())
 

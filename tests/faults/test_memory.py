@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 
 import faults_kit as kit
+import h5py
 import numpy as np
 import pytest
 
 from phyradgs_cl.errors import OutOfMemoryError
+from phyradgs_cl.objective import ImageLoss
+from phyradgs_cl.reconstructors.voxels import run as voxels
 from phyradgs_cl.reconstructors.voxels import sirt
 
 # In a process of its own that may map no more than so many MiB beyond what it has at the start.
@@ -34,33 +36,22 @@ def test_a_machine_without_memory_is_said(scan, tmp_path, source) -> None:
     output = tmp_path / "v.h5"
     output.write_bytes(kit.OLD)
     words = ["simulate", "--phantom", "jaw", "--size", "512", "--detector", "16", "--views", "2"]
-    if source == "scan":
-        words = ["reconstruct", str(_large_grid(scan, tmp_path)), "--method", "sirt"]
+    if source == "scan":  # with half a gigabyte of voxels to reconstruct
+        large = tmp_path / "large.h5"
+        large.write_bytes(scan.read_bytes())
+        with h5py.File(large, "r+") as file:
+            file["entry/phyradgs/grid/shape"][...] = 512
+            del file["entry/phyradgs/reference"]
+        words = ["reconstruct", str(large), "--method", "sirt"]
     command = [sys.executable, "-c", LIMITED, "256", *words, "-o", str(output)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     lines = [line for line in done.stderr.splitlines() if line.startswith("phyradgs:")]
     assert (done.returncode, len(lines)) == (6, 1), done.stderr
     assert lines[0].startswith("phyradgs: memory of ") and "Traceback" not in done.stderr
-    assert output.read_bytes() == kit.OLD
-    assert set(kit.names(tmp_path)) <= {"large.h5", "v.h5"}
+    assert output.read_bytes() == kit.OLD and set(kit.names(tmp_path)) <= {"large.h5", "v.h5"}
 
 
-def _large_grid(scan, folder):
-    """The scan with half a gigabyte of voxels to reconstruct."""
-    import h5py
-
-    path = folder / "large.h5"
-    path.write_bytes(scan.read_bytes())
-    with h5py.File(path, "r+") as file:
-        extra = file["entry/phyradgs"]
-        extra["grid/shape"][...] = 512
-        del extra["reference"]
-    return path
-
-
-def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(
-    run, scan, tmp_path, capfd, monkeypatch
-) -> None:
+def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, monkeypatch) -> None:
     whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
     words = ["--method", "sirt", "--iterations", "6", "--checkpoint-every", "1e-6"]
     assert run("reconstruct", scan, "-o", whole, *words) == 0
@@ -77,10 +68,8 @@ def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(
     capfd.readouterr()
     assert run("reconstruct", scan, "-o", output, *words) == OutOfMemoryError.exit_code
     line = capfd.readouterr().err.splitlines()[-1]
-    assert line == (
-        "phyradgs: memory of this machine: found too little (Unable to allocate 9.0 GiB); expected enough; "
-        "use a smaller problem, or a machine with more; --resume goes on from iteration 3"
-    )
+    assert line.startswith("phyradgs: memory of this machine: found too little (Unable to allocate 9.0 GiB)")
+    assert line.endswith("--resume goes on from iteration 3")
     monkeypatch.setattr(sirt.Sirt, "step", step)
     assert run("reconstruct", scan, "-o", output, *words, "--resume") == 0
     kit.same_bits(output, whole)
@@ -88,16 +77,14 @@ def test_memory_that_runs_out_in_the_middle_leaves_the_checkpoint(
 
 @pytest.mark.parametrize("method", ["sirt", "os-sart", "cgls", "fista-tv", "asd-pocs"])
 def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch, method) -> None:
-    from phyradgs_cl.reconstructors.voxels import run as iterative
+    step = voxels._Iterations.step
 
-    step = iterative._Iterations.step
-
-    def poisoned(self: iterative._Iterations) -> None:
+    def poisoned(self: voxels._Iterations) -> None:
         if self.iteration == 2:
             self.measured_norm = float("nan")
         step(self)
 
-    monkeypatch.setattr(iterative._Iterations, "step", poisoned)
+    monkeypatch.setattr(voxels._Iterations, "step", poisoned)
     words = ["--method", method, "--iterations", "5", "--checkpoint-every", "1e-6"]
     words += ["--set", "noise_stop=0"] if method == "cgls" else []
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
@@ -108,11 +95,8 @@ def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monke
 
 
 def test_a_loss_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch) -> None:
-    from phyradgs_cl.objective import ImageLoss
-
     value = ImageLoss.value
     monkeypatch.setattr(ImageLoss, "value", lambda self: value(self) * np.float32("nan"))
-    words = ["--iterations", "60", "--gaussians", "20"]
-    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--iterations", "60", "--gaussians", "20") == 3
     assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: loss: found nan at iteration 3;")
-    assert os.listdir(tmp_path) == []
+    assert kit.names(tmp_path) == []

@@ -21,6 +21,7 @@ def test_variance_is_added_and_mass_is_kept(make_cloud) -> None:
     mass, kept = (r[10] * np.prod(r[3:6], axis=0) for r in (rows, after.rows()))
     np.testing.assert_allclose(kept, mass, rtol=1e-12)
     np.testing.assert_array_equal(after.mean, rows[:3].T)
+    assert Gaussians.from_rows(np.zeros((11, 0))).averaged(BOX).count == 0
 
 
 @pytest.mark.parametrize(("scale", "limit"), [(0.05, 0.05), (0.1, 2e-3), (0.3, 2e-4)])
@@ -36,8 +37,3 @@ def test_samples_are_the_means_over_voxels(scale, limit) -> None:
     found, sampled = (voxel_field(r, centres, centres, centres) for r in (averaged.rows(), rows))
     error, before = (np.linalg.norm(f - means) / np.linalg.norm(means) for f in (found, sampled))
     assert error <= limit and error < before / 5
-
-
-def test_no_gaussians_are_no_gaussians() -> None:
-    empty = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))
-    assert empty.averaged(BOX).count == 0

@@ -20,9 +20,8 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 # With import-mode importlib nothing in this folder has a name of its own: tests import the helpers by these.
 sys.modules["conftest_of_importers"] = sys.modules[__name__]
 for _helper in ("writers", "hostile"):
-    _spec = importlib.util.spec_from_file_location(
-        f"{_helper}_of_importers", Path(__file__).with_name(f"{_helper}.py")
-    )
+    _file = Path(__file__).with_name(f"{_helper}.py")
+    _spec = importlib.util.spec_from_file_location(f"{_helper}_of_importers", _file)
     sys.modules[_spec.name] = importlib.util.module_from_spec(_spec)
     _spec.loader.exec_module(sys.modules[_spec.name])
 
@@ -30,15 +29,9 @@ FRAMES = 6
 # No two lengths alike and nothing centred, so that every exchange of axes, signs or factors shows.
 GEOMETRY = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, -6.0))
 GRID = Grid((7, 9, 8), (2.0, 1.5, 1.75), (1.0, -2.0, 3.0))
-BALLS = EllipsoidPhantom(
-    (
-        Ellipsoid((3.0, -2.0, 1.0), (5.0, 4.0, 3.0), 0.03),
-        Ellipsoid((-4.0, 3.0, 4.5), (2.0, 2.5, 1.5), 0.08),
-        Ellipsoid((1.0, 5.0, -4.0), (1.5, 1.0, 2.0), 0.12),
-    ),
-    "three balls",
-)
 WORLD_POINTS = np.array([[3.0, -2.0, 1.0], [-4.0, 3.0, 4.5], [1.0, 5.0, -4.0], [0.0, 0.0, 0.0]])
+AXES_MM = ((5.0, 4.0, 3.0), (2.0, 2.5, 1.5), (1.5, 1.0, 2.0))
+BALLS = EllipsoidPhantom(tuple(map(Ellipsoid, WORLD_POINTS[:3], AXES_MM, (0.03, 0.08, 0.12))), "three balls")
 RTOL = 1e-6
 
 
@@ -131,17 +124,16 @@ def compare_timing(ours: Scan, native: Scan) -> None:
         np.testing.assert_allclose(*elapsed, rtol=RTOL, atol=1e-9)
 
 
+def pose_at(scan: Scan, frame: int, share: float) -> np.ndarray:
+    """The pose (12,) after a share of a frame's window."""
+    return scan.trajectory.pose(frame, scan.frame_start_s[frame] + share * np.array([scan.shutter.span_s]))[0]
+
+
 def compare_poses(ours: Scan, native: Scan) -> None:
     """Where world points fall, at five shares of every frame's window."""
     for frame in range(native.frames):
         for share in (0.0, 0.3, 0.5, 0.8, 1.0):
-            poses = [
-                scan.trajectory.pose(
-                    frame, np.array([scan.frame_start_s[frame] + share * scan.shutter.span_s])
-                )[0]
-                for scan in (ours, native)
-            ]
-            np.testing.assert_allclose(
-                projected(poses[0], WORLD_POINTS), projected(poses[1], WORLD_POINTS), rtol=0, atol=RTOL
-            )
-            np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=1e-5)
+            our, their = pose_at(ours, frame, share), pose_at(native, frame, share)
+            seen = projected(our, WORLD_POINTS), projected(their, WORLD_POINTS)
+            np.testing.assert_allclose(*seen, rtol=0, atol=RTOL)
+            np.testing.assert_allclose(our, their, rtol=0, atol=1e-5)

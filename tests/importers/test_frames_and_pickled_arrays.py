@@ -18,10 +18,18 @@ from phyradgs_cl.io.scan.reader import united
 FRAMES = np.array([[[100.0, 50.0], [25.0, 10.0]]] * 3, np.float32)
 
 
-def test_one_flat_value_stands_for_flat_frames() -> None:
+def test_flats_one_value_none_or_of_another_panel() -> None:
     found = line_integrals("f", FRAMES, ImportOptions(flat_value=100.0))
     np.testing.assert_allclose(found.values, -np.log(FRAMES / 100), rtol=0, atol=FLOAT32)
     assert found.mask is None and found.saturation == Saturation(100.0, 0.0)
+    with pytest.raises(InputError, match="quantity: found nothing that says it.*--quantity"):
+        line_integrals("f", FRAMES, ImportOptions())
+    with pytest.raises(InputError, match="f flats: found none.*--flat-value"):
+        line_integrals("f", FRAMES, ImportOptions(quantity="counts"))
+    for name in ("flats", "darks"):
+        stacks = {"flats": np.full((1, 2, 2), 100.0, np.float32), name: np.ones((1, 3, 2), np.float32)}
+        with pytest.raises(InputError, match=r"flats or darks of \(3, 2\)"):
+            line_integrals("f", FRAMES, ImportOptions(), **stacks)
 
 
 def test_values_that_no_object_has_are_masked_in_one_line(caplog, recwarn) -> None:
@@ -47,23 +55,8 @@ def test_clipped_counts_are_masked_in_their_own_frames(caplog) -> None:
     assert same.mask is None and same.saturation == found.saturation and (same.values[frames == 40000] == 0).all()
     text = f"f: {100 * share:.3g} % of the projections' pixels are clipped at 40000 counts: "
     assert caplog.messages == [
-        text + "masked, each in its own frame",
-        text + "taken as air, for the flats are clipped too",
+        text + "masked, each in its own frame", text + "taken as air, for the flats are clipped too",
     ]
-
-
-def test_counts_without_flats_say_what_to_do() -> None:
-    with pytest.raises(InputError, match="quantity: found nothing that says it.*--quantity"):
-        line_integrals("f", FRAMES, ImportOptions())
-    with pytest.raises(InputError, match="f flats: found none.*--flat-value"):
-        line_integrals("f", FRAMES, ImportOptions(quantity="counts"))
-
-
-@pytest.mark.parametrize("name", ["flats", "darks"])
-def test_flats_and_darks_of_another_panel_are_refused(name) -> None:
-    stacks = {"flats": np.full((1, 2, 2), 100.0, np.float32), name: np.ones((1, 3, 2), np.float32)}
-    with pytest.raises(InputError, match=r"flats or darks of \(3, 2\)"):
-        line_integrals("f", FRAMES, ImportOptions(), **stacks)
 
 
 def test_masks() -> None:
@@ -88,32 +81,28 @@ def test_frames_are_turned_to_row_0_below_and_column_0_left() -> None:
 CONTENT = {
     "rows": np.arange(6.0).reshape(2, 3),
     "columns": np.asfortranarray(np.arange(6, dtype=">i4").reshape(2, 3)),
-    "large": np.arange(300, dtype=np.float32),
-    "scalars": [np.float32(2.5), np.int64(3), np.array(1.5)],
-    "plain": [1, 2.5, "é", b"x", None, True, (4, -5)],
-    7: {},
+    "large": np.arange(300, dtype=np.float32), "scalars": [np.float32(2.5), np.int64(3), np.array(1.5)],
+    "plain": [1, 2.5, "é", b"x", None, True, (4, -5)], 7: {},
 }
 
 
-@pytest.mark.parametrize("protocol", range(6))
-def test_plain_containers_and_arrays_come_out_of_pickles(tmp_path, protocol) -> None:
-    (tmp_path / "a.pickle").write_bytes(pickle.dumps(CONTENT, protocol))
-    found = read_pickle(tmp_path / "a.pickle")
-    assert list(found) == list(CONTENT) and found["plain"] == CONTENT["plain"] and found["scalars"] == [2.5, 3, 1.5]
-    for name in ("rows", "columns", "large"):
-        np.testing.assert_array_equal(found[name], CONTENT[name])
+def test_plain_containers_and_arrays_come_out_of_pickles(tmp_path) -> None:
+    for protocol in range(6):
+        (tmp_path / "a.pickle").write_bytes(pickle.dumps(CONTENT, protocol))
+        found = read_pickle(tmp_path / "a.pickle")
+        assert list(found) == list(CONTENT), protocol
+        assert found["plain"] == CONTENT["plain"] and found["scalars"] == [2.5, 3, 1.5]
+        for name in ("rows", "columns", "large"):
+            np.testing.assert_array_equal(found[name], CONTENT[name])
 
 
 RAW = np.arange(6, dtype="<i2").tobytes()
 CALLS = {
     "numpy.core.numeric _frombuffer": [
         ((RAW, "TYPE", (7,), "C"), r"shape \(7,\) in 12 bytes"),
-        ((RAW, "TYPE", (-6,), "C"), "impossible shape"),
-        ((RAW, "TYPE", (1,) * 9, "C"), "impossible shape"),
-        ((RAW, "TYPE", [6], "C"), "impossible shape"),
-        ((RAW, "TYPE", (True,), "C"), "impossible shape"),
-        ((RAW, "i2", (6,), "C"), "without numbers"),
-        ((None, "TYPE", (6,), "C"), "without numbers"),
+        ((RAW, "TYPE", (-6,), "C"), "impossible shape"), ((RAW, "TYPE", (1,) * 9, "C"), "impossible shape"),
+        ((RAW, "TYPE", [6], "C"), "impossible shape"), ((RAW, "TYPE", (True,), "C"), "impossible shape"),
+        ((RAW, "i2", (6,), "C"), "without numbers"), ((None, "TYPE", (6,), "C"), "without numbers"),
     ],
     "numpy dtype": [((code,), "plain real numbers") for code in ("O8", "c8", "V9", "i4,i4", "a", "b1\n", 3)],
     "_codecs encode": [(("a", "utf-7"), "not latin1"), ((b"a", "latin1"), "not latin1")],

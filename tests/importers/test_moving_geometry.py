@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from conftest_of_importers import GEOMETRY, WORLD_POINTS, projected
+from conftest_of_importers import GEOMETRY, WORLD_POINTS, pose_at, projected
 from writers_of_importers import AIR, write_phyradgs_real
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable
@@ -50,80 +50,73 @@ def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder) -> None:
         for share in (0.0, 0.5, 1.0):
             at = scan.frame_start_s[frame] + share * scan.shutter.middle_s
             pose = scan.trajectory.pose(frame, np.array([at]))[0]
-            np.testing.assert_allclose(
-                projected(pose, WORLD_POINTS), rtk_pixels(matrix, WORLD_POINTS), atol=1e-6
-            )
+            expected = rtk_pixels(matrix, WORLD_POINTS)
+            np.testing.assert_allclose(projected(pose, WORLD_POINTS), expected, atol=1e-6)
     np.testing.assert_array_equal(scan.projections[1, 2, :3], 140 + 28 + np.arange(3))
 
 
 def test_rtk_s_poses_move_through_the_frames(rtk_folder) -> None:
-    """With times the poses of the file are met as each exposure starts, and the table covers every window."""
-    still, fly = import_scan(rtk_folder), import_scan(rtk_folder, FLY)
-    assert fly.is_fly
-    for frame in range(3):
-        stands = still.trajectory.pose(frame, still.frame_start_s[frame : frame + 1])
-        passes = fly.trajectory.pose(frame, fly.frame_start_s[frame : frame + 1])
-        np.testing.assert_allclose(passes, stands, atol=1e-6)
-    middle = import_scan(rtk_folder, replace(FLY, angle_at="middle"))
-    for frame in range(3):
-        at = middle.frame_start_s[frame : frame + 1] + 0.25
-        stands = still.trajectory.pose(frame, still.frame_start_s[frame : frame + 1])
-        np.testing.assert_allclose(middle.trajectory.pose(frame, at), stands, atol=1e-6)
+    """With times the poses of the file are met as each exposure starts, or in its middle; every window is covered."""
+    still = import_scan(rtk_folder)
+    for options, after_s in ((FLY, 0.0), (replace(FLY, angle_at="middle"), 0.25)):
+        fly = import_scan(rtk_folder, options)
+        assert fly.is_fly
+        for frame in range(3):
+            stands = still.trajectory.pose(frame, still.frame_start_s[frame : frame + 1])
+            passes = fly.trajectory.pose(frame, fly.frame_start_s[frame : frame + 1] + after_s)
+            np.testing.assert_allclose(passes, stands, atol=1e-6)
 
 
 REAL = ImportOptions(exposure_s=0.4, pixel_size_mm=GEOMETRY.pixel_size_mm, flat_value=AIR)
 REAL_GEOMETRY = replace(GEOMETRY, detector_offset_mm=(4.0, 0.0))
 
 
-def test_phyradgs_real(tmp_path, make_truth, assert_same) -> None:
+@pytest.fixture
+def real_truth(make_truth):
     """The first stored row, at the top, is read first: our last."""
-    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
-    path = write_phyradgs_real(tmp_path / "real", truth)
+    return make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
+
+
+def test_phyradgs_real(tmp_path, real_truth, assert_same) -> None:
+    path = write_phyradgs_real(tmp_path / "real", real_truth)
     assert recognise(path) == "phyradgs-real"
     scan = import_scan(path, REAL)
     # counts of 16 bits: half a count of 50,000 · exp(−1.5) is 5e-5
-    assert_same(scan, truth, grid=False, pixels=1e-4)
+    assert_same(scan, real_truth, grid=False, pixels=1e-4)
     brightest = import_scan(path, replace(REAL, flat_value=None))
     np.testing.assert_allclose(brightest.projections, scan.projections, atol=1e-4)
 
 
-def test_one_scan_of_several_in_a_file(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
-    path = write_phyradgs_real(tmp_path / "real", truth)
+def test_one_scan_of_several_in_a_file(tmp_path, real_truth, assert_same) -> None:
+    path = write_phyradgs_real(tmp_path / "real", real_truth)
     file = path / "geometric_motion_rs.json"
     meta = json.loads(file.read_text())
     meta["views"] = meta["views"][::-1] + meta["views"]
     file.write_text(json.dumps(meta))
     with pytest.raises(InputError, match="--first-view"):
         import_scan(path, REAL)
-    assert_same(import_scan(path, replace(REAL, first_view=6)), truth, grid=False, pixels=1e-4)
+    assert_same(import_scan(path, replace(REAL, first_view=6)), real_truth, grid=False, pixels=1e-4)
 
 
-def test_circles_beside_the_axis(tmp_path, make_truth) -> None:
+def test_circles_beside_the_axis(tmp_path, real_truth) -> None:
     """Everything moved by one vector sees a point that moved along where it was."""
-    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
-    scan = import_scan(write_phyradgs_real(tmp_path / "real", truth, centre_mm=(3.0, -2.0)), REAL)
+    scan = import_scan(write_phyradgs_real(tmp_path / "real", real_truth, centre_mm=(3.0, -2.0)), REAL)
     assert not isinstance(scan.trajectory, CircularOrbit)
     for frame in range(scan.frames):
         for share in (0.0, 0.4, 1.0):
-            after_s = share * scan.shutter.span_s
-            ours = scan.trajectory.pose(frame, scan.frame_start_s[frame] + np.array([after_s]))[0]
-            native = truth.scan.trajectory.pose(frame, truth.scan.frame_start_s[frame] + np.array([after_s]))[
-                0
-            ]
-            there = projected(ours, WORLD_POINTS + [3.0, -2.0, 0.0])
+            there = projected(pose_at(scan, frame, share), WORLD_POINTS + [3.0, -2.0, 0.0])
+            native = pose_at(real_truth.scan, frame, share)
             np.testing.assert_allclose(there, projected(native, WORLD_POINTS), atol=1e-4)
 
 
-def test_windows_that_overlap_are_moved_apart(tmp_path, make_truth) -> None:
-    truth = make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
-    sweeps = truth.scan.trajectory.kinematics
+def test_windows_that_overlap_are_moved_apart(tmp_path, real_truth) -> None:
+    sweeps = real_truth.scan.trajectory.kinematics
     wide = replace(sweeps, angle_end_rad=sweeps.angle_start_rad + np.deg2rad(24))
     orbit = CircularOrbit(REAL_GEOMETRY, wide)
-    truth = replace(truth, scan=replace(truth.scan, trajectory=orbit))
-    scan = import_scan(write_phyradgs_real(tmp_path / "real", truth), REAL)
+    wide_truth = replace(real_truth, scan=replace(real_truth.scan, trajectory=orbit))
+    scan = import_scan(write_phyradgs_real(tmp_path / "real", wide_truth), REAL)
     assert np.diff(scan.frame_start_s).min() > scan.shutter.span_s
-    pose = scan.trajectory.pose(3, scan.frame_start_s[3] + np.array([scan.shutter.span_s]))[0]
+    pose = pose_at(scan, 3, 1.0)
     end_rad = sweeps.angle_start_rad[3] + np.deg2rad(24) * (1 + 0.3 / 0.4)
     native = REAL_GEOMETRY.pose(end_rad)
     np.testing.assert_allclose(projected(pose, WORLD_POINTS), projected(native, WORLD_POINTS), atol=1e-5)

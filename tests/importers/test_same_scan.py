@@ -10,12 +10,48 @@ import numpy as np
 import pytest
 import writers_of_importers as w
 
-from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
+from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
-FLY = ImportOptions(
-    exposure_s=0.4, readout_s=0.3, frame_time_s=1.25, readout_axis="columns", readout_direction=-1
-)
+FLY = ImportOptions(0.4, 0.3, 1.25, readout_axis="columns", readout_direction=-1)
+MOVING = {"fly": True, "axis": "columns", "direction": -1}
+ALL = ImportOptions(part="all")
 CONE = {"source_to_axis_mm": 500.0, "source_to_detector_mm": 800.0, "detector_offset_mm": (4.0, -6.0)}
+TIMED = "[timing]\nexposure_s = 0.4\nreadout_s = 0.3\n{}\n[readout]\naxis = 'columns'\ndirection = -1\n"
+EVERY = TIMED.format("frame_time_s = 1.25")
+ROWS = ImportOptions(exposure_s=0.4, readout_axis="rows")
+STARTS, STEPS = "start_s = [0, 1.25, 2.5, 3.75, 5, 6.25]", "first_deg = 10.0\nstep_deg = 25.0"
+MIDDLE = "first_deg = 14.0\nlast_deg = 139.0\nat = 'middle'"  # 25 · 0.5 · 0.4 / 1.25 after the opening
+# (format, what its writer is told, how the scan moves, options): grids are stored by some formats only
+SAME = {
+    "r2, scene units": ("r2", {"unit_mm": 40.0}, {}, replace(ALL, unit_mm=40.0)),
+    "r2, moving": ("r2", {}, MOVING, replace(FLY, part="all")),
+    # the first stored line is read first: the left column, or the top row, which is our last
+    "phyradgs by columns": ("phyradgs", {}, MOVING | {"direction": 1}, ImportOptions(exposure_s=0.4)),
+    "phyradgs by rows": ("phyradgs", {}, MOVING | {"axis": "rows"}, ROWS),
+    **{f"naf in {dtype}": ("naf", {"dtype": np.dtype(dtype)}, {}, ALL) for dtype in ("f8", ">f4", ">f8")},
+    **{f"naf, protocol {protocol}": ("naf", {"protocol": protocol}, {}, ALL) for protocol in range(6)},
+    **{
+        f"rtk {name} {flip} {packed}": ("rtk", {"flip": flip, "compressed": packed, "name": name}, {}, None)
+        for name in ("projections.mha", "projections.mhd") for flip in (False, True)
+        for packed in (False, True)
+    },
+    "rtk, moving": ("rtk", {}, MOVING, FLY),
+    "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
+    "nxtomo, moving": ("nxtomo", {}, MOVING, replace(FLY, exposure_s=None, detector_offset_mm=(4.0, -6.0))),
+    "tiff, frame time": ("tiff", {"timing": EVERY, "angles": STEPS}, MOVING, None),
+    "tiff, starts": ("tiff", {"timing": TIMED.format(STARTS), "angles": STEPS}, MOVING, None),
+    "tiff, middles": ("tiff", {"timing": EVERY, "angles": MIDDLE}, MOVING, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_the_same_scan(tmp_path, make_truth, assert_same, case) -> None:
+    form, how, motion, options = SAME[case]
+    writer, name = w.WRITERS[form]
+    truth = make_truth(**motion)
+    path = writer(tmp_path / name, truth, **how)
+    assert recognise(path) == form
+    assert_same(import_scan(path, options), truth, grid=form in ("r2", "phyradgs", "naf"))
 
 
 def test_r2_gaussian(tmp_path, make_truth, assert_same) -> None:
@@ -24,19 +60,9 @@ def test_r2_gaussian(tmp_path, make_truth, assert_same) -> None:
     assert recognise(path) == "r2"
     assert import_scan(path).frames == truth.scan.frames - 2
     assert import_scan(path, ImportOptions(part="test")).frames == 2
-    assert_same(import_scan(path, ImportOptions(part="all")), truth)
-
-
-def test_r2_gaussian_in_scene_units(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth()
-    path = w.write_r2(tmp_path / "r2", truth, unit_mm=40.0)
-    assert_same(import_scan(path, ImportOptions(part="all", unit_mm=40.0)), truth)
-
-
-def test_r2_gaussian_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth(fly=True, axis="columns", direction=-1)
-    path = w.write_r2(tmp_path / "r2", truth)
-    assert_same(import_scan(path, replace(FLY, part="all")), truth)
+    assert_same(import_scan(path, ALL), truth)
+    path = w.write_phyradgs(tmp_path / "phyradgs", make_truth(fly=True))
+    assert_same(import_scan(path, form="r2"), truth)  # at rest
 
 
 def test_naf_with_numpy_s_own_numbers(tmp_path, make_truth, assert_same) -> None:
@@ -50,58 +76,14 @@ def test_naf_with_numpy_s_own_numbers(tmp_path, make_truth, assert_same) -> None
         content[part]["angles"] = list(content[part]["angles"])
         content[part]["projections"] = np.asfortranarray(content[part]["projections"])
     (tmp_path / "chest.pickle").write_bytes(pickle.dumps(content))
-    assert_same(import_scan(tmp_path / "chest.pickle", ImportOptions(part="all")), make_truth())
+    assert_same(import_scan(tmp_path / "chest.pickle", ALL), make_truth())
+    assert import_scan(tmp_path / "chest.pickle").frames == make_truth().scan.frames - 2
 
 
 def test_a_flat_value_wins_over_flats(tmp_path, make_truth) -> None:
     path = w.write_data_exchange(tmp_path / "scan.h5", make_truth())
     usual, flat = (import_scan(path, ImportOptions(**CONE, flat_value=v)).projections for v in (None, w.AIR))
     assert np.abs(usual - flat).max() > 0.05
-
-
-@pytest.mark.parametrize(("axis", "direction"), [("columns", 1), ("rows", -1)])
-def test_phyradgs(tmp_path, make_truth, assert_same, axis, direction) -> None:
-    """The first stored line is read first: the left column, or the top row, which is our last."""
-    truth = make_truth(fly=True, axis=axis, direction=direction)
-    path = w.write_phyradgs(tmp_path / "phyradgs", truth)
-    assert recognise(path) == "phyradgs"
-    options = ImportOptions(exposure_s=0.4, readout_axis=None if axis == "columns" else axis)
-    assert_same(import_scan(path, options), truth)
-
-
-def test_a_phyradgs_folder_can_be_read_at_rest(tmp_path, make_truth, assert_same) -> None:
-    path = w.write_phyradgs(tmp_path / "phyradgs", make_truth(fly=True))
-    assert_same(import_scan(path, form="r2"), make_truth())
-
-
-@pytest.mark.parametrize("protocol", range(6))
-def test_naf(tmp_path, make_truth, assert_same, protocol) -> None:
-    truth = make_truth()
-    path = w.write_naf(tmp_path / "chest_50.pickle", truth, protocol)
-    assert recognise(path) == "naf"
-    assert import_scan(path).frames == truth.scan.frames - 2
-    assert_same(import_scan(path, ImportOptions(part="all")), truth)
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.dtype(">f4"), np.dtype(">f8")])
-def test_naf_in_other_number_types(tmp_path, make_truth, assert_same, dtype) -> None:
-    path = w.write_naf(tmp_path / "chest_50.pkl", make_truth(), dtype=dtype)
-    assert_same(import_scan(path, ImportOptions(part="all")), make_truth())
-
-
-@pytest.mark.parametrize("name", ["projections.mha", "projections.mhd"])
-@pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("flip", [False, True])
-def test_rtk(tmp_path, make_truth, assert_same, flip, compressed, name) -> None:
-    truth = make_truth()
-    path = w.write_rtk(tmp_path / "rtk", truth, flip, compressed, name)
-    assert recognise(path) == "rtk" and recognise(path / "geometry.xml") == "rtk"
-    assert_same(import_scan(path), truth, grid=False)
-
-
-def test_rtk_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth(fly=True, axis="columns", direction=-1)
-    assert_same(import_scan(w.write_rtk(tmp_path / "rtk", truth), FLY), truth, grid=False)
 
 
 def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
@@ -125,42 +107,23 @@ def test_data_exchange_with_mean_flats_and_darks(tmp_path, make_truth, assert_sa
     assert_same(import_scan(path, ImportOptions(**CONE)), make_truth(), grid=False)
 
 
-def test_data_exchange_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth(fly=True, axis="columns", direction=-1)
-    path = w.write_data_exchange(tmp_path / "scan.h5", truth)
-    assert_same(import_scan(path, replace(FLY, **CONE)), truth, grid=False)
-
-
 @pytest.mark.parametrize("flips", [(False, False), (True, False), (False, True), (True, True)])
-def test_nxtomo(tmp_path, make_truth, assert_same, flips) -> None:
-    geometry = replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0))
-    truth = make_truth(geometry=geometry)
+def test_nxtomo(tmp_path, make_truth, assert_same, caplog, flips) -> None:
+    """What the format does not say, the option does, after the flips that the file declares; a line says what is assumed."""
+    truth = make_truth(geometry=replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0)))
     path = w.write_nxtomo(tmp_path / "theirs.nx", truth, flips)
     assert recognise(path) == "nxtomo"
     scan = import_scan(path)
     assert_same(scan, truth, grid=False, timing=False)
     assert scan.shutter.exposure_s == pytest.approx(0.4) and scan.title == "theirs"
-
-
-@pytest.mark.parametrize("flips", [(False, False), (True, True)])
-def test_nxtomo_with_row_0_on_top(tmp_path, make_truth, assert_same, caplog, flips) -> None:
-    """What the format does not say, the option does, after the flips that the file declares; a line says what is assumed."""
-    truth = make_truth(geometry=replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0)))
-    path = w.write_nxtomo(tmp_path / "theirs.nx", truth, flips)
+    assert "row 0 is taken as the lowest" in caplog.text and "--row-0 top" in caplog.text
+    assert "an exposure of 0.4 s and no time from frame to frame: taken at rest; --frame-time-s" in caplog.text
+    caplog.clear()
     with h5py.File(path, "r+") as file:
         frames = file["entry0000/instrument/detector/data"]
         frames[...] = frames[()][:, ::-1]
     assert_same(import_scan(path, ImportOptions(row_0="top")), truth, grid=False, timing=False)
     assert "row 0" not in caplog.text
-    import_scan(path)
-    assert "row 0 is taken as the lowest" in caplog.text and "--row-0 top" in caplog.text
-
-
-def test_nxtomo_as_a_fly_scan(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth(fly=True, axis="columns", direction=-1)
-    path = w.write_nxtomo(tmp_path / "theirs.nx", truth)
-    options = replace(FLY, exposure_s=None, detector_offset_mm=(4.0, -6.0))
-    assert_same(import_scan(path, options), truth, grid=False)
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
@@ -203,48 +166,13 @@ def test_tiff_with_a_file_of_angles(tmp_path, make_truth, assert_same, unit) -> 
     assert_same(import_scan(path), truth, grid=False)
 
 
-TIMING = """[timing]
-exposure_s = 0.4
-readout_s = 0.3
-{when}
-[readout]
-axis = "columns"
-direction = -1
-"""
-
-
-@pytest.mark.parametrize("when", ["frame_time_s = 1.25", "start_s = [0, 1.25, 2.5, 3.75, 5, 6.25]"])
-def test_tiff_with_timing(tmp_path, make_truth, assert_same, when) -> None:
-    truth = make_truth(fly=True, axis="columns", direction=-1)
-    angles = "first_deg = 10.0\nstep_deg = 25.0"
-    path = w.write_tiff(tmp_path / "tiff", truth, TIMING.format(when=when), angles)
-    assert_same(import_scan(path), truth, grid=False)
-
-
-def test_angles_in_the_middle_of_the_exposure(tmp_path, make_truth, assert_same) -> None:
-    truth = make_truth(fly=True, axis="columns", direction=-1)
-    middle_deg = np.rad2deg(truth.angle_rad) + 25.0 * 0.5 * 0.4 / 1.25
-    angles = f"first_deg = {middle_deg[0]}\nlast_deg = {middle_deg[-1]}\nat = 'middle'"
-    path = w.write_tiff(tmp_path / "tiff", truth, TIMING.format(when="frame_time_s = 1.25"), angles)
-    assert_same(import_scan(path), truth, grid=False)
-
-
 def test_stored_words_can_be_overruled(tmp_path, make_truth, assert_same) -> None:
     """Frames stored bottom up and mirrored, angles of the sample: the options say so, the file does not."""
     truth = make_truth()
-    path = w.write_tiff(
-        tmp_path / "tiff", truth, angles=f"values_deg = {(-np.rad2deg(truth.angle_rad)).tolist()}"
-    )
+    angles = f"values_deg = {(-np.rad2deg(truth.angle_rad)).tolist()}"
+    path = w.write_tiff(tmp_path / "tiff", truth, angles=angles)
     for file in path.glob("*.tif"):
         image = w.tifffile.imread(file)
         w.tifffile.imwrite(file, np.ascontiguousarray(image[::-1, ::-1]))
     options = ImportOptions(row_0="bottom", column_0="right", rotates="sample")
     assert_same(import_scan(path, options), truth, grid=False)
-
-
-def test_every_format_has_its_test() -> None:
-    tested = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
-    names = {"r2": "r2_gaussian"}
-    apart = {"phyradgs-real"}  # test_phyradgs_real.py
-    for form in set(FORMATS) - apart:
-        assert names.get(form, form.replace("-", "_")) in tested

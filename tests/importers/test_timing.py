@@ -11,36 +11,19 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan
 
 CONE = ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0)
-FORMS = {
-    "r2": (w.write_r2, ImportOptions()),
-    "naf": (w.write_naf, ImportOptions()),
-    "rtk": (w.write_rtk, ImportOptions()),
-    "data-exchange": (w.write_data_exchange, CONE),
-    "nxtomo": (w.write_nxtomo, ImportOptions()),
-    "tiff": (w.write_tiff, ImportOptions()),
-}
 SAID = {
-    "--exposure-s": {"exposure_s": 0.4},
-    "--readout-s": {"readout_s": 0.3},
-    "--angle-at": {"angle_at": "middle"},
-    "--readout": {"readout_axis": "rows"},
+    "--exposure-s": {"exposure_s": 0.4}, "--readout-s": {"readout_s": 0.3},
+    "--angle-at": {"angle_at": "middle"}, "--readout": {"readout_axis": "rows"},
     "--readout-direction": {"readout_direction": -1},
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", ["r2", "naf", "rtk", "data-exchange", "nxtomo", "tiff"])
 def test_a_turn_without_a_frame_time_is_refused(tmp_path, make_truth, form) -> None:
-    write, options = FORMS[form]
-    path = write(tmp_path / "scan", make_truth())
+    path, options = w.write(form, tmp_path, make_truth), CONE if form == "data-exchange" else ImportOptions()
     for name, said in SAID.items():
         with pytest.raises(InputError, match=f"^{name}: .*time from frame to frame.*--frame-time-s"):
             import_scan(path, replace(options, **said), form)
         timed = replace(options, frame_time_s=1.25, **{"exposure_s": 0.4, **said})
         assert import_scan(path, timed, form).is_fly
     assert not import_scan(path, options, form).is_fly
-
-
-def test_a_file_s_own_exposure_is_no_turn_but_a_hint(tmp_path, make_truth, caplog) -> None:
-    path = w.write_nxtomo(tmp_path / "scan.nx", make_truth())
-    assert not import_scan(path).is_fly
-    assert "an exposure of 0.4 s and no time from frame to frame: taken at rest; --frame-time-s" in caplog.text

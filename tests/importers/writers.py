@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +18,26 @@ from nxtomo.application import nxtomo
 AIR, DARK = 50000.0, 300.0
 
 
-# --- R2-Gaussian, PhyRadGS: images and volumes as TIGRE's users store them -------------------------------------
-
-
 def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
     """meta_data.json's scanner; lengths in scene units."""
     g, grid = truth.scan.geometry, truth.scan.grid
+    lengths_mm = {
+        "sDetector": np.multiply(g.detector_shape, g.pixel_size_mm), "sVoxel": grid.size_mm[::-1],
+        "offOrigin": grid.offset_mm[::-1], "offDetector": g.detector_offset_mm[::-1],
+    }  # fmt: skip
     return {
-        "mode": "cone",
-        "DSD": g.source_to_detector_mm / unit_mm,
+        "mode": "cone", "accuracy": 0.5, "DSD": g.source_to_detector_mm / unit_mm,
         "DSO": g.source_to_axis_mm / unit_mm,
-        "nDetector": list(g.detector_shape),
-        "sDetector": [n * d / unit_mm for n, d in zip(g.detector_shape, g.pixel_size_mm, strict=True)],
-        "nVoxel": list(grid.shape[::-1]),
-        "sVoxel": [s / unit_mm for s in grid.size_mm[::-1]],
-        "offOrigin": [o / unit_mm for o in grid.offset_mm[::-1]],
-        "offDetector": [g.detector_offset_mm[1] / unit_mm, g.detector_offset_mm[0] / unit_mm],
-        "accuracy": 0.5,
-    }
+        "nDetector": list(g.detector_shape), "nVoxel": list(grid.shape[::-1]),
+        **{name: [float(one) / unit_mm for one in three] for name, three in lengths_mm.items()},
+    }  # fmt: skip
 
 
 def write_r2(folder: Path, truth: Any, unit_mm: float = 1.0, test: int = 2) -> Path:
     """An R2-Gaussian folder: the last ``test`` frames are held out."""
     folder.mkdir()
     meta: dict[str, Any] = {
-        "scanner": scanner_table(truth, unit_mm),
-        "vol": "vol_gt.npy",
-        "bbox": [[-1] * 3, [1] * 3],
+        "scanner": scanner_table(truth, unit_mm), "vol": "vol_gt.npy", "bbox": [[-1] * 3, [1] * 3],
     }
     np.save(folder / "vol_gt.npy", np.transpose(truth.scan.reference, (2, 1, 0)) * unit_mm)
     count = truth.scan.frames - test
@@ -66,10 +60,7 @@ def write_phyradgs(folder: Path, truth: Any) -> Path:
     meta = json.loads((folder / "meta_data.json").read_text())
     meta["simulate_train"] = [
         {
-            "file_path": entry["file_path"],
-            "angle": entry["angle"],
-            "first_line_start": entry["angle"],
-            "first_line_end": entry["angle"] + a,
+            **entry, "first_line_start": entry["angle"], "first_line_end": entry["angle"] + a,
             "last_line_end": entry["angle"] + a * (1 + shutter.readout_s / shutter.exposure_s),
         }
         for entry, a in zip(meta["proj_train"], arc, strict=True)
@@ -84,16 +75,10 @@ def naf_dict(truth: Any, dtype: type = np.float32) -> dict[str, object]:
     g, grid, frames = truth.scan.geometry, truth.scan.grid, truth.scan.projections[:, ::-1].astype(dtype)
     count = len(frames) - 2
     return {
-        "numTrain": count,
-        "numVal": 2,
-        "DSD": g.source_to_detector_mm,
-        "DSO": g.source_to_axis_mm,
-        "nDetector": list(g.detector_shape),
-        "dDetector": list(g.pixel_size_mm),
-        "nVoxel": list(grid.shape[::-1]),
-        "dVoxel": list(grid.voxel_size_mm[::-1]),
-        "offOrigin": list(grid.offset_mm[::-1]),
-        "offDetector": [g.detector_offset_mm[1], g.detector_offset_mm[0]],
+        "numTrain": count, "numVal": 2, "DSD": g.source_to_detector_mm, "DSO": g.source_to_axis_mm,
+        "nDetector": list(g.detector_shape), "dDetector": list(g.pixel_size_mm),
+        "nVoxel": list(grid.shape[::-1]), "dVoxel": list(grid.voxel_size_mm[::-1]),
+        "offOrigin": list(grid.offset_mm[::-1]), "offDetector": list(g.detector_offset_mm[::-1]),
         "image": np.transpose(truth.scan.reference, (2, 1, 0)) * 1e3,
         "train": {"angles": truth.angle_rad[:count], "projections": frames[:count]},
         "val": {"angles": truth.angle_rad[count:], "projections": frames[count:]},
@@ -103,9 +88,6 @@ def naf_dict(truth: Any, dtype: type = np.float32) -> dict[str, object]:
 def write_naf(path: Path, truth: Any, protocol: int = 4, dtype: type = np.float32) -> Path:
     path.write_bytes(pickle.dumps(naf_dict(truth, dtype), protocol))
     return path
-
-
-# --- PhyRadGS's real scans ------------------------------------------------------------------------------------
 
 
 def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float] = (0.0, 0.0)) -> Path:
@@ -150,9 +132,6 @@ def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float]
     return folder
 
 
-# --- RTK ------------------------------------------------------------------------------------------------------
-
-
 def write_rtk(
     folder: Path, truth: Any, flip: bool = False, compressed: bool = False, name: str = "projections.mha"
 ) -> Path:
@@ -180,9 +159,6 @@ def write_rtk(
         stack.SetDirection((1, 0, 0, 0, -1, 0, 0, 0, 1))
     sitk.WriteImage(stack, str(folder / name), useCompression=compressed)
     return folder
-
-
-# --- HDF5 of beamlines ------------------------------------------------------------------------------------------
 
 
 def counts(truth: Any, dead: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -242,17 +218,13 @@ def write_nxtomo(path: Path, truth: Any, flips: tuple[bool, bool] = (False, Fals
     return path
 
 
-# --- TIFF -------------------------------------------------------------------------------------------------------
-
-
 def write_pages(path: Path, stack: np.ndarray, way: str) -> None:
     """A stack (n, v, u) as one file, in one of the ways in which programs do it."""
     if way == "SimpleITK":
         sitk.WriteImage(sitk.GetImageFromArray(stack), str(path))
         return
     options: dict[str, dict[str, Any]] = {
-        "plain": {},
-        "imagej": {"imagej": True},
+        "plain": {}, "imagej": {"imagej": True},
         "planar": {"photometric": "minisblack", "planarconfig": "separate"},
         "volumetric": {"photometric": "minisblack", "volumetric": True},
         "tiled": {"photometric": "minisblack", "volumetric": True, "tile": (16, 16, 16)},
@@ -268,11 +240,8 @@ def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = 
     frames, flats, darks = counts(truth, options.get("dead"))
     for name, stack in (("proj", frames), ("flat", flats), ("dark", darks)):
         for i, image in enumerate(stack):
-            tifffile.imwrite(
-                folder / f"{name}_{i}.tif",
-                image[::-1].astype(np.float64),
-                compression=options.get("compression"),
-            )
+            file = folder / f"{name}_{i}.tif"
+            tifffile.imwrite(file, image[::-1].astype(np.float64), compression=options.get("compression"))
     g, grid = truth.scan.geometry, truth.scan.grid
     angles = angles or f"values_deg = {np.rad2deg(truth.angle_rad).tolist()}"
     (folder / "scan.toml").write_text(
@@ -299,3 +268,22 @@ offset_mm = {list(grid.offset_mm)}
 """
     )
     return folder
+
+
+# format: (what writes a good one, under which name)
+WRITERS = {
+    "r2": (write_r2, "r2"), "phyradgs": (write_phyradgs, "phyradgs"),
+    "phyradgs-real": (write_phyradgs_real, "real"),
+    "naf": (write_naf, "chest.pickle"), "rtk": (write_rtk, "rtk"),
+    "data-exchange": (write_data_exchange, "dx.h5"),
+    "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
+}  # fmt: skip
+
+
+def write(form: str, folder: Path, make_truth: Any) -> Path:
+    """A good one in a folder, of a scan that the format can hold; real views have source and panel face each other."""
+    truth = make_truth(fly=form.startswith("phyradgs"))
+    if form == "phyradgs-real":
+        truth = make_truth(fly=True, geometry=replace(truth.scan.geometry, detector_offset_mm=(4.0, 0.0)))
+    writer, name = WRITERS[form]
+    return writer(folder / name, truth)

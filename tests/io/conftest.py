@@ -26,13 +26,9 @@ def make_scan() -> Callable[..., Scan]:
         sweeps = FrameSweeps(start_s, 0.8, first_rad, first_rad + np.deg2rad([3.0, 4.0, 5.0, 6.0]))
         fields: dict[str, object] = {
             "projections": rng.uniform(0, 4, (FRAMES, ROWS, COLUMNS)).astype(np.float32),
-            "geometry": GEOMETRY,
-            "trajectory": CircularOrbit(GEOMETRY, sweeps),
-            "shutter": Shutter(0.8, 0.3, "columns", -1),
-            "frame_start_s": start_s,
-            "grid": GRID,
-            "detector_model": "intensity",
-            "title": "a test scan",
+            "geometry": GEOMETRY, "trajectory": CircularOrbit(GEOMETRY, sweeps),
+            "shutter": Shutter(0.8, 0.3, "columns", -1), "frame_start_s": start_s, "grid": GRID,
+            "detector_model": "intensity", "title": "a test scan",
         }
         return Scan(**(fields | changes))  # type: ignore[arg-type]
 

@@ -22,15 +22,14 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "c.npz"
 
 
-def members(path: Path) -> dict[str, bytes]:
-    with zipfile.ZipFile(path) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
+
 
 
 def rewrite(path: Path, changes: dict[str, bytes]) -> None:
-    content = members(path) | changes
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w") as archive:
-        for name, data in content.items():
+        for name, data in (content | changes).items():
             archive.writestr(name, data)
 
 
@@ -47,15 +46,13 @@ def refused(path: Path, words: str) -> None:
 
 
 def test_what_was_written_is_read(path) -> None:
-    found = read_checkpoint(path, "print")
-    assert sorted(found) == sorted(ARRAYS)
-    for name, values in ARRAYS.items():
-        np.testing.assert_array_equal(found[name], values)
-
-
-def test_columns_first_keep_their_order(path) -> None:
-    rewrite(path, {"volume.npy": npy(np.asfortranarray(ARRAYS["volume"]))})
-    np.testing.assert_array_equal(read_checkpoint(path, "print")["volume"], ARRAYS["volume"])
+    """Columns that come first keep their order."""
+    for _ in range(2):
+        found = read_checkpoint(path, "print")
+        assert sorted(found) == sorted(ARRAYS)
+        for name, values in ARRAYS.items():
+            np.testing.assert_array_equal(found[name], values)
+        rewrite(path, {"volume.npy": npy(np.asfortranarray(ARRAYS["volume"]))})
 
 
 def test_none_another_runs_or_another_formats(path) -> None:
@@ -84,29 +81,25 @@ def test_what_another_run_had_otherwise_is_named(path) -> None:
         assert "another scan or other options" in told(damaged, now)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"volume.npy": npy(ARRAYS["volume"]).replace(b"(2, 3, 4)", b"(9, 9, 9)")},
-        {"volume.npy": npy(ARRAYS["volume"])[:-8]},
-        {"volume.npy": b"no array"},
-        {"volume.txt": b"hello"},
-        {"volume.npy": npy(np.array([None]))},
-    ],
-    ids=["too large", "cut off", "no array", "a text", "a pickle"],
-)
-def test_archives_that_no_run_writes(path, changes) -> None:
-    rewrite(path, changes)
-    refused(path, "a damaged checkpoint")
+def test_archives_that_no_run_writes(path) -> None:
+    good, volume = path.read_bytes(), npy(ARRAYS["volume"])
+    for name, content in [
+        ("volume.npy", volume.replace(b"(2, 3, 4)", b"(9, 9, 9)")), ("volume.npy", volume[:-8]),
+        ("volume.npy", b"no array"), ("volume.txt", b"hello"), ("volume.npy", npy(np.array([None]))),
+    ]:  # fmt: skip
+        path.write_bytes(good)
+        rewrite(path, {name: content})
+        refused(path, "a damaged checkpoint")
 
 
-@pytest.mark.parametrize("at", [0, 33, 66, 127, 300])
-def test_a_changed_byte_is_noticed(path, at) -> None:
+def test_a_changed_byte_is_noticed(path) -> None:
     """In the header of the archive's member, in that of the array, in its numbers: by the checksum if by nothing else."""
-    content = bytearray(path.read_bytes())
-    content[at] ^= 0x11
-    path.write_bytes(content)
-    refused(path, "a damaged checkpoint")
+    good = path.read_bytes()
+    for at in (0, 33, 66, 127, 300):
+        content = bytearray(good)
+        content[at] ^= 0x11
+        path.write_bytes(content)
+        refused(path, "a damaged checkpoint")
 
 
 def test_one_that_cannot_be_opened_says_why(path, monkeypatch) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PoseTable, Scan, Shutter
+from phyradgs_cl.acquisition.trajectory import sampled
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -46,6 +47,16 @@ def test_it_is_saved_as_a_table_that_follows_it(tmp_path, every_s) -> None:
         times = start_s + np.linspace(0, 0.7, 33)
         apart = found.trajectory.pose(frame, times) - scan.trajectory.pose(frame, times)
         assert np.abs(apart).max() <= 2e-4 * 5.0
+
+
+def test_where_frames_overlap_the_table_follows_between_their_samples() -> None:
+    """Samples of one frame lie in the middle between another's, where a table is right of itself."""
+    scan = scan_on(Wobbling(), 0.350001)  # half a span
+    table = sampled(scan.trajectory, scan.frame_start_s, 0.7, 1e-3)
+    for frame, start_s in enumerate(scan.frame_start_s):
+        times = start_s + np.linspace(0, 0.7, 57)
+        apart = table.pose(frame, times) - scan.trajectory.pose(frame, times)
+        assert np.abs(apart).max() <= 1.2e-3, frame
 
 
 def test_every_kind_of_method_follows_it(rt, tmp_path) -> None:

@@ -30,10 +30,8 @@ def test_nxtomo_reads_our_file(stored) -> None:
     detector = tomo.instrument.detector
     np.testing.assert_array_equal(detector.data, data)
     np.testing.assert_array_equal([int(k.value) for k in detector.image_key_control], key)
-    assert detector.x_pixel_size.to("mm").magnitude == pytest.approx(0.5)
-    assert detector.y_pixel_size.to("mm").magnitude == pytest.approx(0.6)
-    assert detector.distance.to("mm").magnitude == pytest.approx(1200.0 - 785.0)
-    assert tomo.instrument.source.distance.to("mm").magnitude == pytest.approx(-785.0)
+    lengths = detector.x_pixel_size, detector.y_pixel_size, detector.distance, tomo.instrument.source.distance
+    assert [one.to("mm").magnitude for one in lengths] == pytest.approx([0.5, 0.6, 1200.0 - 785.0, -785.0])
     assert detector.count_time.to("s").magnitude == pytest.approx(0.8)
     angles_deg = tomo.sample.rotation_angle.to("degree").magnitude
     np.testing.assert_allclose(angles_deg, [10, 10, 10, 25, 40, 40, 58])
@@ -70,9 +68,8 @@ def test_we_read_a_file_of_nxtomo(tmp_path) -> None:
         file["entry0000/instrument/detector/data"].attrs["quantity"] = "attenuation"
     scan = read_scan(tmp_path / "theirs.nx", counts_to_attenuation)
     assert not scan.is_fly and scan.title == "theirs"
-    assert scan.geometry.source_to_axis_mm == pytest.approx(500)
-    assert scan.geometry.source_to_detector_mm == pytest.approx(750)
-    assert scan.geometry.pixel_size_mm == pytest.approx((0.3, 0.2))
+    found = scan.geometry.source_to_axis_mm, scan.geometry.source_to_detector_mm, *scan.geometry.pixel_size_mm
+    assert found == pytest.approx((500, 750, 0.3, 0.2))
     assert scan.shutter.exposure_s == pytest.approx(0.1)
     np.testing.assert_array_equal(scan.projections, tomo.instrument.detector.data)
     start_s = scan.frame_start_s[2:3]

@@ -42,32 +42,29 @@ def write(tmp_path):
     return written
 
 
-def test_the_synthetic_scanner_of_the_benchmark() -> None:
-    scanner = load_scanner("r2", DATA)
-    geometry = scanner.geometry
-    assert (geometry.source_to_axis_mm, geometry.source_to_detector_mm) == (5, 7)
-    assert geometry.detector_shape == (512, 512)
-    assert [n * d for n, d in zip(geometry.detector_shape, geometry.pixel_size_mm, strict=True)] == [4, 4]
-    assert scanner.grid.shape == (256,) * 3 and scanner.grid.size_mm == (2, 2, 2)
-
-
-def test_the_c_arm_sees_its_volume_in_every_view() -> None:
-    scanner = load_scanner("carm", DATA)
-    assert scanner.geometry.source_to_axis_mm == 785 and scanner.geometry.source_to_detector_mm == 1200
-    assert scanner.grid.size_mm == pytest.approx((200, 200, 200))
-    assert min(default_grid(scanner.geometry).size_mm) > 200  # the inscribed cylinder
+def test_the_scanners_that_come_with_the_project() -> None:
+    """The benchmark's; and a C-arm that sees its volume in every view."""
+    r2, arm = load_scanner("r2", DATA), load_scanner("carm", DATA)
+    assert (r2.geometry.source_to_axis_mm, r2.geometry.source_to_detector_mm) == (5, 7)
+    assert r2.geometry.detector_shape == (512, 512) and r2.geometry.pixel_size_mm == (4 / 512, 4 / 512)
+    assert r2.grid.shape == (256,) * 3 and r2.grid.size_mm == (2, 2, 2)
+    assert (arm.geometry.source_to_axis_mm, arm.geometry.source_to_detector_mm) == (785, 1200)
+    assert arm.grid.size_mm == pytest.approx((200, 200, 200))
+    assert min(default_grid(arm.geometry).size_mm) > 200  # the inscribed cylinder
 
 
 def test_all_fields(write) -> None:
-    scanner = load_scanner(write(GOOD), DATA)
-    assert scanner.geometry == ConeGeometry(500.0, 1000.0, (40, 60), (2.0, 1.0), (0.0, 3.5))
-    assert scanner.grid == Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0))
-    assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("columns", -1, 0.5)
-
-
-def test_a_byte_order_mark_is_no_part_of_the_text(write) -> None:
-    """Editors of Windows write one."""
-    assert load_scanner(write("\ufeff" + GOOD), DATA) == load_scanner(write(GOOD), DATA)
+    """Editors of Windows write a byte order mark; volume and readout may be left out."""
+    for text in (GOOD, "\ufeff" + GOOD):
+        scanner = load_scanner(write(text), DATA)
+        assert scanner.geometry == ConeGeometry(500.0, 1000.0, (40, 60), (2.0, 1.0), (0.0, 3.5))
+        assert scanner.grid == Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0))
+        assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == (
+            "columns", -1, 0.5,
+        )
+    scanner = load_scanner(write(GOOD.split("[volume]")[0]), DATA)
+    assert scanner.grid == default_grid(scanner.geometry)
+    assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("rows", 1, None)
 
 
 def test_pulse_and_lag_of_a_scanner(write) -> None:
@@ -83,12 +80,6 @@ def test_pulse_and_lag_of_a_scanner(write) -> None:
         load_scanner(write(GOOD.replace("columns = 60", "columns = 60\nlag = 1.0")), DATA)
 
 
-def test_volume_and_readout_may_be_left_out(write) -> None:
-    scanner = load_scanner(write(GOOD.split("[volume]")[0]), DATA)
-    assert scanner.grid == default_grid(scanner.geometry)
-    assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("rows", 1, None)
-
-
 WRONG = {
     "unknown key": ("rows = 40", "rows = 40\ncolums = 60", "[detector] colums", "did you mean 'columns'"),
     "unknown table": ("[volume]", "[volumes]", "volumes", "did you mean 'volume'"),
@@ -101,19 +92,11 @@ WRONG = {
     "half a row": ("rows = 40", "rows = 40.5", "[detector] rows", "whole"),
     "true": ("rows = 40", "rows = true", "[detector] rows", "True"),
     "detector before axis": (
-        "to_detector_mm = 1000.0",
-        "to_detector_mm = 400",
-        "[source] to_detector_mm",
-        "500",
+        "to_detector_mm = 1000.0", "to_detector_mm = 400", "[source] to_detector_mm", "500",
     ),
     "two counts": ("shape = [10, 20, 40]", "shape = [10, 20]", "[volume] shape", "three"),
     "zero voxels": ("shape = [10, 20, 40]", "shape = [10, 0, 40]", "[volume] shape", "at least 1"),
-    "flat volume": (
-        "size_mm = [10.0, 20.0, 80.0]",
-        "size_mm = [10.0, 0, 80.0]",
-        "[volume] size_mm",
-        "above 0",
-    ),
+    "flat volume": ("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]", "[volume] size_mm", "above 0"),
     "axis": ('axis = "columns"', 'axis = "cols"', "[readout] axis", "'rows'"),
     "direction": ("direction = -1", "direction = 0", "[readout] direction", "-1"),
     "direction true": ("direction = -1", "direction = true", "[readout] direction", "True"),
@@ -123,23 +106,17 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_errors_name_table_and_key(write, case) -> None:
-    old, new, where, word = WRONG[case]
-    assert old in GOOD
-    path = write(GOOD.replace(old, new, 1))
-    with pytest.raises(InputError) as caught:
-        load_scanner(path, DATA)
-    text = str(caught.value)
-    assert text.startswith(f"{path} {where}".strip()) and word in text, text
-    assert "\n" not in text
-
-
-def test_unknown_names_and_paths(tmp_path) -> None:
-    with pytest.raises(InputError, match=r"did you mean 'carm'"):
-        load_scanner("carmm", DATA)
-    with pytest.raises(InputError, match="no such file"):
-        load_scanner(tmp_path / "none.toml", DATA)
+def test_errors_name_table_and_key(write, tmp_path) -> None:
+    for old, new, where, word in WRONG.values():
+        assert old in GOOD
+        path = write(GOOD.replace(old, new, 1))
+        with pytest.raises(InputError) as caught:
+            load_scanner(path, DATA)
+        text = str(caught.value)
+        assert text.startswith(f"{path} {where}".strip()) and word in text and "\n" not in text, text
+    for name, words in (("carmm", r"did you mean 'carm'"), (tmp_path / "none.toml", "no such file")):
+        with pytest.raises(InputError, match=words):
+            load_scanner(name, DATA)
 
 
 def test_another_count_keeps_the_panel() -> None:

@@ -14,12 +14,9 @@ from phyradgs_cl.fields import Grid
 
 STRESSED = int(os.environ.get("STRESS", "1")) > 1
 many = settings(
-    max_examples=1000 if STRESSED else 20,
-    deadline=None,
-    derandomize=True,
-    database=None,
+    max_examples=1000 if STRESSED else 20, deadline=None, derandomize=True, database=None,
     suppress_health_check=list(HealthCheck),
-)
+)  # fmt: skip
 """Cases of a law: a thousand in `make stress`."""
 
 
@@ -66,9 +63,7 @@ def cloud(seed: int, count: int = 4, smallest: float = 0.08) -> np.ndarray:
     rng = np.random.default_rng(seed)
     quaternion = rng.normal(size=(4, count))
     parts = [
-        rng.uniform(-0.7, 0.7, (3, count)),
-        np.exp(rng.uniform(np.log(smallest), np.log(0.5), (3, count))),
-        quaternion / np.linalg.norm(quaternion, axis=0),
-        rng.uniform(0.5, 2.0, (1, count)),
+        rng.uniform(-0.7, 0.7, (3, count)), np.exp(rng.uniform(np.log(smallest), np.log(0.5), (3, count))),
+        quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.5, 2.0, (1, count)),
     ]
     return np.concatenate(parts).astype(np.float32).astype(np.float64)

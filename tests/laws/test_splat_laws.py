@@ -4,40 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 from hypothesis import given
+from kernel_kit import splat, splat_gradients
 from laws_kit import cloud, many, seeds, tables
 from tolerances import ADJOINT, GRADIENT, SPLAT_CLOUD
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields.gaussians import DENSITY
-from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_frame
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.runtime.layout import pad_rows
 
 STEP = 1e-5
 
 
-def lines_first(shape: tuple[int, int], cells: TimeCells) -> tuple[int, int]:
-    return shape if cells.axis == "rows" else shape[::-1]
-
-
 def draw(rt: Runtime, rows: np.ndarray, shape: tuple[int, int], cells: TimeCells) -> np.ndarray:
-    """The frame (lines, width), all of every Gaussian."""
-    projector = SplatProjector(rt, *lines_first(shape, cells), cutoff_sigma=0.0)
-    return projector.project(rows, DeviceCells.upload(rt, cells)).astype(np.float64)
-
-
-def pull(
-    rt: Runtime, rows: np.ndarray, shape: tuple[int, int], cells: TimeCells, h: np.ndarray
-) -> np.ndarray:
-    """Rows (11, G) of dL/d… for L = Σ h · frame, h (rows, columns)."""
-    projector = SplatProjector(rt, *lines_first(shape, cells), cutoff_sigma=0.0)
-    h = np.ascontiguousarray(h if cells.axis == "rows" else h.T)
-    on_device, gaussians = DeviceCells.upload(rt, cells), DeviceGaussians.upload(rt, rows)
-    projector.forward(gaussians, on_device)
-    gradients = rt.zeros((13, gaussians.stride))
-    projector.backward(gaussians, on_device, rt.upload(pad_rows(h)), gradients)
-    return rt.download(gradients)[:11, : gaussians.count].astype(np.float64)
+    """The frame (rows, columns), all of every Gaussian."""
+    return splat(rt, rows, cells, shape, cutoff_sigma=0.0).astype(np.float64)
 
 
 @many
@@ -61,8 +42,9 @@ def test_the_gradient_of_densities_is_the_adjoint(rt, scanner, seed) -> None:
     shape, (cells, _) = scanner
     rows = cloud(seed)
     h = np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
-    one = float(np.vdot(draw(rt, rows, shape, cells), h if cells.axis == "rows" else h.T))
-    other = float(np.vdot(rows[DENSITY], pull(rt, rows, shape, cells, h)[DENSITY]))
+    one = float(np.vdot(draw(rt, rows, shape, cells), h))
+    gradient = splat_gradients(rt, rows, cells, h, cutoff_sigma=0.0).astype(np.float64)
+    other = float(np.vdot(rows[DENSITY], gradient[DENSITY]))
     assert abs(one - other) <= ADJOINT * max(abs(one), abs(other))
 
 
@@ -75,7 +57,7 @@ def test_the_gradient_is_the_derivative(rt, scanner, seed) -> None:
     h = rng.normal(size=shape).astype(np.float32)
     direction = rng.normal(size=rows.shape) * np.where(np.arange(11)[:, None] < 6, 0.1, 1.0)
     ends = [float((h * splat_frame(rows + s * STEP * direction, cells, shape)).sum()) for s in (1, -1)]
-    gradient = pull(rt, rows, shape, cells, h)
+    gradient = splat_gradients(rt, rows, cells, h, cutoff_sigma=0.0).astype(np.float64)
     size = np.linalg.norm(gradient * direction)  # of what is added up, which may nearly cancel
     found, expected = float(np.vdot(gradient, direction)), (ends[0] - ends[1]) / (2 * STEP)
     assert abs(found - expected) <= 2 * GRADIENT * max(size, 1e-3)

@@ -17,8 +17,7 @@ def test_compare_uses_the_references_maximum_and_says_so() -> None:
     truth = _frames()
     found = compare(truth + 0.1, truth)
     assert found == {
-        "psnr_db": psnr(truth + 0.1, truth, truth.max()),
-        "ssim": ssim(truth + 0.1, truth, truth.max()),
+        "psnr_db": psnr(truth + 0.1, truth, truth.max()), "ssim": ssim(truth + 0.1, truth, truth.max()),
         "data_range": truth.max(),
     }
     with pytest.raises(InputError, match="reference: found a maximum of 0"):

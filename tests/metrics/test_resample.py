@@ -26,13 +26,10 @@ def test_what_is_linear_stays_as_it_is(onto) -> None:
     np.testing.assert_allclose(values, plane_through(onto), rtol=1e-5)
 
 
-def test_half_as_many_voxels_are_the_means_of_eight() -> None:
+def test_means_of_eight_and_nothing_outside() -> None:
     volume = np.random.default_rng(0).random((8, 8, 8)).astype(np.float32)
     values, _ = resampled(volume, Grid.cube(8, 2.0), Grid.cube(4, 2.0))
     np.testing.assert_allclose(values, volume.reshape(4, 2, 4, 2, 4, 2).mean(axis=(1, 3, 5)), rtol=1e-5)
-
-
-def test_outside_of_the_box_is_nothing_and_said() -> None:
     ones, inner = np.ones((4, 4, 4), np.float32), Grid.cube(4, 2.0)
     values, share = resampled(ones, inner, Grid.cube(8, 4.0))
     assert share == pytest.approx(1 / 8) and values.sum() == 64 and np.all(values[2:6, 2:6, 2:6] == 1)

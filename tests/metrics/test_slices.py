@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
+from refusals import assert_refused
 
-from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.errors import OutputError
 from phyradgs_cl.metrics import slices_png
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -24,20 +24,17 @@ def test_three_columns_with_a_truth_and_one_without(tmp_path: Path) -> None:
     slices_png(tmp_path / "with.png", volume + 0.1, volume, "title")
     slices_png(tmp_path / "without.png", volume, None, "title")
     assert _size(tmp_path / "with.png")[0] > 2 * _size(tmp_path / "without.png")[0] > 200
-
-
-def test_empty_volumes_are_drawn_too(tmp_path: Path) -> None:
     slices_png(tmp_path / "empty.png", np.zeros((3, 3, 3)), np.zeros((3, 3, 3)), "nothing")
-    _size(tmp_path / "empty.png")
+    assert min(_size(tmp_path / "empty.png")) > 0
 
 
 def test_errors(tmp_path: Path) -> None:
-    good = np.ones((3, 3, 3))
-    with pytest.raises(OutputError, match="missing"):
-        slices_png(tmp_path / "missing" / "a.png", good, None, "title")
-    with pytest.raises(InputError, match="result: found shape"):
-        slices_png(tmp_path / "a.png", good[0], None, "title")
-    with pytest.raises(InputError, match=r"found shape \(3, 3, 3\); expected shape \(2, 3, 3\)"):
-        slices_png(tmp_path / "a.png", good, good[1:], "title")
-    with pytest.raises(InputError, match="NaN"):
-        slices_png(tmp_path / "a.png", good * np.nan, None, "title")
+    good, png = np.ones((3, 3, 3)), tmp_path / "a.png"
+    assert_refused(
+        {"missing": lambda: slices_png(tmp_path / "missing" / "a.png", good, None, "title")}, OutputError
+    )
+    assert_refused({
+        "result: found shape": lambda: slices_png(png, good[0], None, "title"),
+        r"found shape \(3, 3, 3\); expected shape \(2, 3, 3\)": lambda: slices_png(png, good, good[1:], "title"),
+        "NaN": lambda: slices_png(png, good * np.nan, None, "title"),
+    })  # fmt: skip

@@ -24,16 +24,9 @@ from mutation.mutants import Mutant, mutants  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 NEEDED = ("phyradgs_cl", "cl", "data", "tests", "cli.py", "pyproject.toml")
-IMPORTED = (
-    "numpy",
-    "scipy.ndimage",
-    "scipy.spatial",
-    "h5py",
-    "skimage.metrics",
-    "pyopencl",
-    "hypothesis",
-    "pytest",
-)
+IMPORTED = [
+    "numpy", "scipy.ndimage", "scipy.spatial", "h5py", "skimage.metrics", "pyopencl", "hypothesis", "pytest",
+]
 TESTS = {
     "acquisition": ("tests/acquisition",),
     "objective": ("tests/objective",),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 
-import pytest
 from mutation.mutants import mutants
 
 SOURCE = b'''"""A text with 1 + 1."""
@@ -19,20 +18,11 @@ def f(x: int = -1, *, whole: bool = True) -> int | None:
     return x * 3 if x is None else None
 '''
 FOUND = [
-    "2: 40 → 80",
-    "5: -1 → (1)",
-    "5: 1 → 2",
-    "5: True → False",
-    "7: x < LIMIT and not whole → (x < LIMIT or not whole)",
-    "7: x < LIMIT → (x <= LIMIT)",
-    "7: not whole → (whole)",
-    '8: return f"{x + 1} €" → return None',
-    "9: x += 2.5 → x -= 2.5",
-    "9: 2.5 → 5.0",
-    "10: return x * 3 if x is None else None → return None",
-    "10: x * 3 if x is None else None → (None if x is None else x * 3)",
-    "10: x * 3 → (x / 3)",
-    "10: 3 → 4",
+    "2: 40 → 80", "5: -1 → (1)", "5: 1 → 2", "5: True → False",
+    "7: x < LIMIT and not whole → (x < LIMIT or not whole)", "7: x < LIMIT → (x <= LIMIT)",
+    "7: not whole → (whole)", '8: return f"{x + 1} €" → return None', "9: x += 2.5 → x -= 2.5",
+    "9: 2.5 → 5.0", "10: return x * 3 if x is None else None → return None",
+    "10: x * 3 if x is None else None → (None if x is None else x * 3)", "10: x * 3 → (x / 3)", "10: 3 → 4",
     "10: x is None → (x is not None)",
 ]
 
@@ -41,8 +31,8 @@ def test_every_kind_of_change_is_found_in_its_place() -> None:
     assert sorted(map(str, mutants(SOURCE))) == sorted(FOUND)
 
 
-@pytest.mark.parametrize("mutant", mutants(SOURCE), ids=str)
-def test_a_mutant_is_another_program(mutant) -> None:
-    changed = mutant.applied(SOURCE)
-    assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(SOURCE))
-    assert changed.count(b"\n") == SOURCE.count(b"\n")
+def test_a_mutant_is_another_program() -> None:
+    for mutant in mutants(SOURCE):
+        changed = mutant.applied(SOURCE)
+        assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(SOURCE)), mutant
+        assert changed.count(b"\n") == SOURCE.count(b"\n"), mutant

@@ -85,30 +85,22 @@ def test_the_mean_over_all_subsets_of_times_is_the_loss_of_all_times(field, bund
     whole.backward()
     assert float(mean.detach()) == pytest.approx(float(whole.detach()), rel=FLOAT64)
     for gradient, parameter in zip(found, field.parameters(), strict=True):
-        assert torch.allclose(
-            gradient, parameter.grad, rtol=1e-8, atol=1e-8 * float(parameter.grad.abs().max())
-        )
+        slack = 1e-8 * float(parameter.grad.abs().max())
+        assert torch.allclose(gradient, parameter.grad, rtol=1e-8, atol=slack)
 
 
 def test_a_plain_subset_would_be_biased(field, bundle) -> None:
     integrals = line_integrals(field, *bundle[:2], torch.ones(3, dtype=torch.float64), SAMPLES, bundle[2])
     integrals = integrals.reshape(RAYS, TIMES).detach()
     measured = torch.zeros(RAYS, dtype=torch.float64)
-    plain = torch.stack(
-        [(integrals[:, list(t)].mean(1) - measured) ** 2 for t in combinations(range(TIMES), 2)]
-    )
+    pairs = combinations(range(TIMES), 2)
+    plain = torch.stack([(integrals[:, list(times)].mean(1) - measured) ** 2 for times in pairs])
     excess = plain.mean(0) - log_squares(integrals, measured, TIMES)
     assert torch.allclose(excess, (1 / 2 - 1 / TIMES) * integrals.var(1))
     assert float(excess.max()) > 1e-6
 
 
-def test_intensity_averages_light(bundle) -> None:
-    integrals = torch.tensor([[0.1, 0.9, 2.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
-    expected = [-np.log(np.mean(np.exp(-4 * np.array(row)))) / 4 for row in integrals.tolist()]
-    assert np.allclose(intensity_average(integrals, 4.0).tolist(), expected, rtol=1e-12)
-
-
-def test_how_many_times_a_step_looks_at() -> None:
+def test_how_many_times_a_step_looks_at_and_how_light_is_averaged(bundle) -> None:
     options = NeuralOptions()
     assert [options.times_for(5, model) for model in ("log", "intensity")] == [5, 5]
     assert replace(options, times=2).times_for(5, "log") == 2
@@ -118,3 +110,6 @@ def test_how_many_times_a_step_looks_at() -> None:
         replace(options, times=3).times_for(5, "intensity")
     with pytest.raises(InputError, match="option times: found 1 of 5 times.*biased"):
         replace(options, times=1).times_for(5, "log")
+    integrals = torch.tensor([[0.1, 0.9, 2.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
+    expected = [-np.log(np.mean(np.exp(-4 * np.array(row)))) / 4 for row in integrals.tolist()]
+    assert np.allclose(intensity_average(integrals, 4.0).tolist(), expected, rtol=1e-12)

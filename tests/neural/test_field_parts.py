@@ -57,20 +57,16 @@ def test_the_encoding_is_its_definition_and_so_is_its_gradient() -> None:
     by_gradient = float((encoding.table.grad * direction).sum())
     with torch.no_grad():
         encoding.table.copy_(direction)
-        assert float((encoding(torch.tensor(positions)) * weights).sum()) == pytest.approx(
-            by_gradient, rel=1e-9
-        )
+        by_definition = float((encoding(torch.tensor(positions)) * weights).sum())
+    assert by_definition == pytest.approx(by_gradient, rel=1e-9)
 
 
-def test_devices_without_the_fused_sum_add_up_the_same() -> None:
+def test_sums_without_the_fused_one_and_weights_of_corners() -> None:
     made = torch.Generator().manual_seed(0)
     table, weight = torch.rand(50, 3, generator=made), torch.rand(20, 8, generator=made)
     index = torch.randint(0, 50, (20, 8), generator=made)
     fused = torch.nn.functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
     assert torch.allclose(weighted_rows(table, index, weight), fused, rtol=FLOAT32)
-
-
-def test_corner_weights_sum_to_one_and_entries_are_in_the_table() -> None:
     positions = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
     for cells, size in ((5, 216), (64, 1000)):
         entry, weight = corners(positions, cells, size)
@@ -160,9 +156,8 @@ def test_the_field_starts_at_its_share_of_the_bound() -> None:
         options = NeuralOptions(first_share=share, density_bound=4.0)
         values = first_field(options, 16, 1)(positions).detach()
         assert float(values.mean()) == pytest.approx(4 * share, rel=0.5) and float(values.max()) < 4
-    assert (
-        float(first_field(NeuralOptions(last_activation="leaky-relu"), 16, 1)(positions).detach().min()) > -1
-    )
+    leaky = first_field(NeuralOptions(last_activation="leaky-relu"), 16, 1)
+    assert float(leaky(positions).detach().min()) > -1
 
 
 def test_the_same_seed_draws_the_same_field_and_leaves_others_draws_alone() -> None:
@@ -176,7 +171,7 @@ def test_the_same_seed_draws_the_same_field_and_leaves_others_draws_alone() -> N
     assert not all(torch.equal(a, c) for a, _, c in pairs)
 
 
-def test_scattered_pixels_are_usable_and_each_drawn_once() -> None:
+def test_pixels_and_times_are_drawn_evenly_and_each_once() -> None:
     rng = np.random.default_rng(0)
     usable = rng.random((9, 7)) < 0.5
     pixels = scattered_pixels(usable, 20, rng)
@@ -184,6 +179,10 @@ def test_scattered_pixels_are_usable_and_each_drawn_once() -> None:
     assert usable[tuple(pixels.T)].all()
     assert len(scattered_pixels(usable, 1000, rng)) == usable.sum()
     assert scattered_pixels(np.zeros((3, 3), bool), 4, rng).shape == (0, 2)
+    times = chosen_times(20_000, 5, 2, np.random.default_rng(0))
+    assert np.all(times[:, 0] != times[:, 1])
+    assert np.allclose(np.bincount(times.ravel(), minlength=5) / times.size, 0.2, atol=0.01)
+    assert np.array_equal(chosen_times(2, 3, 3, np.random.default_rng(0)), [[0, 1, 2]] * 2)
 
 
 def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
@@ -210,23 +209,13 @@ def test_windows_favour_no_pixel() -> None:
     assert np.abs(counts / 4000 - likely).max() < 5 * np.sqrt(likely * (1 - likely) / 4000)
 
 
-def test_times_are_drawn_evenly_and_without_repeats() -> None:
-    times = chosen_times(20_000, 5, 2, np.random.default_rng(0))
-    assert np.all(times[:, 0] != times[:, 1])
-    assert np.allclose(np.bincount(times.ravel(), minlength=5) / times.size, 0.2, atol=0.01)
-    assert np.array_equal(chosen_times(2, 3, 3, np.random.default_rng(0)), [[0, 1, 2]] * 2)
-
-
-def test_a_device_that_pytorch_lacks_is_refused() -> None:
+def test_devices_and_options_that_do_not_go_together() -> None:
     assert torch_device("cpu") == CPU
     missing = [name for name in ("cuda", "mps") if not getattr(torch, name).is_available()]
     for name in missing:
         with pytest.raises(DeviceError, match=f"torch_device: found no {name} in PyTorch"):
             torch_device(name)
     assert torch_device("auto").type in {"cuda", "mps", "cpu"}
-
-
-def test_options_that_do_not_go_together_are_refused() -> None:
     with pytest.raises(InputError, match="levels: found a finest level"):
         NeuralOptions(levels=32)
     assert NeuralOptions().samples_for(64) == 96

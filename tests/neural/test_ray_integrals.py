@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from tolerances import FLOAT32, RAY_SAMPLES, RAY_SAMPLES_SHARP
 
 from phyradgs_cl.acquisition import MicroViews, PerRow
-from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions
@@ -48,11 +49,8 @@ def thinned(rays) -> tuple[np.ndarray, np.ndarray]:
 
 def many_draws(field, rays, jitter: str) -> np.ndarray:
     """Integrals (4096, R) with shifts drawn anew each time."""
-    together = 64
-    copies = tuple(np.tile(part, (together, 1)) for part in rays)
-    return np.concatenate(
-        [integrals(field, copies, jitter, seed).reshape(together, -1) for seed in range(4096 // together)]
-    )
+    copies = tuple(np.tile(part, (64, 1)) for part in rays)
+    return np.concatenate([integrals(field, copies, jitter, seed).reshape(64, -1) for seed in range(64)])
 
 
 def quadratic(rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,50 +61,49 @@ def quadratic(rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def distance(x: torch.Tensor) -> torch.Tensor:
     """The square of a position's distance from the centre, in axes."""
-    return (((x - torch.tensor(CENTRE.astype(np.float32))) / torch.tensor(AXES.astype(np.float32))) ** 2).sum(
-        1
-    )
+    centre, axes = (torch.tensor(three.astype(np.float32)) for three in (CENTRE, AXES))
+    return (((x - centre) / axes) ** 2).sum(1)
 
 
-@pytest.mark.parametrize("jitter", ["ray", "none"])
-def test_a_gaussian(rays, jitter) -> None:
-    shrink = 9.0  # σ is a third of the axes
+def through_gaussian(rays, shrink: float = 9.0) -> np.ndarray:
+    """Integrals (R,) of a Gaussian whose σ is a third of the axes."""
     a, b, c = quadratic(rays)
-    expected = np.sqrt(2 * np.pi / (shrink * a)) * np.exp(-shrink * (c - b * b / a) / 2)
-    found = integrals(lambda x: torch.exp(-shrink * distance(x) / 2), rays, jitter)
-    assert expected.max() > 0.2
-    assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
+    return np.sqrt(2 * np.pi / (shrink * a)) * np.exp(-shrink * (c - b * b / a) / 2)
+
+
+def gaussian(x: torch.Tensor) -> torch.Tensor:
+    return torch.exp(-9 * distance(x) / 2)
+
+
+def through_fading(rays) -> np.ndarray:
+    """Of the density 1 − q inside q < 1: the chord's ends are kinks, not steps."""
+    a, b, c = quadratic(rays)
+    return 4 / 3 * a * (np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)) ** 3
+
+
+def fading(x: torch.Tensor) -> torch.Tensor:
+    return (1 - distance(x)).clamp(min=0)
+
+
+def test_smooth_fields_and_their_means_over_an_exposure(rays) -> None:
+    """With fewer samples per ray where a pixel has five rays."""
+    for field, expected, jitter in [
+        (gaussian, through_gaussian(rays), "ray"), (gaussian, through_gaussian(rays), "none"),
+        (fading, through_fading(rays), "ray"),
+    ]:  # fmt: skip
+        assert expected.max() > 0.2
+        assert np.abs(integrals(field, rays, jitter) - expected).max() <= RAY_SAMPLES * expected.max()
+        mean, found = (
+            expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1),
+        )
+        assert np.abs(found - mean).max() <= RAY_SAMPLES * mean.max()
 
 
 def test_a_gaussian_with_one_shift_per_sample_is_noisier_and_right_on_average(rays) -> None:
     few = thinned(rays)
-    a, b, c = quadratic(few)
-    expected = np.sqrt(2 * np.pi / (9 * a)) * np.exp(-9 * (c - b * b / a) / 2)
-    draws = many_draws(lambda x: torch.exp(-9 * distance(x) / 2), few, "sample")
+    expected, draws = through_gaussian(few), many_draws(gaussian, few, "sample")
     assert np.abs(draws[0] - expected).max() > RAY_SAMPLES * expected.max()
     assert np.linalg.norm(draws.mean(0) - expected) <= RAY_SAMPLES * np.linalg.norm(expected)
-
-
-def test_an_ellipsoid_that_fades_towards_its_edge(rays) -> None:
-    """Density 1 − q inside q < 1: the chord's ends are kinks, not steps."""
-    a, b, c = quadratic(rays)
-    half = np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)
-    expected = 4 / 3 * a * half**3
-    found = integrals(lambda x: (1 - distance(x)).clamp(min=0), rays, "ray")
-    assert expected.max() > 0.3
-    assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
-
-
-def test_the_mean_over_an_exposure(rays) -> None:
-    """Fewer samples per ray, and five rays of a pixel: a Gaussian, and an ellipsoid that fades."""
-    a, b, c = quadratic(rays)
-    gaussian = np.sqrt(2 * np.pi / (9 * a)) * np.exp(-9 * (c - b * b / a) / 2)
-    fading = 4 / 3 * a * (np.sqrt(np.maximum(b * b / a - c + 1, 0) / a)) ** 3
-    fields = (lambda x: torch.exp(-9 * distance(x) / 2), lambda x: (1 - distance(x)).clamp(min=0))
-    for field, each in zip(fields, (gaussian, fading), strict=True):
-        found = integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1)
-        expected = each.reshape(-1, 5).mean(1)
-        assert np.abs(found - expected).max() <= RAY_SAMPLES * expected.max()
 
 
 @pytest.mark.parametrize("jitter", ["ray", "sample"])
@@ -126,10 +123,7 @@ def test_rays_are_those_of_the_cells(scan) -> None:
     table = MicroViews(3, 2).cells(scan, 1)
     grid = Grid(scan.grid.shape, scan.grid.voxel_size_mm, (0.1, -0.2, 0.3))
     for axis in ("rows", "columns"):
-        turned = TimeCells(
-            table.pose, table.time_s, table.line_start, table.line_stop, table.weight, table.lines, axis
-        )
-        exposure = ExposureRays.of_cells(turned, grid)
+        exposure = ExposureRays.of_cells(replace(table, axis=axis), grid)
         pixels = np.array([[0, 5], [7, 23], [23, 0], [12, 12]])
         times = np.tile([[0, 1]], (4, 1))
         source, direction = exposure(pixels, times)

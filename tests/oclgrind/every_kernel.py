@@ -26,7 +26,14 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Protocol, Scan, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import DeviceCells, SplatProjector, voxelise
+from phyradgs_cl.operators import (
+    DensityOperator,
+    DeviceCells,
+    SplatOperator,
+    SplatProjector,
+    VoxelOperator,
+    voxelise,
+)
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
@@ -37,10 +44,9 @@ GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
-VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing")
+VECTORS_OR_FREEZES = ("asd-pocs", "fista-tv", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
-    "lanes 1": {"lanes": 1},
-    "a GPU's": {"lanes": 1, "pixel_items": True},
+    "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
 }
 
@@ -54,10 +60,8 @@ def cloud(count: int) -> np.ndarray:
     rng = np.random.default_rng(count)
     quaternion = rng.normal(size=(4, count))
     parts = [
-        rng.uniform(-0.6, 0.6, (3, count)),
-        rng.uniform(0.05, 0.3, (3, count)),
-        quaternion / np.linalg.norm(quaternion, axis=0),
-        rng.uniform(0.5, 1.0, (1, count)),
+        rng.uniform(-0.6, 0.6, (3, count)), rng.uniform(0.05, 0.3, (3, count)),
+        quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.5, 1.0, (1, count)),
     ]
     rows = np.concatenate(parts)
     rows[:3, :1] = [[40.0], [0.0], [0.0]]  # one behind the source
@@ -65,13 +69,11 @@ def cloud(count: int) -> np.ndarray:
 
 
 OPTIONS = {
-    "exact": {},
-    "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
+    "exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
     "intensity, pixels": {"intensity_unit": 2.0, "pixel_footprint": True},
 }
 MODELS: dict[str, Callable[..., TimeCells]] = {
-    "still": static_cells,
-    "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
+    "still": static_cells, "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
     "moving": lambda *where: exact_cells(*where, 2),
 }
 
@@ -81,6 +83,19 @@ def splats(rt: Runtime, model: str, options: str) -> None:
     table = MODELS[model](orbit, shutter, 0, 0.0, SHAPE[1])
     projector = SplatProjector(rt, SHAPE[1], SHAPE[0], **OPTIONS[options])  # type: ignore[arg-type]
     projector.project_adjoint(cloud(3), DeviceCells.upload(rt, table), np.ones(SHAPE[::-1], np.float32))
+
+
+def operators(rt: Runtime) -> None:
+    """Splats from and to plain arrays, as the Python API has them."""
+    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
+    frames = SplatOperator(rt, SHAPE, [micro_view_cells(orbit, shutter, f, 0.0, SHAPE[1], 2, 2) for f in (0, 1)], 0.7)
+    point = frames.rows.enter(rt.upload(cloud(3), np.float32))
+    frames.back(point, frames.forward(point))
+    densities = DensityOperator(frames, point)
+    densities.adjoint(densities.forward(rt.upload(np.ones(3, np.float32))))
+    voxels = VoxelOperator(rt, GRID)
+    point = voxels.rows.enter(rt.upload(cloud(3), np.float32))
+    voxels.back(point, voxels.forward(point))
 
 
 def nothing(rt: Runtime) -> None:
@@ -93,8 +108,10 @@ def nothing(rt: Runtime) -> None:
 
 def tiny_scan(rt: Runtime, model: str) -> Scan:
     volume = np.random.default_rng(0).uniform(0, 1, GRID.shape).astype(np.float32)
-    source = VolumeSource(rt, volume, GRID, GEOMETRY, "rows")
-    options = SimulationOptions(Protocol(views=3, exposure_deg=20.0), detector_model=model, time_samples=2)
+    axis = "rows" if model == "log" else "columns"
+    source = VolumeSource(rt, volume, GRID, GEOMETRY, axis)
+    protocol = Protocol(views=3, exposure_deg=20.0)
+    options = SimulationOptions(protocol, axis, detector_model=model, time_samples=2)
     return simulate(source, GEOMETRY, GRID, options)
 
 
@@ -107,12 +124,12 @@ def method(rt: Runtime, name: str, motion: str) -> None:
         changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0, "shape_weight": 0.1}
         changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
     elif name != "fdk":
-        changes["iterations"] = 1
+        changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
     reconstruct(scan, name, rt, method_options(name, None, changes))
 
 
 def cases() -> dict[str, Callable[[Runtime], None]]:
-    found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing}
+    found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing, "operators": operators}
     for model in MODELS:
         for options in OPTIONS:
             found[f"splats {model} {options}"] = partial(splats, model=model, options=options)
@@ -148,11 +165,8 @@ def checked(build: str, case: str, log: Path) -> tuple[set[str], str]:
     unwritten = build not in FREEZES and not case.startswith(VECTORS_OR_FREEZES)
     checks = {"OCLGRIND_DATA_RACES": "1", **({"OCLGRIND_UNINITIALIZED": "1"} if unwritten else {})}
     done = subprocess.run(
-        [sys.executable, __file__, build, case],
-        env={**os.environ, **checks, "OCLGRIND_LOG": str(log)},
-        capture_output=True,
-        text=True,
-        timeout=600,
+        [sys.executable, __file__, build, case], env={**os.environ, **checks, "OCLGRIND_LOG": str(log)},
+        capture_output=True, text=True, timeout=600,
     )
     reports = log.read_text(encoding="utf-8") if log.exists() else ""
     if done.returncode:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from itertools import product
 
 import numpy as np
 import pytest
+from kernel_kit import assert_near
 from memory_limits import refuse_large, room_for
 from ray_tables import noise, tables
 from tolerances import BRICKS
@@ -31,28 +33,26 @@ Z_ONLY, Z_AND_Y = 320_000, 130_000  # bytes of room for TALL: cuts along z, and 
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (5, 7, 3), (33, 65, 9), (8, 32, 4)])
-@pytest.mark.parametrize("steps", [(1, 1), (4, 4), (8, 32)])
-@pytest.mark.parametrize("floats", [10**9, 2000, 320])
-def test_bricks_are_the_volume_once(shape, steps, floats) -> None:
+def test_bricks_are_the_volume_once(shape) -> None:
     def needs(brick: tuple[int, int, int]) -> tuple[int, int]:
         return 3 * int(np.prod(brick)), int(np.prod(brick))
 
-    if min(steps[0], shape[0]) * min(steps[1], shape[1]) * shape[2] * 4 > 4 * floats:
-        with pytest.raises(OutOfMemoryError, match="smallest part"):
-            cut(shape, steps, needs, Room(4 * floats, 4 * floats))
-        return
-    bricks = cut(shape, steps, needs, Room(4 * floats, 4 * floats))
-    count = np.zeros(shape, int)
-    for brick in bricks:
-        assert sum(needs(brick.shape)) <= 4 * floats
-        assert brick.start[0] % steps[0] == 0 and brick.start[1] % steps[1] == 0
-        count[brick.box] += 1
-    assert (count == 1).all()
-    assert (len(bricks) == 1) == (4 * np.prod(shape) <= 4 * floats)
-
-
-def test_the_largest_buffer_counts_too() -> None:
-    assert len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2
+    for steps, floats in product([(1, 1), (4, 4), (8, 32)], [10**9, 2000, 320]):
+        if min(steps[0], shape[0]) * min(steps[1], shape[1]) * shape[2] * 4 > 4 * floats:
+            with pytest.raises(OutOfMemoryError, match="smallest part"):
+                cut(shape, steps, needs, Room(4 * floats, 4 * floats))
+            continue
+        bricks = cut(shape, steps, needs, Room(4 * floats, 4 * floats))
+        count = np.zeros(shape, int)
+        for brick in bricks:
+            assert sum(needs(brick.shape)) <= 4 * floats
+            assert brick.start[0] % steps[0] == 0 and brick.start[1] % steps[1] == 0
+            count[brick.box] += 1
+        assert (count == 1).all(), (steps, floats)
+        assert (len(bricks) == 1) == (4 * np.prod(shape) <= 4 * floats), (steps, floats)
+    assert (
+        len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2
+    )  # the largest buffer counts too
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
@@ -77,10 +77,8 @@ def test_rays(any_rt, motion, axis, nbytes) -> None:
     if motion == "per line":  # layers bring tables of their own
         with room_for(any_rt, nbytes + 120_000):
             for name in ("intensity", "gap"):
-                error = np.abs(
-                    RayOperator(any_rt, TALL, SHAPE, cells).project(x, name) - expected[name]
-                ).max()
-                assert error <= 2 * BRICKS * expected["log"].max()
+                found = RayOperator(any_rt, TALL, SHAPE, cells).project(x, name)
+                assert np.abs(found - expected[name]).max() <= 2 * BRICKS * expected["log"].max()
         assert expected["gap"].max() > 1e-4
 
 
@@ -98,14 +96,11 @@ def test_a_projector_of_frames(any_rt, monkeypatch) -> None:
         assert isinstance(held, np.ndarray)
         for model, image in zip(("log", "intensity"), expected, strict=True):
             assert np.abs(small.forward(held, table, model) - image).max() <= 2 * BRICKS * image.max()
-        np.testing.assert_allclose(
-            small.backproject(expected[0], table), back, rtol=0, atol=BRICKS * back.max()
-        )
+        assert_near(small.backproject(expected[0], table), back, BRICKS)
 
 
 @pytest.mark.parametrize(
-    ("pixels", "tilt"),
-    [((13, 18), 0.0), ((13, 18), 0.05), ((700, 7), 0.0)],
+    ("pixels", "tilt"), [((13, 18), 0.0), ((13, 18), 0.05), ((700, 7), 0.0)],
     ids=["upright", "tilted", "blocks along z"],
 )
 def test_backprojection_of_frames(any_rt, make_geometry, pixels, tilt) -> None:
@@ -184,7 +179,7 @@ def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
             refuse_large(patch, rt, 50_000, times=1)
             found = call()
         assert warned(caplog) == 1
-        np.testing.assert_allclose(found, expected, rtol=0, atol=BRICKS * np.abs(expected).max())
+        assert_near(found, expected, BRICKS)
     for call in calls.values():
         with room_for(rt, 2_000_000), monkeypatch.context() as patch:
             refuse_large(patch, rt, 500, times=9)

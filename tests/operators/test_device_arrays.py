@@ -58,6 +58,8 @@ def test_the_intensity_model(any_rt, axis) -> None:
             expected = getattr(on_host, name)(values)
             found = on_device(any_rt, getattr(there, name), values)
             np.testing.assert_allclose(found, expected, rtol=0, atol=RAYS * np.abs(expected).max(), err_msg=name)
+    swapped = there.forward(d), any_rt.download(on_host.forward(any_rt.upload(d)))  # each has stood at the other's kind
+    np.testing.assert_allclose(*swapped, rtol=0, atol=RAYS * swapped[0].max())
 
 
 @AXES

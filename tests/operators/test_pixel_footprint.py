@@ -7,17 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kernel_kit import CLASSES, MODELS, assert_near, frame_cells, random_weights
 from remembered import remembered
-from tolerances import (
-    FINITE_DIFFERENCE_STEP,
-    FOOTPRINT_AREA,
-    FOOTPRINT_MASS,
-    GRADIENT,
-    SPLAT_MOVING,
-)
+from tolerances import FOOTPRINT_AREA, FOOTPRINT_MASS, GRADIENT, SPLAT_MOVING
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, static_cells
+from phyradgs_cl.acquisition.cells import TimeCells, static_cells
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.operators.twins.splat_moving import moving_frame
@@ -26,7 +21,6 @@ from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
 PIXEL_VARIANCE = 1 / 12
-AFFINE = pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
 MOTIONS = pytest.mark.parametrize("motion", ["static", "exact"])
 SMALL = (0.01, 0.3)  # from a thirtieth of a pixel
 
@@ -40,14 +34,7 @@ def at_rest(table: TimeCells) -> TimeCells:
 
 @pytest.fixture
 def make_table(make_geometry) -> Callable[[str], TimeCells]:
-    orbit = CircularOrbit(make_geometry(*SHAPE, offset=(0.15, -0.25)), ConstantSpeed(0.3, 0.5))
-    shutter = Shutter(0.8, 0.6, "rows", 1)
-
-    def make(motion: str) -> TimeCells:
-        where = (orbit, shutter, 0, 0.2, SHAPE[0])
-        return static_cells(*where) if motion == "static" else exact_cells(*where, 3)
-
-    return make
+    return lambda motion: frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)))
 
 
 @remembered
@@ -60,7 +47,7 @@ def projector(rt: Runtime, shape: tuple[int, int] = SHAPE, **options: object) ->
     return SplatProjector(rt, *shape, cutoff_sigma=0.0, time_error=1e-6, **options)
 
 
-@AFFINE
+@MODELS
 @MOTIONS
 def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, affine) -> None:
     rows, table = make_cloud(5, 51, scale=SMALL), make_table(motion)
@@ -69,25 +56,21 @@ def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, affine)
         for on in (False, True)
     )
     expected = twin(rows, table, affine)
-    np.testing.assert_allclose(wide, expected, rtol=0, atol=SPLAT_MOVING * expected.max())
+    assert_near(wide, expected, SPLAT_MOVING)
     assert np.abs(sharp - wide).max() > 0.1 * expected.max()
 
 
-@AFFINE
+@MODELS
 @MOTIONS
 def test_gradients(any_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
-    rows, table = make_cloud(3, 52, scale=(0.02, 0.3)), make_table(motion)
-    h = np.random.default_rng(5).normal(size=SHAPE).astype(np.float32).astype(np.float64)
-    found = projector(any_rt, affine=affine, pixel_footprint=True).project_adjoint(
-        rows, DeviceCells.upload(any_rt, table), h.astype(np.float32)
-    )
+    rows, table, h = make_cloud(3, 52, scale=(0.02, 0.3)), make_table(motion), random_weights(SHAPE)
+    wide, cells = projector(any_rt, affine=affine, pixel_footprint=True), DeviceCells.upload(any_rt, table)
+    found = wide.project_adjoint(rows, cells, h.astype(np.float32))
     for g, row in enumerate(rows.T):
-        expected = finite_differences(
-            lambda r: float((h * twin(r[:, None], table, affine)).sum()), row, FINITE_DIFFERENCE_STEP
-        )
-        for part in (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11)):
-            wrong = np.linalg.norm(found[part, g] - expected[part])
-            assert wrong <= GRADIENT * max(np.linalg.norm(expected[part]), 1e-3 * np.linalg.norm(expected))
+        expected = finite_differences(lambda r: float((h * twin(r[:, None], table, affine)).sum()), row)
+        for name, part in CLASSES.items():
+            wrong, size = np.linalg.norm(found[part, g] - expected[part]), np.linalg.norm(expected[part])
+            assert wrong <= GRADIENT * max(size, 1e-3 * np.linalg.norm(expected)), name
 
 
 def round_splat(scale: float, x: float) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from kernel_kit import note_launches
 from memory_limits import room_for
 from ray_tables import noise, tables
 from remembered import remembered
@@ -37,29 +39,23 @@ def general(rt: Runtime, grid: Grid, shape: tuple[int, int], cells: list[TimeCel
     return RayOperator(rt, grid, shape, cells, memory=RayMemory(rt, layout, len(cells)))
 
 
-def launched(
-    rt: Runtime, monkeypatch: pytest.MonkeyPatch, operator: RayOperator, volume: np.ndarray
-) -> set[str]:
-    names, launch = set(), Runtime.launch
-
-    def noted(self: Runtime, kernel: object, *args: object, **options: object) -> None:
-        names.add(kernel.function_name)  # type: ignore[attr-defined]
-        launch(self, kernel, *args, **options)  # type: ignore[arg-type]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Runtime, "launch", noted)
-        operator.forward(volume)
-    return names
+def assert_same_bits(
+    rt: Runtime, grid: Grid, cells: list[TimeCells], x: np.ndarray, shape=TALL_PANEL
+) -> np.ndarray:
+    frames = RayOperator(rt, grid, shape, cells).forward(x)
+    np.testing.assert_array_equal(frames, general(rt, grid, shape, cells).forward(x))
+    return frames
 
 
 @pytest.mark.parametrize("motion", ["static", "micro-views"])
 @pytest.mark.parametrize("shape", [TALL_PANEL, (131, 18), (96, 1)])
 def test_the_same_bits_as_the_general_kernel(cpu_rt, monkeypatch, motion, shape) -> None:
     cells, x = tables(motion, shape, frames=2), noise(GRID.shape, 101)
-    operator = RayOperator(cpu_rt, GRID, shape, cells)
-    assert launched(cpu_rt, monkeypatch, operator, x) == {"turn_upright", "rays_upright"}
-    frames = operator.forward(x)
-    np.testing.assert_array_equal(frames, general(cpu_rt, GRID, shape, cells).forward(x))
+    with monkeypatch.context() as patch:
+        launched = note_launches(patch)
+        RayOperator(cpu_rt, GRID, shape, cells).forward(x)
+    assert set(launched) == {"turn_upright", "rays_upright"}
+    frames = assert_same_bits(cpu_rt, GRID, cells, x, shape)
     expected = np.stack([ray_frame(x, GRID, table, shape) for table in cells])
     assert np.abs(frames - expected).max() <= RAYS * expected.max() and expected.max() > 0
 
@@ -67,29 +63,22 @@ def test_the_same_bits_as_the_general_kernel(cpu_rt, monkeypatch, motion, shape)
 @pytest.mark.parametrize("voxels", [(1, 1, 1), (1, 33, 2), (40, 1, 17), (530, 3, 3)])
 def test_odd_volumes(cpu_rt, voxels) -> None:
     """Also one higher than what a work-item blends of it."""
-    grid = Grid(voxels, (1.9 / voxels[0], 0.2, 0.3))
-    cells, x = tables("static", TALL_PANEL, frames=3), noise(voxels, 102)
-    frames = RayOperator(cpu_rt, grid, TALL_PANEL, cells).forward(x)
-    np.testing.assert_array_equal(frames, general(cpu_rt, grid, TALL_PANEL, cells).forward(x))
-    assert frames.any()
+    grid, cells = Grid(voxels, (1.9 / voxels[0], 0.2, 0.3)), tables("static", TALL_PANEL, frames=3)
+    assert assert_same_bits(cpu_rt, grid, cells, noise(voxels, 102)).any()
 
 
 @pytest.mark.parametrize("source_mm", [0.4, 1.3])
 def test_source_inside_or_close_to_the_volume(cpu_rt, source_mm) -> None:
     grid, cells = Grid((9, 30, 30), (0.05, 2 / 30, 2 / 30)), tables("static", TALL_PANEL, source_mm=source_mm)
-    x = noise(grid.shape, 103)
-    frames = RayOperator(cpu_rt, grid, TALL_PANEL, cells).forward(x)
-    np.testing.assert_array_equal(frames, general(cpu_rt, grid, TALL_PANEL, cells).forward(x))
+    assert_same_bits(cpu_rt, grid, cells, noise(grid.shape, 103))
 
 
 def test_lines_without_cells_are_zero(cpu_rt) -> None:
     whole = tables("micro-views", TALL_PANEL, frames=1)[0]
     keep = whole.line_start != 17
     parts = {n: getattr(whole, n)[keep] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    cells, x = [replace(whole, **parts)], noise(GRID.shape, 104)
-    frames = RayOperator(cpu_rt, GRID, TALL_PANEL, cells).forward(x)
+    frames = assert_same_bits(cpu_rt, GRID, [replace(whole, **parts)], noise(GRID.shape, 104))
     assert not frames[0, 17:34].any() and frames[0, :17].any() and frames[0, 34:].any()
-    np.testing.assert_array_equal(frames, general(cpu_rt, GRID, TALL_PANEL, cells).forward(x))
 
 
 def test_a_subset_and_batches_of_frames(rt) -> None:
@@ -110,8 +99,9 @@ def test_without_room_for_the_turned_volume(rt, monkeypatch) -> None:
     operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(GRID, TALL_PANEL, "rows")
     with room_for(rt, int(4 * (layout.volume_floats + layout.frames_floats(3) + 64) / PLANNED)):
         assert len(operator.memory.plan()) == 1
-        assert launched(rt, monkeypatch, operator, x) == {"rays_forward"}
+        launched = note_launches(monkeypatch)
         np.testing.assert_array_equal(operator.forward(x), expected)
+        assert set(launched) == {"rays_forward"}
 
 
 def test_intensities_take_the_general_kernel(rt) -> None:
@@ -122,36 +112,32 @@ def test_intensities_take_the_general_kernel(rt) -> None:
     assert gap.max() > 1e-3
 
 
-def tilted(shape: tuple[int, int]) -> list[TimeCells]:
-    cells = tables("static", shape)
+def changed(change: Callable[[np.ndarray], None]) -> list[TimeCells]:
+    cells = tables("static", TALL_PANEL)
     for table in cells:
-        table.pose[:, 9:12] += 1e-4 * table.pose[:, 6:9]
+        change(table.pose)
     return cells
 
 
-def steep(shape: tuple[int, int]) -> list[TimeCells]:
-    cells = tables("static", shape)
-    for table in cells:
-        table.pose[:, 5] += 30.0
-    return cells
+def tilt(pose: np.ndarray) -> None:
+    pose[:, 9:12] += 1e-4 * pose[:, 6:9]
 
 
-@pytest.mark.parametrize(
-    ("cells", "applies"),
-    [
-        (tables("static", TALL_PANEL), True),
-        (tables("micro-views", TALL_PANEL), True),
-        (tables("per line", TALL_PANEL), False),
-        (tables("static", (15, 85)), False),
-        (tables("static", (7, 85), "columns"), False),
-        (tilted(TALL_PANEL), False),
-        (steep(TALL_PANEL), False),
-    ],
-    ids=["static", "strips", "a pose per line", "few lines", "columns", "tilted", "steep"],
-)
-def test_where_it_applies(cells, applies) -> None:
-    width = 85 if cells[0].lines == 15 else 7
-    assert (upright_block(GRID, cells, width, 16) > 0) == applies
+def steepen(pose: np.ndarray) -> None:
+    pose[:, 5] += 30.0
+
+
+def test_where_it_applies() -> None:
+    cases = {
+        "static": (tables("static", TALL_PANEL), True), "strips": (tables("micro-views", TALL_PANEL), True),
+        "a pose per line": (tables("per line", TALL_PANEL), False),
+        "few lines": (tables("static", (15, 85)), False),
+        "columns": (tables("static", (7, 85), "columns"), False),
+        "tilted": (changed(tilt), False), "steep": (changed(steepen), False),
+    }  # fmt: skip
+    for name, (cells, applies) in cases.items():
+        width = 85 if cells[0].lines == 15 else 7
+        assert (upright_block(GRID, cells, width, 16) > 0) == applies, name
 
 
 def test_lines_far_apart_in_voxels() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from kernel_kit import assert_near, note_launches, splat
 from tolerances import (
     BRUTE_FORCE,
     FLOAT64,
@@ -15,10 +16,9 @@ from tolerances import (
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
-from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
+from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_frame, splat_image
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
 START_S = 0.4
@@ -31,10 +31,8 @@ def orbit(make_geometry) -> CircularOrbit:
     return CircularOrbit(make_geometry(*SHAPE, offset=(0.1, 0.2)), ConstantSpeed(0.3, 0.6))
 
 
-def render(rt: Runtime, rows: np.ndarray, table: TimeCells, **options: object) -> np.ndarray:
-    lines, width = SHAPE if table.axis == "rows" else SHAPE[::-1]
-    frame = SplatProjector(rt, lines, width, **options).project(rows, DeviceCells.upload(rt, table))
-    return frame if table.axis == "rows" else frame.T
+def render(rt: Runtime, rows: np.ndarray, table: TimeCells, cutoff_sigma: float = 0.0) -> np.ndarray:
+    return splat(rt, rows, table, SHAPE, cutoff_sigma=cutoff_sigma)
 
 
 def unfused(
@@ -46,12 +44,8 @@ def unfused(
     for j in range(strips):
         mean = np.zeros(SHAPE)
         for k in range(sub_intervals):
-            t = (
-                START_S
-                + (j + 0.5) / strips * shutter.readout_s
-                + (k + 0.5) / sub_intervals * shutter.exposure_s
-            )
-            mean += splat_image(rows, orbit.pose(0, np.array(t)), SHAPE) / sub_intervals
+            delay_s = (j + 0.5) / strips * shutter.readout_s + (k + 0.5) / sub_intervals * shutter.exposure_s
+            mean += splat_image(rows, orbit.pose(0, np.array(START_S + delay_s)), SHAPE) / sub_intervals
         for order in range(lines):
             if order * strips // lines == j:
                 line = order if shutter.direction > 0 else lines - 1 - order
@@ -62,44 +56,36 @@ def unfused(
 
 @AXES
 @DIRECTIONS
-@pytest.mark.parametrize(("strips", "sub_intervals"), [(1, 1), (4, 3), (13, 1), (5, 2), (25, 2), (1, 4)])
-def test_fused_equals_unfused(rt, make_cloud, orbit, axis, direction, strips, sub_intervals) -> None:
+def test_fused_equals_unfused(rt, make_cloud, orbit, axis, direction) -> None:
     rows, shutter = make_cloud(4, 31), Shutter(0.5, 0.4, axis, direction)
-    table = micro_view_cells(orbit, shutter, 0, START_S, shutter.lines(SHAPE), strips, sub_intervals)
-    expected = unfused(rows, orbit, shutter, strips, sub_intervals)
-    np.testing.assert_allclose(
-        render(rt, rows, table, cutoff_sigma=0.0), expected, rtol=0, atol=MERGED_FRAME * expected.max()
-    )
-    twin = splat_frame(rows, table, SHAPE)
-    np.testing.assert_allclose(twin, expected, rtol=0, atol=FLOAT64)
+    for counts in [(1, 1), (4, 3), (13, 1), (5, 2), (25, 2), (1, 4)]:
+        table = micro_view_cells(orbit, shutter, 0, START_S, shutter.lines(SHAPE), *counts)
+        expected = unfused(rows, orbit, shutter, *counts)
+        assert_near(render(rt, rows, table), expected, MERGED_FRAME)
+        assert_near(splat_frame(rows, table, SHAPE), expected, FLOAT64, 1.0)
 
 
 def test_fused_in_every_build(any_rt, make_cloud, orbit) -> None:
     rows, shutter = make_cloud(4, 32), Shutter(0.5, 0.4, "columns", -1)
     table = micro_view_cells(orbit, shutter, 0, START_S, SHAPE[1], 7, 3)
-    expected = unfused(rows, orbit, shutter, 7, 3)
-    np.testing.assert_allclose(
-        render(any_rt, rows, table, cutoff_sigma=0.0), expected, rtol=0, atol=MERGED_FRAME * expected.max()
-    )
+    assert_near(render(any_rt, rows, table), unfused(rows, orbit, shutter, 7, 3), MERGED_FRAME)
 
 
 @AXES
 def test_no_exposure_and_no_readout_is_static(rt, make_cloud, orbit, axis) -> None:
     rows, shutter = make_cloud(4, 33), Shutter(0.0, 0.0, axis)
     where = (orbit, shutter, 0, START_S, shutter.lines(SHAPE))
-    static = render(rt, rows, static_cells(*where))
-    frame = render(rt, rows, micro_view_cells(*where, 5, 3))
-    np.testing.assert_allclose(frame, static, rtol=0, atol=STANDING_PICTURE * static.max())
+    assert_near(
+        render(rt, rows, micro_view_cells(*where, 5, 3)), render(rt, rows, static_cells(*where)),
+        STANDING_PICTURE,
+    )
 
 
 def test_without_readout_strips_do_not_matter(rt, make_cloud, orbit) -> None:
-    rows, shutter = make_cloud(4, 34), Shutter(0.7, 0.0)
-    one, many = (
-        render(rt, rows, micro_view_cells(orbit, shutter, 0, START_S, SHAPE[0], strips, 4))
-        for strips in (1, 6)
-    )
-    np.testing.assert_allclose(many, one, rtol=0, atol=STANDING_PICTURE * one.max())
-    static = render(rt, rows, static_cells(orbit, shutter, 0, START_S, SHAPE[0]))
+    rows, where = make_cloud(4, 34), (orbit, Shutter(0.7, 0.0), 0, START_S, SHAPE[0])
+    one, many = (render(rt, rows, micro_view_cells(*where, strips, 4)) for strips in (1, 6))
+    assert_near(many, one, STANDING_PICTURE)
+    static = render(rt, rows, static_cells(*where))
     assert np.abs(one - static).max() > 0.01 * one.max()  # the exposure does matter
 
 
@@ -124,11 +110,10 @@ def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axi
         brute[where] = mean[where]
 
     where = (orbit, shutter, 0, START_S, lines)
-    exact = render(rt, rows, per_line_cells(*where, exposure_lines * fine), cutoff_sigma=0.0)
-    np.testing.assert_allclose(exact, brute, rtol=0, atol=BRUTE_FORCE * brute.max())
+    assert_near(render(rt, rows, per_line_cells(*where, exposure_lines * fine)), brute, BRUTE_FORCE)
 
     def error(strips: int, sub_intervals: int) -> float:
-        frame = render(rt, rows, micro_view_cells(*where, strips, sub_intervals), cutoff_sigma=0.0)
+        frame = render(rt, rows, micro_view_cells(*where, strips, sub_intervals))
         return float(np.abs(frame - brute).max() / brute.max())
 
     coarse, fine_error = error(1, 1), error(lines, 12)
@@ -138,44 +123,25 @@ def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axi
 
 def test_an_axially_symmetric_cloud_does_not_move(rt, make_geometry) -> None:
     """Turning bodies on the axis: fly-scan and static show the same picture."""
-    heights = np.array([-0.5, 0.0, 0.4])
     rows = np.zeros((11, 3))
-    rows[2], rows[3:5], rows[5], rows[6], rows[10] = (
-        heights,
-        [0.1, 0.3, 0.2],
-        [0.2, 0.1, 0.3],
-        1.0,
-        [1.0, 0.5, 2.0],
-    )
+    rows[2], rows[3:5], rows[5] = [-0.5, 0.0, 0.4], [0.1, 0.3, 0.2], [0.2, 0.1, 0.3]
+    rows[6], rows[10] = 1.0, [1.0, 0.5, 2.0]
     orbit = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 0.6))
-    shutter = Shutter(0.5, 0.4)
-    where = (orbit, shutter, 0, START_S, SHAPE[0])
-    static = render(rt, rows, static_cells(*where), cutoff_sigma=0.0)
+    where = (orbit, Shutter(0.5, 0.4), 0, START_S, SHAPE[0])
+    static = render(rt, rows, static_cells(*where))
     for table in (micro_view_cells(*where, 4, 5), per_line_cells(*where, 3)):
-        frame = render(rt, rows, table, cutoff_sigma=0.0)
-        np.testing.assert_allclose(frame, static, rtol=0, atol=STANDING_PICTURE * static.max())
+        assert_near(render(rt, rows, table), static, STANDING_PICTURE)
 
 
 def test_launches_do_not_grow_with_the_micro_views(rt, make_cloud, orbit, monkeypatch) -> None:
     """Preparation, gather and both adjoint passes once a frame, 1 micro-view or 40 (no serial loop)."""
-    launched: list[str] = []
-    launch = Runtime.launch
-
-    def counting(self, kernel, items, *args, group=1):
-        launched.append(kernel.function_name)
-        launch(self, kernel, items, *args, group=group)
-
-    monkeypatch.setattr(Runtime, "launch", counting)
-    counts = []
+    launched, counts = note_launches(monkeypatch), []
     for strips, sub_intervals in ((1, 1), (8, 5)):
         table = micro_view_cells(orbit, Shutter(0.5, 0.4), 0, START_S, SHAPE[0], strips, sub_intervals)
         assert table.count == strips * sub_intervals
         launched.clear()
-        projector, cells = SplatProjector(rt, *SHAPE), DeviceCells.upload(rt, table)
-        gaussians = DeviceGaussians.upload(rt, make_cloud(4, 36))
-        projector.forward(gaussians, cells)
-        gradients = rt.zeros((13, gaussians.stride))
-        projector.backward(gaussians, cells, rt.upload(pad_rows(np.ones(SHAPE))), gradients)
+        cells = DeviceCells.upload(rt, table)
+        SplatProjector(rt, *SHAPE).project_adjoint(make_cloud(4, 36), cells, np.ones(SHAPE))
         counts.append(list(launched))
     assert counts[0] == counts[1]
     for kernel in ("splat_prepare", "splat_forward_rows", "splat_backward_rows", "splat_chain"):

@@ -3,38 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pytest
-from tolerances import CUTOFF_EDGE_SIGMA, FINITE_DIFFERENCE_STEP, FLOAT64, GRADIENT
+from kernel_kit import (
+    MODELS,
+    READOUTS,
+    assert_classes,
+    assert_near,
+    by_gaussian,
+    frame_cells,
+    random_weights,
+)
+from tolerances import CUTOFF_EDGE_SIGMA, FLOAT64, GRADIENT
 
-from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
-from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
+from phyradgs_cl.acquisition import Shutter
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.fields.gaussians import QUATERNION, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.operators.twins.splat import precision_matrices, splat_frame
 from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
-CLASSES = {"mean": MEAN, "scale": SCALE, "quaternion": QUATERNION, "density": DENSITY}
 
 
-@pytest.fixture(
-    params=[("rows", 1), ("rows", -1), ("columns", 1), ("columns", -1)], ids=lambda p: f"{p[0]}{p[1]:+d}"
-)
+@pytest.fixture(params=READOUTS, ids=str)
 def make_table(request, make_geometry) -> Callable[[str], TimeCells]:
     """Tables of one frame, read out along rows or columns, either way."""
-    axis, direction = request.param
-    orbit = CircularOrbit(make_geometry(*SHAPE, offset=(0.15, -0.25)), ConstantSpeed(0.3, 0.5))
-    shutter = Shutter(0.8, 0.6, axis, direction)
-
-    def make(motion: str) -> TimeCells:
-        where = (orbit, shutter, 0, 0.2, shutter.lines(SHAPE))
-        return static_cells(*where) if motion == "static" else micro_view_cells(*where, 4, 2)
-
-    return make
+    geometry, shutter = make_geometry(*SHAPE, offset=(0.15, -0.25)), Shutter(0.8, 0.6, *request.param)
+    return lambda motion: frame_cells(motion, geometry, shutter=shutter)
 
 
 def device_gradients(rt, rows: np.ndarray, table: TimeCells, h: np.ndarray, **options: object) -> np.ndarray:
@@ -48,52 +46,34 @@ def device_gradients(rt, rows: np.ndarray, table: TimeCells, h: np.ndarray, **op
     return rt.download(gradients)[:, : gaussians.count]
 
 
-def weights() -> np.ndarray:
-    return np.random.default_rng(5).normal(size=SHAPE).astype(np.float32).astype(np.float64)
+def expected_gradients(finite_differences, rows, table, h, affine: bool = False) -> np.ndarray:
+    return by_gaussian(
+        finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows
+    )
 
 
-def expected_gradients(finite_differences, rows, table, h, affine: bool) -> np.ndarray:
-    """(11, G), a Gaussian at a time: frames are sums, so that the others do not matter."""
-    columns = [
-        finite_differences(
-            lambda r: float((h * splat_frame(r[:, None], table, SHAPE, affine=affine)).sum()),
-            row,
-            FINITE_DIFFERENCE_STEP,
-        )
-        for row in rows.T
-    ]
-    return np.stack(columns, -1)
-
-
-def relative(found: np.ndarray, expected: np.ndarray) -> float:
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
-
-
-@pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
+@MODELS
 @pytest.mark.parametrize("motion", ["static", "micro-views"])
 def test_every_class_of_parameters(rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
-    rows, table, h = make_cloud(3, 21, scale=(0.05, 0.3)), make_table(motion), weights()
+    rows, table, h = make_cloud(3, 21, scale=(0.05, 0.3)), make_table(motion), random_weights(SHAPE)
     found = device_gradients(rt, rows, table, h, affine=affine, cutoff_sigma=0.0)
-    expected = expected_gradients(finite_differences, rows, table, h, affine)
-    for name, part in CLASSES.items():
-        assert relative(found[:11][part], expected[part]) <= GRADIENT, name
+    assert_classes(found, expected_gradients(finite_differences, rows, table, h, affine), GRADIENT)
 
 
-@pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
+@MODELS
 def test_every_way_to_build_the_kernels(
-    any_rt, make_cloud, make_geometry, one_cell, finite_differences, affine
+    any_rt, make_cloud, make_geometry, finite_differences, affine
 ) -> None:
-    rows, h = make_cloud(3, 22, scale=(0.05, 0.3)), weights()
-    table = one_cell(make_geometry(*SHAPE).pose(0.9), SHAPE[0])
-    found = device_gradients(any_rt, rows, table, h, affine=affine, cutoff_sigma=0.0)
-    expected = expected_gradients(finite_differences, rows, table, h, affine)
-    for name, part in CLASSES.items():
-        assert relative(found[:11][part], expected[part]) <= GRADIENT, name
+    rows, h = make_cloud(3, 22, scale=(0.05, 0.3)), random_weights(SHAPE)
+    for motion in ("static", "micro-views"):
+        table = frame_cells(motion, make_geometry(*SHAPE))
+        found = device_gradients(any_rt, rows, table, h, affine=affine, cutoff_sigma=0.0)
+        assert_classes(found, expected_gradients(finite_differences, rows, table, h, affine), GRADIENT)
 
 
 def test_quaternion_gradient_is_tangent(rt, make_cloud, make_table) -> None:
     rows = make_cloud(6, 23)
-    found = device_gradients(rt, rows, make_table("micro-views"), weights())
+    found = device_gradients(rt, rows, make_table("micro-views"), random_weights(SHAPE))
     along = (found[QUATERNION] * rows[QUATERNION]).sum(axis=0)
     assert np.abs(along).max() <= GRADIENT * np.abs(found[QUATERNION]).max()
     assert np.abs(found[QUATERNION]).max() > 0
@@ -106,15 +86,8 @@ ROUNDING = 1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]])  # what three equal steps
 @pytest.mark.parametrize("motion", ["static", "micro-views", "exact"])
 def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud, make_geometry, motion, options) -> None:
     """Its torque is a difference that cancels; Adam would make whole steps of what rounding leaves of it."""
-    rows, h = make_cloud(5, 22, scale=(0.05, 0.3)), weights()
-    orbit, shutter = (
-        CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 0.5)),
-        Shutter(0.8, 0.6, "rows", 1),
-    )
-    where = (orbit, shutter, 0, 0.2, SHAPE[0])
-    table = {"static": static_cells, "micro-views": partial(micro_view_cells, strips=4, sub_intervals=2)}.get(
-        motion, partial(exact_cells, segments=2)
-    )(*where)
+    rows, h = make_cloud(5, 22, scale=(0.05, 0.3)), random_weights(SHAPE)
+    table = frame_cells(motion, make_geometry(*SHAPE))
     rows[SCALE] = rows[SCALE][:1] * ROUNDING
     found = device_gradients(any_rt, rows, table, h, **options)[:11]
     assert not found[QUATERNION].any() and found[SCALE].all()
@@ -122,34 +95,24 @@ def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud, make_geomet
     assert device_gradients(any_rt, rows, table, h, **options)[QUATERNION].any()
 
 
-def test_with_cutoff_only_drawn_pixels_pull(
-    any_rt, make_cloud, make_geometry, one_cell, finite_differences
-) -> None:
+def test_with_cutoff_only_drawn_pixels_pull(any_rt, make_cloud, make_geometry, finite_differences) -> None:
     """The set of drawn pixels is held fixed: the cutoff's edge itself has no gradient."""
-    table = one_cell(make_geometry(*SHAPE).pose(0.9), SHAPE[0])
-    rows = make_cloud(4, 24, scale=(0.05, 0.25))
-    h, expected = weights(), np.zeros((11, 4))
-    masks = [
-        [
-            splat_frame(row[:, None], table, SHAPE, DEFAULT_CUTOFF_SIGMA + e) > 0
-            for e in (-1, 1) * np.array(CUTOFF_EDGE_SIGMA)
-        ]
-        for row in rows.T
-    ]
+    table, rows = frame_cells("static", make_geometry(*SHAPE)), make_cloud(4, 24, scale=(0.05, 0.25))
+    h, expected = random_weights(SHAPE), np.zeros((11, 4))
+    cutoffs = DEFAULT_CUTOFF_SIGMA - CUTOFF_EDGE_SIGMA, DEFAULT_CUTOFF_SIGMA + CUTOFF_EDGE_SIGMA
+    masks = [[splat_frame(row[:, None], table, SHAPE, cutoff) > 0 for cutoff in cutoffs] for row in rows.T]
     h[np.any([low != high for low, high in masks], axis=0)] = 0.0  # float32 may disagree there
-    for g, (row, (drawn, _)) in enumerate(zip(rows.T, masks, strict=True)):
-        expected[:, g : g + 1] = expected_gradients(finite_differences, row[:, None], table, h * drawn, False)
+    for g, (drawn, _) in enumerate(masks):
+        expected[:, g : g + 1] = expected_gradients(finite_differences, rows[:, g : g + 1], table, h * drawn)
         assert not drawn.all()
-    found = device_gradients(any_rt, rows, table, h)
-    for name, part in CLASSES.items():
-        assert relative(found[:11][part], expected[part]) <= GRADIENT, name
+    assert_classes(device_gradients(any_rt, rows, table, h), expected, GRADIENT)
 
 
 def test_what_is_not_drawn_has_no_gradient(any_rt, make_cloud, make_geometry, one_cell) -> None:
     table = one_cell(make_geometry(*SHAPE).pose(0.0), SHAPE[0])
     rows = make_cloud(3, 25, scale=(0.05, 0.1))
     rows[0, 1], rows[1, 2] = 9.0, 4.0  # behind the source; off the detector
-    found = device_gradients(any_rt, rows, table, weights())
+    found = device_gradients(any_rt, rows, table, random_weights(SHAPE))
     np.testing.assert_array_equal(found[:, 1:], 0)
     assert np.all(np.isfinite(found)) and np.any(found[:, 0])
 
@@ -171,10 +134,8 @@ def image_with_moved_centre(
     delta = np.stack([u - x / z - shift[1], v - y / z - shift[0]], -1)
     big_q = 1 + 2 * delta @ b + np.einsum("...i,ij,...j", delta, c, delta)
     q = np.einsum("...i,ij,...j", delta, s, delta) / big_q
-    length = np.linalg.norm(
-        pose[3:6] - pose[:3] + u[..., None] * pose[6:9] + v[..., None] * pose[9:12], axis=-1
-    )
-    return length * row[10] * np.sqrt(2 * np.pi / alpha / big_q) * np.exp(-q / 2)
+    ray = pose[3:6] - pose[:3] + u[..., None] * pose[6:9] + v[..., None] * pose[9:12]
+    return np.linalg.norm(ray, axis=-1) * row[10] * np.sqrt(2 * np.pi / alpha / big_q) * np.exp(-q / 2)
 
 
 @pytest.mark.parametrize("motion", ["static", "micro-views"])
@@ -182,25 +143,20 @@ def test_statistic_rows_are_the_gradient_by_the_seen_centre(
     rt, make_cloud, make_table, finite_differences, motion
 ) -> None:
     """Rows 11 and 12: across the lines and along the readout, per half the detector's width."""
-    rows, table, h = make_cloud(3, 26, scale=(0.05, 0.3)), make_table(motion), weights()
+    rows, table, h = make_cloud(3, 26, scale=(0.05, 0.3)), make_table(motion), random_weights(SHAPE)
     found = device_gradients(rt, rows, table, h, cutoff_sigma=0.0)[11:]
 
     def frame(row: np.ndarray, shift: np.ndarray) -> np.ndarray:
         total = np.zeros(SHAPE)
         for c in range(table.count):
             lines = slice(int(table.line_start[c]), int(table.line_stop[c]))
-            where = (lines, slice(None)) if table.axis == "rows" else (slice(None), lines)
-            total[where] += table.weight[c] * image_with_moved_centre(row, table.pose[c], SHAPE, shift)[where]
+            image = table.weight[c] * image_with_moved_centre(row, table.pose[c], SHAPE, shift)
+            table.readout.frames(total)[lines] += table.readout.frames(image)[lines]
         return total
 
     for g, row in enumerate(rows.T):
-        np.testing.assert_allclose(
-            frame(row, np.zeros(2)),
-            splat_frame(row[:, None], table, SHAPE),
-            rtol=0,
-            atol=FLOAT64 * rows[10, g],
-        )
+        assert_near(frame(row, np.zeros(2)), splat_frame(row[:, None], table, SHAPE), FLOAT64, rows[10, g])
         by_v, by_u = finite_differences(lambda shift, r=row: float((h * frame(r, shift)).sum()), np.zeros(2))
         by_v, by_u = by_v * SHAPE[0] / 2, by_u * SHAPE[1] / 2
         across, along = (by_u, by_v) if table.axis == "rows" else (by_v, by_u)
-        assert relative(found[:, g], np.array([across, along])) <= GRADIENT
+        assert np.linalg.norm(found[:, g] - (across, along)) <= GRADIENT * np.hypot(across, along)

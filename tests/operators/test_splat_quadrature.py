@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tolerances import TWIN_QUADRATURE
 
 from phyradgs_cl.acquisition import pixel_centres
@@ -15,14 +16,7 @@ PANELS, ORDER, REACH_SIGMA = 400, 10, 12.0
 def density_at(row: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The field (n,) of one Gaussian (11,) at points (n, 3), from the definition."""
     w, x, y, z = row[6:10] / np.linalg.norm(row[6:10])
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    local = (points - row[:3]) @ turn / row[3:6]
+    local = Rotation.from_quat([x, y, z, w]).inv().apply(points - row[:3]) / row[3:6]
     return row[10] * np.exp(-0.5 * (local**2).sum(-1))
 
 

@@ -31,18 +31,21 @@ def population() -> Population:
     return Population(ACTIVATION.invert(rows), moments)
 
 
-def run(
-    population: Population, statistic: list[float], control: DensityControl = CONTROL, seed: int = 0
-) -> Population:
-    return control_density(
-        population, np.array(statistic, float), ACTIVATION, control, BOX, np.random.default_rng(seed)
-    )
+def run(population, statistic, control=CONTROL, seed: int = 0, box: np.ndarray = BOX) -> Population:
+    rng = np.random.default_rng(seed)
+    return control_density(population, np.array(statistic, float), ACTIVATION, control, box, rng)
 
 
-def test_nobody_is_chosen_below_the_threshold(population) -> None:
+def test_below_the_threshold_nothing_changes_but_the_order(population) -> None:
     grown = run(population, [0.99] * 5)
     np.testing.assert_array_equal(grown.raw, population.raw)
     np.testing.assert_array_equal(grown.moments, population.moments)
+    other = Population(population.raw.copy(), population.moments.copy())
+    assert population == population and population != other and len({population, other}) == 2
+    order = np.array([3, 0, 4, 2, 1])
+    pruned = prune(population.take(order), ACTIVATION, CONTROL, BOX)
+    np.testing.assert_array_equal(pruned.raw, population.raw)
+    np.testing.assert_array_equal(pruned.moments, population.moments)
 
 
 def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
@@ -52,23 +55,12 @@ def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
     box = np.array([rows[:3].min(1), rows[:3].max(1)])
     pruned = prune(population, ACTIVATION, control, box)
     assert pruned.count == 5
-    grown = control_density(
-        population, np.array([0, 0, 0, 1.0, 0]), ACTIVATION, control, 10 * BOX, np.random.default_rng(0)
-    )
+    grown = run(population, [0, 0, 0, 1.0, 0], control, box=10 * BOX)
     assert grown.count == 6
     np.testing.assert_allclose(
         ACTIVATION.apply(grown.raw)[3:6].max(), LARGE, rtol=FLOAT64
     )  # no child is smaller
     assert np.isclose(ACTIVATION.apply(grown.raw)[3], LARGE).sum() == 3
-
-
-def test_with_room_for_few_equals_at_the_threshold_are_chosen(population) -> None:
-    assert run(population, [1.0] * 5, replace(CONTROL, max_gaussians=7)).count == 7
-
-
-def test_populations_are_compared_by_what_they_are(population) -> None:
-    other = Population(population.raw.copy(), population.moments.copy())
-    assert population == population and population != other and len({population, other}) == 2
 
 
 def test_a_clone_shares_place_shape_and_mass(population) -> None:
@@ -106,16 +98,12 @@ def test_children_are_drawn_from_the_parent() -> None:
     rows = np.zeros((11, count))
     rows[3:6], rows[6:10], rows[10] = scale[:, None], turn.as_quat()[[3, 0, 1, 2]][:, None], 1.0
     population = Population(ACTIVATION.invert(rows), np.zeros((2, 11, count)))
-    box = 100 * BOX
-    grown = control_density(
-        population, np.full(count, 2.0), ACTIVATION, CONTROL, box, np.random.default_rng(4)
-    )
+    grown = run(population, np.full(count, 2.0), seed=4, box=100 * BOX)
     assert grown.count == 2 * count
     covariance = np.cov(ACTIVATION.apply(grown.raw)[:3])
     expected = turn.as_matrix() @ np.diag(scale**2) @ turn.as_matrix().T
-    np.testing.assert_allclose(
-        covariance, expected, rtol=0, atol=5 * 0.16 * np.sqrt(2 / (2 * count))
-    )  # 5 standard errors
+    standard_error = 0.16 * np.sqrt(2 / (2 * count))
+    np.testing.assert_allclose(covariance, expected, rtol=0, atol=5 * standard_error)
 
 
 def test_rotate_is_scipys() -> None:
@@ -126,55 +114,36 @@ def test_rotate_is_scipys() -> None:
     np.testing.assert_allclose(rotate(quaternion, vector), expected, rtol=0, atol=FLOAT64)
 
 
-@pytest.mark.parametrize("room", [0, 1, 2, 3])
-def test_never_more_than_allowed_and_the_strongest_first(population, room) -> None:
-    control = replace(CONTROL, max_gaussians=5 + room)
-    grown = run(population, [3, 5, 4, 0, 0], control)
-    assert grown.count == 5 + room
-    densities = ACTIVATION.apply(grown.raw)[10]
-    halved = [np.isclose(densities, d / 2).sum() == 2 for d in (2.0, 3.6, 1.1)]  # statistic 5, 4, 3
-    assert halved == [room > 0, room > 1, room > 2]
+def test_never_more_than_allowed_and_the_strongest_first(population) -> None:
+    for room in (0, 1, 2, 3):
+        grown = run(population, [3, 5, 4, 0, 0], replace(CONTROL, max_gaussians=5 + room))
+        assert grown.count == 5 + room
+        densities = ACTIVATION.apply(grown.raw)[10]
+        halved = [np.isclose(densities, d / 2).sum() == 2 for d in (2.0, 3.6, 1.1)]  # statistic 5, 4, 3
+        assert halved == [room > 0, room > 1, room > 2]
+    assert run(population, [1.0] * 5, replace(CONTROL, max_gaussians=7)).count == 7  # equals at the threshold
+    assert (
+        run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5
+    )  # a full one is left in peace
 
 
-def test_a_full_population_is_left_in_peace(population) -> None:
-    assert run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5
+def test_the_faded_and_the_lost_are_pruned(population) -> None:
+    for row, value, kept in [
+        (10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False),
+        (2, 1.2, False)
+    ]:  # fmt: skip
+        rows = ACTIVATION.apply(population.raw)
+        rows[row, 4] = value
+        pruned = prune(Population(ACTIVATION.invert(rows), population.moments), ACTIVATION, CONTROL, BOX)
+        assert pruned.count == 4 + kept, (row, value)
+        assert (5.0 in pruned.moments[0, 0]) == kept, (row, value)
 
 
-@pytest.mark.parametrize(
-    ("row", "value", "kept"),
-    [
-        (10, 0.5e-3, False),
-        (10, 2e-3, True),
-        (0, 1.01, False),
-        (0, 0.99, True),
-        (1, -1.01, False),
-        (2, 1.2, False),
-    ],
-)
-def test_the_faded_and_the_lost_are_pruned(population, row, value, kept) -> None:
-    rows = ACTIVATION.apply(population.raw)
-    rows[row, 4] = value
-    pruned = prune(Population(ACTIVATION.invert(rows), population.moments), ACTIVATION, CONTROL, BOX)
-    assert pruned.count == 4 + kept
-    assert (5.0 in pruned.moments[0, 0]) == kept
-
-
-def test_the_rest_is_sorted_by_height_with_its_moments(population) -> None:
-    order = np.array([3, 0, 4, 2, 1])
-    pruned = prune(population.take(order), ACTIVATION, CONTROL, BOX)
-    np.testing.assert_array_equal(pruned.raw, population.raw)
-    np.testing.assert_array_equal(pruned.moments, population.moments)
-
-
-def test_the_seed_decides(population) -> None:
+def test_the_seed_decides_and_the_caller_keeps_his_population(population) -> None:
+    raw, moments = population.raw.copy(), population.moments.copy()
     one, same, other = (run(population, [2, 2, 0, 2, 2], seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.raw, same.raw)
     assert np.any(one.raw != other.raw)
-
-
-def test_the_caller_keeps_his_population(population) -> None:
-    raw, moments = population.raw.copy(), population.moments.copy()
-    run(population, [2] * 5)
     np.testing.assert_array_equal(population.raw, raw)
     np.testing.assert_array_equal(population.moments, moments)
 

@@ -13,35 +13,29 @@ from phyradgs_cl.optim.schedules import PUBLISHED_RATES
 
 # what the command line accepts (docs/reference/cli.md says the defaults)
 RANGES = {
-    "every": (0, 1_000_000_000),
-    "start_iteration": (0, 1_000_000_000),
-    "stop_fraction": (0, 1),
+    "every": (0, 1_000_000_000), "start_iteration": (0, 1_000_000_000), "stop_fraction": (0, 1),
     "threshold": (0, 1e6),
-    "split_scale": (0, 1e3),
-    "split_factor": (1, 1e3),
-    "prune_density": (0, 1e6),
-    "prune_aspect": (0, 1e9),
+    "split_scale": (0, 1e3), "split_factor": (1, 1e3), "prune_density": (0, 1e6), "prune_aspect": (0, 1e9),
     "max_gaussians": (1, 100_000_000),
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", RANGES)
-def test_ranges_of_density_control_hold_both_ends(name) -> None:
-    lowest, highest = RANGES[name]
-    for inside in (lowest, highest):
-        assert getattr(replace(DensityControl(), **{name: inside}), name) == inside
-    for outside in (lowest - 0.5, highest * 1.001, float("nan")):
-        with pytest.raises(InputError, match=f"control.{name}"):
-            replace(DensityControl(), **{name: outside})
+def test_ranges_of_density_control_hold_both_ends() -> None:
+    for name, (lowest, highest) in RANGES.items():
+        for inside in (lowest, highest):
+            assert getattr(replace(DensityControl(), **{name: inside}), name) == inside
+        for outside in (lowest - 0.5, highest * 1.001, float("nan")):
+            with pytest.raises(InputError, match=f"control.{name}"):
+                replace(DensityControl(), **{name: outside})
 
 
-@pytest.mark.parametrize("name", ["position", "scale", "rotation", "density"])
-def test_rates_hold_both_ends(name) -> None:
-    for first, last in ((1e-12, 10), (10, 1e-12)):
-        assert getattr(replace(Rates(), **{name: (first, last)}), name) == (first, last)
-    for first, last in ((0.9e-12, 1), (1, 0.9e-12), (10.01, 1), (1, 0.0)):
-        with pytest.raises(InputError, match=f"rates.{name}"):
-            replace(Rates(), **{name: (first, last)})
+def test_rates_hold_both_ends() -> None:
+    for name in ("position", "scale", "rotation", "density"):
+        for first, last in ((1e-12, 10), (10, 1e-12)):
+            assert getattr(replace(Rates(), **{name: (first, last)}), name) == (first, last)
+        for first, last in ((0.9e-12, 1), (1, 0.9e-12), (10.01, 1), (1, 0.0)):
+            with pytest.raises(InputError, match=f"rates.{name}"):
+                replace(Rates(), **{name: (first, last)})
 
 
 def test_published_numbers() -> None:
@@ -61,13 +55,9 @@ def test_options_are_values(options) -> None:
     assert options == replace(options) and hash(options) == hash(replace(options))
 
 
-def test_an_aspect_of_one_leaves_only_balls() -> None:
+def test_edges_of_control() -> None:
     scale = np.array([[1.0, 1.0, 2.0], [1.0, 1.0, 1.0], [1.0, 0.999, 1.0]])
-    assert DensityControl(prune_aspect=1.0).allows(scale).tolist() == [True, False, False]
-    assert DensityControl(prune_aspect=2.0).allows(scale).tolist() == [True, True, True]
-    assert DensityControl(prune_aspect=0.0).allows(scale).tolist() == [True, True, True]
-
-
-def test_every_iteration_can_be_one_of_control() -> None:
+    for aspect, allowed in {1.0: [True, False, False], 2.0: [True] * 3, 0.0: [True] * 3}.items():
+        assert DensityControl(prune_aspect=aspect).allows(scale).tolist() == allowed
     control = DensityControl(every=1, start_iteration=2, stop_fraction=0.5)
     assert [i for i in range(1, 21) if control.is_due(i, 20)] == list(range(3, 10))

@@ -10,43 +10,21 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from phyradgs_cl.acquisition import Exact, MicroViews, Scan  # noqa: E402
+from parallel.shared_runs import OPTIONS, started  # noqa: E402
+
+from phyradgs_cl.acquisition import Exact  # noqa: E402
 from phyradgs_cl.api import load_scan, reconstruct  # noqa: E402
-from phyradgs_cl.optim import DensityControl  # noqa: E402
 from phyradgs_cl.parallel import launched_ranks  # noqa: E402
 from phyradgs_cl.reconstructors import reconstruct as run_method  # noqa: E402
-from phyradgs_cl.reconstructors.fdk import static_fdk  # noqa: E402
-from phyradgs_cl.reconstructors.splats.options import SplatOptions  # noqa: E402
-from phyradgs_cl.reconstructors.splats.run import SplatRun  # noqa: E402
-from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
-CONTROL = DensityControl(every=6, start_iteration=5, threshold=1e-6)
-OPTIONS = SplatOptions(
-    motion=MicroViews(4, 2), iterations=21, gaussians=300, tv_edge=8, control=CONTROL
-)
-SPLATS = {
-    "micro-views": replace(OPTIONS, batch=4),
-    "exact": replace(OPTIONS, batch=4, motion=Exact()),
-}
+SPLATS = {"micro-views": OPTIONS, "exact": replace(OPTIONS, motion=Exact())}
 VOXELS = {
     "sirt": {"iterations": 5, "motion": "per-row"},
     "os-sart": {"iterations": 3, "frames_per_subset": 4},
     "fista-tv": {"iterations": 5, "tv_iterations": 3},
     "asd-pocs": {"iterations": 3},
 }
-
-
-def gradient(scan: Scan, options: SplatOptions, rt: Runtime) -> np.ndarray:
-    """dL/draw (11, G) of the first step, of all Gaussians."""
-    fdk = static_fdk(rt, scan)
-    scale = internal_scale(fdk, scan.grid)
-    rng = np.random.default_rng(1)
-    grid = scan.grid.scaled(1 / scale.length_mm)
-    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
-    run = SplatRun(rt, scan, options, scale, population, rng)
-    run.step()
-    return rt.download(run.cloud.gradients)[:11, : run.cloud.count]
 
 
 def main() -> None:
@@ -61,9 +39,10 @@ def main() -> None:
         assert np.array_equal(volume.volume, again.volume), f"{name}: other bits in a second run"
         assert np.array_equal(volume.volume, ranks.bcast(volume.volume)), f"{name}: other bits on rank 0"
         kept[name] = volume.volume
-    # without jumps, across which a last digit makes a difference
-    smooth = replace(OPTIONS, batch=4, l1_weight=0.0, poisson_weight=1.0, tv_weight=0.0)
-    kept["gradient"] = gradient(scan, smooth, rt)
+    # dL/draw (11, G) of the first step, without jumps, across which a last digit makes a difference
+    step = started(scan, replace(OPTIONS, l1_weight=0.0, poisson_weight=1.0, tv_weight=0.0), rt)
+    step.step()
+    kept["gradient"] = rt.download(step.cloud.gradients)[:11, : step.cloud.count]
     if ranks.rank == 0:
         np.savez(sys.argv[2], **kept)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 from phyradgs_cl.phantoms import ellipsoids as module
 from phyradgs_cl.phantoms.ellipsoids import Ellipsoid, EllipsoidPhantom, rotation_about_z
@@ -18,16 +20,8 @@ def _random_rotation(rng: np.random.Generator) -> tuple:
 
 def _random_phantom(seed: int) -> EllipsoidPhantom:
     rng = np.random.default_rng(seed)
-    bodies = tuple(
-        Ellipsoid(
-            tuple(rng.uniform(-20, 20, 3)),
-            tuple(rng.uniform(5, 25, 3)),
-            rng.uniform(-0.02, 0.05),
-            _random_rotation(rng),
-        )
-        for _ in range(5)
-    )
-    return EllipsoidPhantom(bodies, "random")
+    draws = lambda: (rng.uniform(-20, 20, 3), rng.uniform(5, 25, 3), rng.uniform(-0.02, 0.05))  # noqa: E731
+    return EllipsoidPhantom(tuple(Ellipsoid(*draws(), _random_rotation(rng)) for _ in range(5)), "random")
 
 
 def _marched(phantom: EllipsoidPhantom, source: np.ndarray, target: np.ndarray, n: int = 40000) -> float:
@@ -53,16 +47,13 @@ def test_line_integrals_equal_brute_force_sampling_also_from_inside() -> None:
     assert np.allclose(phantom.line_integrals(source, target), expected, atol=5e-4, rtol=0)
 
 
-def test_sphere_chord_in_closed_form_from_a_far_source() -> None:
+def test_sphere_chords_in_closed_form_and_segments_that_stop() -> None:
     ball = EllipsoidPhantom((Ellipsoid((0, 0, 0), (2, 2, 2), 0.5),), "ball")
     height = np.array([0.0, 1.0, 1.9, 1.999999, 2.1])
     source = np.stack([np.full(5, 1e4), np.zeros(5), height], axis=-1)
     target = source * [-1, 1, 1]
     expected = 0.5 * 2 * np.sqrt(np.maximum(4 - height**2, 0))
     assert np.allclose(ball.line_integrals(source, target), expected, atol=1e-9)
-
-
-def test_segments_stop_at_their_ends() -> None:
     ball = EllipsoidPhantom((Ellipsoid((0, 0, 0), (2, 2, 2), 1.0),), "ball")
     target = np.array([[1, 0, 0], [9, 0, 0], [-1, 0, 0], [0, 0, 0]])
     assert np.allclose(ball.line_integrals([0, 0, 0], target), [1, 2, 1, 0])
@@ -86,9 +77,8 @@ def test_parallel_projection_holds_the_volume_of_the_ellipsoid() -> None:
     body = Ellipsoid((3, -4, 5), (11, 17, 7), 0.03, _random_rotation(rng))
     side = np.linspace(-40, 40, 201)
     y, z = np.meshgrid(side, side, indexing="ij")
-    rays = EllipsoidPhantom((body,), "one").line_integrals(
-        np.stack([np.full_like(y, -99), y, z], -1), np.stack([np.full_like(y, 99), y, z], -1)
-    )
+    source, target = (np.stack([np.full_like(y, x), y, z], -1) for x in (-99, 99))
+    rays = EllipsoidPhantom((body,), "one").line_integrals(source, target)
     mass = rays.sum() * (side[1] - side[0]) ** 2
     assert mass == pytest.approx(0.03 * 4 / 3 * np.pi * 11 * 17 * 7, rel=2e-3)
 
@@ -104,43 +94,28 @@ def test_voxels_hold_the_volume_and_sit_where_the_density_is() -> None:
     assert np.allclose(phantom.density(x, y, z)[clear], volume[clear], atol=1e-7)
     centre = [float((volume * c).sum() / volume.sum()) for c in (x, y, z)]
     assert np.allclose(centre, (2, -3, 4), atol=0.02)
-
-
-def test_one_sample_a_voxel_is_the_density_at_its_centre() -> None:
     phantom, grid = _random_phantom(6), Grid((11, 13, 9), (5.0, 4.0, 6.0), (1.0, 2.0, 3.0))
     z, y, x = grid.axes_mm()
     expected = phantom.density(x, y[:, None], z[:, None, None])
     assert np.allclose(phantom.voxelise(grid, 1), expected, atol=1e-8)
 
 
-def test_the_box_touches_the_surface() -> None:
+def test_the_long_axis_turns_counter_clockwise_and_the_box_touches_the_surface() -> None:
     tilted = Ellipsoid((5, 0, 0), (10, 2, 3), 1.0, rotation_about_z(np.pi / 4))
-    reach = np.sqrt((10**2 + 2**2) / 2)
+    reach, phantom = np.sqrt((10**2 + 2**2) / 2), EllipsoidPhantom((tilted,), "one")
     assert np.allclose(tilted.half_box_mm, (reach, reach, 3))
+    assert phantom.density(10, 5, 0) == 1 and phantom.density(10, -5, 0) == 0
 
 
-def test_rotation_about_z_turns_the_long_axis_counter_clockwise() -> None:
-    phantom = EllipsoidPhantom((Ellipsoid((0, 0, 0), (10, 1, 1), 1.0, rotation_about_z(np.pi / 4)),), "one")
-    assert phantom.density(5, 5, 0) == 1 and phantom.density(5, -5, 0) == 0
-
-
-@pytest.mark.parametrize(
-    ("source", "target"), [([0, 0], [1, 1]), (np.zeros((4, 3)), np.zeros((5, 3))), (0.0, 1.0)]
-)
-def test_rays_of_a_wrong_shape_are_refused(source: object, target: object) -> None:
-    with pytest.raises(InputError, match="ray source and target"):
-        _random_phantom(0).line_integrals(source, target)  # type: ignore[arg-type]
-
-
-def test_impossible_ellipsoids_are_refused() -> None:
-    with pytest.raises(InputError, match="semi-axis"):
-        Ellipsoid((0, 0, 0), (1, 0, 1), 1.0)
-    with pytest.raises(InputError, match="rotation"):
-        Ellipsoid((0, 0, 0), (1, 1, 1), 1.0, ((1, 0, 0), (0, 2, 0), (0, 0, 1)))
-    with pytest.raises(InputError, match="semi_axes_mm: found shape"):
-        Ellipsoid((0, 0, 0), (1, 1), 1.0)  # type: ignore[arg-type]
-    assert hash(Ellipsoid(np.zeros(3), [1, 1, 1], 1.0)) == hash(Ellipsoid((0, 0, 0), (1, 1, 1), 1.0))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="centre"):
-        Ellipsoid((0, np.nan, 0), (1, 1, 1), 1.0)
-    with pytest.raises(InputError, match="supersampling"):
-        _random_phantom(0).voxelise(Grid.cube(4, 1.0), 0)
+def test_impossible_ellipsoids_and_rays_are_refused() -> None:
+    origin, phantom = (0, 0, 0), _random_phantom(0)
+    assert_refused({
+        "semi-axis": lambda: Ellipsoid(origin, (1, 0, 1), 1.0),
+        "centre": lambda: Ellipsoid((0, np.nan, 0), (1, 1, 1), 1.0),
+        "rotation": lambda: Ellipsoid(origin, (1, 1, 1), 1.0, ((1, 0, 0), (0, 2, 0), (0, 0, 1))),
+        "semi_axes_mm: found shape": lambda: Ellipsoid(origin, (1, 1), 1.0),  # type: ignore[arg-type]
+        "supersampling": lambda: phantom.voxelise(Grid.cube(4, 1.0), 0),
+    })  # fmt: skip
+    for source, target in [([0, 0], [1, 1]), (np.zeros((4, 3)), np.zeros((5, 3))), (0.0, 1.0)]:
+        assert_refused({"ray source and target": partial(phantom.line_integrals, source, target)})
+    assert hash(Ellipsoid(np.zeros(3), [1, 1, 1], 1.0)) == hash(Ellipsoid(origin, (1, 1, 1), 1.0))  # type: ignore[arg-type]

@@ -12,16 +12,8 @@ from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.reconstructors.fdk import fdk_volume
+from phyradgs_cl.reconstructors.fdk import fdk_volume, weights
 from phyradgs_cl.reconstructors.fdk.arc import view_arc
-from phyradgs_cl.reconstructors.fdk.weights import (
-    displaced_weight,
-    fan_angle,
-    measured_fan,
-    pixel_rays,
-    ray_measure,
-    short_scan_weight,
-)
 
 GRID = Grid.cube(32, 2.0)
 BALLS = (((0.45, 0.1, 0.1), 0.3), ((-0.3, 0.45, -0.15), 0.28), ((-0.15, -0.5, 0.0), 0.25))
@@ -34,15 +26,13 @@ def cone(columns: int = 48, offset_u_mm: float = 0.0) -> ConeGeometry:
 
 
 def frames_of(pose: np.ndarray, columns: int) -> np.ndarray:
-    return PHANTOM.line_integrals(pose[:, None, None, :3], pixel_centres(pose, (44, columns))).astype(
-        np.float32
-    )
+    targets = pixel_centres(pose, (44, columns))
+    return PHANTOM.line_integrals(pose[:, None, None, :3], targets).astype(np.float32)
 
 
-def levels(rt, geometry: ConeGeometry, angles: np.ndarray) -> np.ndarray:
+def levels(rt, pose: np.ndarray, columns: int = 48) -> np.ndarray:
     """Mean reconstructed value inside each ball, whose attenuation is 1."""
-    pose = geometry.pose(angles)
-    volume = fdk_volume(rt, frames_of(pose, geometry.detector_shape[1]), pose, GRID)
+    volume = fdk_volume(rt, frames_of(pose, columns), pose, GRID)
     z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
     distance = [np.sqrt((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2) / r for c, r in BALLS]
     return np.array([volume[d < 0.75].mean() for d in distance])
@@ -52,35 +42,25 @@ def turn(views: int, arc_deg: float = 360.0) -> np.ndarray:
     return 0.3 + np.deg2rad(arc_deg) / views * np.arange(views)
 
 
-# --- arcs --------------------------------------------------------------------------------------------------------
+def test_what_is_a_full_turn() -> None:
+    cases = {
+        "lost view": (np.delete(np.arange(0, 360, 5.0), 7), True),
+        "uneven": (np.concatenate([np.arange(0, 180, 1.0), np.arange(180, 360, 4.0)]), True),
+        "nearly a turn": (np.arange(0, 345, 5.0), False), "short": (np.arange(0, 200, 1.0), False),
+        "short and coarse": (np.arange(0, 201, 40.0), False),
+        "more than a turn": (np.arange(0, 400, 7.3), True),
+    }  # fmt: skip
+    for name, (angles_deg, is_full) in cases.items():
+        arc = view_arc(np.deg2rad(angles_deg))
+        assert arc.is_full == is_full, name
+        assert arc.gap_rad.sum() == pytest.approx(arc.coverage_rad, rel=FLOAT64), name
+    for views in (1, 2, 3, 25, 400):
+        arc = view_arc(np.random.default_rng(1).permutation(turn(views)))
+        assert arc.is_full
+        np.testing.assert_allclose(arc.gap_rad, 2 * np.pi / views, rtol=FLOAT64)
 
 
-@pytest.mark.parametrize("views", [1, 2, 3, 25, 400])
-def test_even_full_turns(views) -> None:
-    arc = view_arc(np.random.default_rng(1).permutation(turn(views)))
-    assert arc.is_full
-    np.testing.assert_allclose(arc.gap_rad, 2 * np.pi / views, rtol=FLOAT64)
-
-
-@pytest.mark.parametrize(
-    ("angles_deg", "is_full"),
-    [
-        (np.delete(np.arange(0, 360, 5.0), 7), True),  # one view was lost
-        (np.concatenate([np.arange(0, 180, 1.0), np.arange(180, 360, 4.0)]), True),
-        (np.arange(0, 345, 5.0), False),
-        (np.arange(0, 200, 1.0), False),
-        (np.array([0.0, 40, 80, 120, 160, 200]), False),
-        (np.arange(0, 400, 7.3), True),
-    ],
-    ids=["lost view", "uneven", "nearly a turn", "short", "short and coarse", "more than a turn"],
-)
-def test_what_is_a_full_turn(angles_deg, is_full) -> None:
-    arc = view_arc(np.deg2rad(angles_deg))
-    assert arc.is_full == is_full
-    assert arc.gap_rad.sum() == pytest.approx(arc.coverage_rad, rel=FLOAT64)
-
-
-def test_an_arc_reaches_half_a_step_beyond_its_ends() -> None:
+def test_arcs_reach_half_a_step_beyond_their_ends_and_views_at_one_angle_share() -> None:
     """Wherever it starts on the turn and in whatever order its views come."""
     order = np.random.default_rng(2).permutation(50)
     angles = np.deg2rad(4.0 * np.arange(50) + 250.0)
@@ -88,10 +68,6 @@ def test_an_arc_reaches_half_a_step_beyond_its_ends() -> None:
     assert arc.coverage_rad == pytest.approx(np.deg2rad(200.0), rel=FLOAT64)
     np.testing.assert_allclose(arc.gap_rad, np.deg2rad(4.0), rtol=FLOAT64)
     np.testing.assert_allclose(arc.progress_rad, np.deg2rad(4.0 * np.arange(50) + 2.0)[order], rtol=FLOAT64)
-
-
-def test_views_at_one_angle_share_its_cell() -> None:
-    """Two turns and a half over the same angles; the first and the last of a turn coincide."""
     arc = view_arc(np.deg2rad(np.arange(0, 901, 10.0)))
     assert arc.is_full
     assert arc.gap_rad.sum() == pytest.approx(2 * np.pi, rel=FLOAT64)
@@ -99,25 +75,18 @@ def test_views_at_one_angle_share_its_cell() -> None:
     np.testing.assert_allclose(arc.gap_rad, np.deg2rad(10.0) / count, rtol=FLOAT64)
 
 
-# --- weights of rays -------------------------------------------------------------------------------------------------
-
-
-def test_the_measure_is_the_cosine_for_a_panel_that_faces_the_source() -> None:
+def test_the_measure_of_panels_that_face_the_source_or_are_turned() -> None:
     pose = cone(offset_u_mm=0.4).pose(0.7)
-    rays = pixel_rays(pose, np.arange(44), np.arange(48))
+    rays = weights.pixel_rays(pose, np.arange(44), np.arange(48))
     expected = 6.0 / np.linalg.norm(rays, axis=-1)
-    np.testing.assert_allclose(ray_measure(pose, rays), expected, rtol=FLOAT64)
-
-
-def test_the_measure_of_a_turned_panel() -> None:
-    """DSO cos γ over the panel's distance from the source: γ is the ray's own, wherever the panel's normal points."""
+    np.testing.assert_allclose(weights.ray_measure(pose, rays), expected, rtol=FLOAT64)
     pose = cone().pose(0.0)
     pose[6:9] = 0.075 * np.array([-np.sin(0.3), np.cos(0.3), 0.0])
     pose[3:6] = np.array([-3.0, 0, 0]) - 23.5 * pose[6:9]
-    rays = pixel_rays(pose, np.zeros(1), np.arange(48))
+    rays = weights.pixel_rays(pose, np.zeros(1), np.arange(48))
     distance = np.abs(np.cross(pose[6:9] / 0.075, rays[0, 0])[2])
-    expected = 6.0 * np.cos(fan_angle(pose, rays)[0]) / distance
-    np.testing.assert_allclose(ray_measure(pose, rays)[0], expected, rtol=FLOAT64)
+    expected = 6.0 * np.cos(weights.fan_angle(pose, rays)[0]) / distance
+    np.testing.assert_allclose(weights.ray_measure(pose, rays)[0], expected, rtol=FLOAT64)
 
 
 @pytest.mark.parametrize("coverage_deg", [190.0, 210.0, 260.0, 350.0])
@@ -125,51 +94,44 @@ def test_a_ray_and_its_opposite_in_a_short_scan_count_two(coverage_deg) -> None:
     coverage, rng = np.deg2rad(coverage_deg), np.random.default_rng(3)
     for fan, progress in zip(rng.uniform(-0.08, 0.08, 200), rng.uniform(0, coverage, 200), strict=True):
         opposite = (progress + np.pi + 2 * fan) % (2 * np.pi)
-        both = short_scan_weight(progress, np.array(fan), coverage)
+        both = weights.short_scan_weight(progress, np.array(fan), coverage)
         if opposite <= coverage:
-            both = both + short_scan_weight(opposite, np.array(-fan), coverage)
+            both = both + weights.short_scan_weight(opposite, np.array(-fan), coverage)
         assert float(both) == pytest.approx(2.0, abs=FLOAT64)
 
 
 @pytest.mark.parametrize("offset_mm", [0.03, -0.2, 0.8, -1.1])
 def test_a_ray_and_its_opposite_on_a_displaced_detector_count_two(offset_mm) -> None:
     geometry = cone(offset_u_mm=offset_mm)
-    fan = measured_fan(geometry.pose(turn(5))[:, None, None], geometry.detector_shape)
+    fan = weights.measured_fan(geometry.pose(turn(5))[:, None, None], geometry.detector_shape)
     assert fan.is_displaced
     angle = np.linspace(-fan.half_rad, fan.half_rad, 401)
-    weight = displaced_weight(angle, fan)
+    weight = weights.displaced_weight(angle, fan)
     np.testing.assert_allclose(weight + weight[::-1], 2.0, atol=FLOAT64)
     unseen = (angle < fan.low_rad) | (angle > fan.high_rad)
     np.testing.assert_allclose(weight[unseen], 0.0, atol=FLOAT64)
     assert sum(fan.missing_columns) == int(np.ceil(2 * abs(offset_mm) / 0.075 - 1e-6))
 
 
-# --- volumes ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "offset_mm", [0.0188, 0.45, 0.9, -0.9], ids=["quarter pixel", "some", "far", "other side"]
-)
+@pytest.mark.parametrize("offset_mm", [0.0188, 0.45, 0.9, -0.9])
 def test_displaced_detectors(rt, offset_mm) -> None:
     """34 columns of 0.075 mm see ±0.85 mm at the axis when centred: the balls need up to 0.77 + the offset."""
-    np.testing.assert_allclose(levels(rt, cone(34, offset_mm), turn(120)), 1.0, atol=FDK_PARTIAL)
+    found = levels(rt, cone(34, offset_mm).pose(turn(120)), 34)
+    np.testing.assert_allclose(found, 1.0, atol=FDK_PARTIAL)
 
 
 @pytest.mark.parametrize("arc_deg", [205.0, 240.0, 300.0, 400.0])
 @pytest.mark.parametrize("views", [40, 120])
 def test_short_scans_and_more_than_a_turn(rt, arc_deg, views) -> None:
     """Rapid scans too: their first and last views stand for half a step beyond themselves."""
-    np.testing.assert_allclose(levels(rt, cone(), turn(views, arc_deg)), 1.0, atol=FDK_PARTIAL)
+    np.testing.assert_allclose(levels(rt, cone().pose(turn(views, arc_deg))), 1.0, atol=FDK_PARTIAL)
 
 
-def test_short_scans_with_uneven_steps(rt) -> None:
+def test_short_scans_with_uneven_steps_and_their_end_views(rt) -> None:
     steps = np.random.default_rng(4).uniform(0.5, 1.5, 110)
     angles = np.cumsum(steps) / steps.sum() * np.deg2rad(225.0)
-    found = levels(rt, cone(), np.random.default_rng(5).permutation(angles))
+    found = levels(rt, cone().pose(np.random.default_rng(5).permutation(angles)))
     np.testing.assert_allclose(found, 1.0, atol=FDK_PARTIAL)
-
-
-def test_the_end_views_of_a_short_scan_count(rt) -> None:
     pose, geometry = cone().pose(turn(30, 215.0)), cone()
     frames = np.zeros((30, 44, 48), np.float32)
     for end in (0, -1):
@@ -178,38 +140,21 @@ def test_the_end_views_of_a_short_scan_count(rt) -> None:
         assert np.abs(fdk_volume(rt, frames, pose, GRID)).max() > 1e-3
 
 
-def test_a_source_beside_its_place(rt) -> None:
-    """The source stands off the panel's normal, along both of the panel's axes: only the poses say so."""
-    pose = cone().pose(turn(120))
-    pose[:, 0:3] += 3.0 * pose[:, 6:9] + 2.0 * pose[:, 9:12]
-    volume = fdk_volume(rt, frames_of(pose, 48), pose, GRID)
-    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
-    for c, r in BALLS:
-        inside = (x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < (0.75 * r) ** 2
-        assert abs(volume[inside].mean() - 1) <= FDK_MEAN
-
-
-def test_views_that_differ_by_more_than_a_turn(rt) -> None:
-    """A gantry that breathes: every view has its own distances, so weights are not shared."""
-    angles = turn(120)
+def test_poses_that_are_no_plain_circle(rt) -> None:
+    """A source off the panel's normal, along both of its axes; a gantry that breathes: every view has its own distances."""
+    beside = cone().pose(turn(120))
+    beside[:, 0:3] += 3.0 * beside[:, 6:9] + 2.0 * beside[:, 9:12]
     near, far = cone(), ConeGeometry(6.2, 9.1, (44, 48), (0.075, 0.075), (0.01, 0.0))
-    pose = np.where((np.arange(120) % 2 == 0)[:, None], near.pose(angles), far.pose(angles))
-    volume = fdk_volume(rt, frames_of(pose, 48), pose, GRID)
-    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
-    for c, r in BALLS:
-        inside = (x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < (0.75 * r) ** 2
-        assert abs(volume[inside].mean() - 1) <= FDK_MEAN
-
-
-# --- what is said ----------------------------------------------------------------------------------------------------
+    breathing = np.where((np.arange(120) % 2 == 0)[:, None], near.pose(turn(120)), far.pose(turn(120)))
+    for pose in (beside, breathing):
+        np.testing.assert_allclose(levels(rt, pose), 1.0, atol=FDK_MEAN)
 
 
 @pytest.mark.parametrize(
     ("arc_deg", "offset_mm", "message"),
     [
         (160.0, 0.0, "the views cover 160.0°, complete data need"),
-        (360.0, 2.5, "does not see the rotation axis"),
-        (240.0, 0.9, "displaced detector needs a full turn"),
+        (360.0, 2.5, "does not see the rotation axis"), (240.0, 0.9, "displaced detector needs a full turn"),
     ],
 )
 def test_incomplete_data_are_named(rt, caplog, arc_deg, offset_mm, message) -> None:
@@ -223,9 +168,8 @@ def test_incomplete_data_are_named(rt, caplog, arc_deg, offset_mm, message) -> N
 
 def test_complete_data_are_not(rt, caplog) -> None:
     with caplog.at_level(logging.WARNING):
-        levels(rt, cone(), turn(60, 215.0))
-        levels(rt, cone(), turn(60))
-        levels(rt, cone(34, 0.5), turn(60))
+        for columns, offset_mm, arc_deg in ((48, 0, 215.0), (48, 0, 360.0), (34, 0.5, 360.0)):
+            levels(rt, cone(columns, offset_mm).pose(turn(60, arc_deg)), columns)
     assert not caplog.records
 
 

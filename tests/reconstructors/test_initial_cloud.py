@@ -26,13 +26,10 @@ def test_centres_are_occupied_voxels_and_density_their_share(volume) -> None:
     cloud = draw(volume, 50)
     assert cloud.count == 50 and len({tuple(m) for m in cloud.mean}) == 50
     z, y, x = GRID.axes_mm()
-    index = tuple(
-        np.abs(axis[:, None] - c).argmin(axis=0)
-        for axis, c in zip((z, y, x), cloud.mean.T[::-1], strict=True)
-    )
-    np.testing.assert_allclose(
-        cloud.mean, np.stack([x[index[2]], y[index[1]], z[index[0]]], -1), rtol=0, atol=FLOAT64
-    )
+    near = zip((z, y, x), cloud.mean.T[::-1], strict=True)
+    index = tuple(np.abs(axis[:, None] - c).argmin(axis=0) for axis, c in near)
+    expected = np.stack([x[index[2]], y[index[1]], z[index[0]]], -1)
+    np.testing.assert_allclose(cloud.mean, expected, rtol=0, atol=FLOAT64)
     assert np.all(volume[index] > 0.2)
     np.testing.assert_allclose(cloud.density, 0.15 * volume[index], rtol=FLOAT64)
     np.testing.assert_array_equal(cloud.quaternion, np.tile([1.0, 0, 0, 0], (50, 1)))
@@ -46,22 +43,16 @@ def test_scale_is_the_rms_distance_to_the_three_nearest(volume) -> None:
     np.testing.assert_allclose(cloud.scale, np.repeat(expected[:, None], 3, axis=1), rtol=FLOAT64)
     bounded = draw(volume, 40, scale_bounds=(0.2, 0.25))
     assert bounded.scale.min() == 0.2 and bounded.scale.max() == 0.25
-
-
-def test_no_more_than_there_are_voxels(volume) -> None:
-    assert draw(volume, 10**6).count == int((volume > 0.2).sum())
-
-
-@pytest.mark.parametrize("occupied", [0, 1, 2])
-def test_hardly_anything_still_gives_a_cloud(occupied) -> None:
-    volume = np.zeros(GRID.shape)
-    volume.ravel()[:occupied] = 1.0
-    cloud = draw(volume, 30)
-    assert cloud.count == max(occupied, 1)
-    assert np.all(np.isfinite(cloud.scale)) and np.all(cloud.scale > 0) and np.all(cloud.density > 0)
-
-
-def test_the_seed_decides(volume) -> None:
+    assert draw(volume, 10**6).count == int((volume > 0.2).sum())  # no more than there are voxels
     one, same, other = (draw(volume, 20, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.mean, same.mean)
     assert np.any(one.mean != other.mean)
+
+
+def test_hardly_anything_still_gives_a_cloud() -> None:
+    for occupied in (0, 1, 2):
+        volume = np.zeros(GRID.shape)
+        volume.ravel()[:occupied] = 1.0
+        cloud = draw(volume, 30)
+        assert cloud.count == max(occupied, 1)
+        assert np.all(np.isfinite(cloud.scale)) and np.all(cloud.scale > 0) and np.all(cloud.density > 0)

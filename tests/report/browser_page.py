@@ -27,9 +27,7 @@ PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     program = os.environ.get("PHYRADGS_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
-    assert program, (
-        f"no browser: install one of {', '.join(PROGRAMS)}, or name its program by PHYRADGS_CHROMIUM"
-    )
+    assert program, f"no browser: install one of {PROGRAMS}, or name its program by PHYRADGS_CHROMIUM"
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser
@@ -115,12 +113,9 @@ def test_a_click_in_a_picture_moves_the_other_two(page) -> None:
     images.click(position={"x": box["width"] * 0.1, "y": box["height"] * 0.9})
     assert " 2 of 12" in place(page, "sagittal") and " 2 of 12" in place(page, "coronal")
     assert "7 of 12" in place(page, "axial")
-    assert page.locator("#plane-axial .upwards").evaluate("e => parseFloat(e.style.left)") == pytest.approx(
-        12.5
-    )
-    assert page.locator("#plane-axial .across").evaluate("e => parseFloat(e.style.top)") == pytest.approx(
-        87.5
-    )
+    for line, side, percent in (("upwards", "left", 12.5), ("across", "top", 87.5)):
+        found = page.locator(f"#plane-axial .{line}").evaluate(f"e => parseFloat(e.style.{side})")
+        assert found == pytest.approx(percent)
 
 
 def test_layers_change_all_pictures(page) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -50,32 +51,29 @@ class Page(HTMLParser):
 
     @property
     def words(self) -> str:
-        shown = (
-            text for tag, texts in self.texts.items() if tag not in ("style", "script") for text in texts
-        )
+        shown = (" ".join(texts) for tag, texts in self.texts.items() if tag not in ("style", "script"))
         return " ".join(" ".join(shown).split())
 
 
-def make_scan(rt, **changes: object) -> Scan:
-    """12³ voxels, 8 frames of 16 × 14 pixels; ``changes`` are those of the simulation."""
-    geometry = ConeGeometry(5.0, 7.0, (16, 14), (0.25, 0.25))
-    axis = str(changes.get("readout_axis", "rows"))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, axis, 0)
-    protocol = changes.pop("protocol", make_protocol("rapid", views=8, exposure_deg=20.0))
-    options = SimulationOptions(protocol=protocol, **changes)
-    return simulate(
-        scene.source, geometry, scene.grid, options, reference=scene.reference, title="a <b>small</b> scan"
-    )
+@pytest.fixture(scope="session")
+def scan_maker(rt) -> Callable[..., Scan]:
+    """A factory of 12³ voxels and 8 frames of 16 × 14 pixels; its changes are those of the simulation."""
+
+    def make(**changes: object) -> Scan:
+        geometry = ConeGeometry(5.0, 7.0, (16, 14), (0.25, 0.25))
+        axis = str(changes.get("readout_axis", "rows"))
+        scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, axis, 0)
+        protocol = changes.pop("protocol", make_protocol("rapid", views=8, exposure_deg=20.0))
+        options = SimulationOptions(protocol=protocol, **changes)
+        words = {"reference": scene.reference, "title": "a <b>small</b> scan"}
+        return simulate(scene.source, geometry, scene.grid, options, **words)
+
+    return make
 
 
 @pytest.fixture(scope="session")
-def scan_maker(rt):
-    return lambda **changes: make_scan(rt, **changes)
-
-
-@pytest.fixture(scope="session")
-def small_scan(rt) -> Scan:
-    return make_scan(rt)
+def small_scan(scan_maker) -> Scan:
+    return scan_maker()
 
 
 @pytest.fixture(scope="session")
@@ -84,9 +82,8 @@ def files(rt, small_scan, tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("run")
     scan, volume = folder / "scan.h5", folder / "volume.h5"
     write_scan(scan, small_scan)
-    job = ReconstructionJob(
-        scan, volume, method="sart", changes={"motion": "micro-views", "strips": 3, "iterations": 3}
-    )
+    changes = {"motion": "micro-views", "strips": 3, "iterations": 3}
+    job = ReconstructionJob(scan, volume, method="sart", changes=changes)
     run_reconstruction(job, lambda: rt, lambda progress: None)
     return scan, volume
 

@@ -45,21 +45,22 @@ def kinds(scan_maker, small_scan) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds, model) -> None:
+def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds) -> None:
     for name, scan in kinds.items():
-        drawings = [shutter_drawing(scan, model()), frames_drawing(scan)]
-        drawings += [orbit_drawing(scan), side_drawing(scan)]
-        for drawing in drawings:
+        drawings = [frames_drawing(scan), orbit_drawing(scan), side_drawing(scan)]
+        for drawing in (*drawings, *(shutter_drawing(scan, model()) for model in MODELS)):
             assert "nan" not in drawing and "inf" not in drawing, name
 
 
-def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(small_scan) -> None:
+def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(kinds, small_scan) -> None:
     (outline,) = shapes(shutter_drawing(small_scan, None), "polygon", "lit")
     lowest, highest = outline[np.isclose(outline[:, 1], outline[:, 1].max())], outline[outline[:, 1].argmin()]
     span = np.ptp(outline[:, 0])
     assert np.ptp(lowest[:, 0]) / span == pytest.approx(1 / 1.86, abs=0.01)
     assert highest[0] > lowest[:, 0].min()  # later lines open later
+    svg = shutter_drawing(kinds["pulsed"], None)
+    (lit,), (opened,) = shapes(svg, "polygon", "lit"), shapes(svg, "polygon", "open")
+    assert np.ptp(lit[:, 0]) < 0.2 * np.ptp(opened[:, 0])
 
 
 def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
@@ -70,12 +71,6 @@ def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
     share = (drawn[:, 0] - outline[:, 0].min()) / np.ptp(outline[:, 0])
     expected = (cells.time_s - small_scan.frame_start_s[0]) / small_scan.shutter.span_s
     assert len(drawn) == 12 and np.allclose(share, expected, atol=0.01)
-
-
-def test_light_is_drawn_inside_the_open_window(kinds) -> None:
-    svg = shutter_drawing(kinds["pulsed"], None)
-    (lit,), (opened,) = shapes(svg, "polygon", "lit"), shapes(svg, "polygon", "open")
-    assert np.ptp(lit[:, 0]) < 0.2 * np.ptp(opened[:, 0])
 
 
 def test_the_orbit_is_to_scale(small_scan) -> None:
@@ -108,6 +103,5 @@ def test_ticks_are_round_and_inside() -> None:
     assert list(ticks(0, 1)) == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1.0])
     assert list(ticks(3, 3)) == [3]
     assert list(decades(0.02, 3)) == pytest.approx([0.02, 0.05, 0.1, 0.2, 0.5, 1, 2])
-    assert Axes((0, 1), (1, 100), log=True).at(0, 10)[1] == pytest.approx(
-        np.mean([Axes((0, 1), (1, 100), log=True).at(0, y)[1] for y in (1, 100)])
-    )
+    heights = [Axes((0, 1), (1, 100), log=True).at(0, y)[1] for y in (1, 10, 100)]
+    assert heights[1] == pytest.approx((heights[0] + heights[2]) / 2)

@@ -45,12 +45,16 @@ def test_grey_values_are_clipped_to_their_window() -> None:
 
 
 def test_facts_have_words_and_units() -> None:
-    facts = dict(flattened({"a": {"b_mm": 1.0}, "psnr_db": 3}))
-    assert facts == {"a.b_mm": 1.0, "psnr_db": 3}
+    assert dict(flattened({"a": {"b_mm": 1.0}, "psnr_db": 3})) == {"a.b_mm": 1.0, "psnr_db": 3}
     assert (label("psnr_db"), unit("psnr_db")) == ("PSNR", "dB")
     assert (label("unit_density_per_mm"), unit("unit_density_per_mm")) == ("unit density", "1/mm")
     assert shown((1, 2.5), "mm").startswith("1, 2.5")
     assert [number(v) for v in (0.012345, -2.0, 1e-7, float("inf"))] == ["0.01235", "−2", "1·10⁻⁷", "∞"]
+    # what rounding left of zero is zero, where a resolution is known
+    assert number(-3.495e-15, 0.1) == "0" and number(-3.495e-15) == "−3.495·10⁻¹⁵"
+    assert shown(-3.495e-15, "mm") == "0\N{NARROW NO-BREAK SPACE}mm"
+    assert shown([1e-14, 0.25], "°") == "0, 0.25°"
+    assert shown(1e-12, "1/mm").startswith("1·10⁻¹²")
 
 
 def test_large_volumes_are_thinned_out_and_small_ones_are_whole() -> None:

@@ -6,22 +6,18 @@ import base64
 import hashlib
 import json
 import re
-import shutil
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from skimage import io
-from typer.testing import CliRunner
 
-from phyradgs_cl.commands.report import report_command
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
 from phyradgs_cl.report import Run, load_run, report_page, write_report
-from phyradgs_cl.report.facts import number, shown
+from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.pictures.projections import chosen_frames, computed_views
 from phyradgs_cl.report.pictures.slices import Window
 from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
@@ -53,52 +49,37 @@ def decoded(source: str) -> np.ndarray:
     return io.imread(BytesIO(base64.b64decode(content, validate=True)))
 
 
-def test_a_page_has_every_section_once_and_every_link_leads_somewhere(page) -> None:
-    assert not page.open
-    assert len(page.ids) == len(set(page.ids))
-    assert set(page.ids) >= ALL
+def test_a_page_is_whole_and_asks_nothing_of_the_world(page, page_text) -> None:
+    """Every section once, every link leads somewhere, every control and picture has a name, and one script may run."""
+    assert not page.open and len(page.ids) == len(set(page.ids)) and set(page.ids) >= ALL
     for link in page.all("a"):
         assert link["href"].startswith("#") and link["href"][1:] in page.ids
     for _, attributes in page.elements:
         for key in ("aria-labelledby", "aria-describedby"):
             assert attributes.get(key, page.ids[0]) in page.ids
-
-
-def test_a_page_asks_nothing_of_the_world(page, page_text) -> None:
-    assert not page.all("link")
-    assert all(image["src"].startswith("data:image/png;base64,") for image in page.all("img"))
-    outside = re.findall(r"https?://[^\s\"'<]*|@import|url\(", page_text)
-    assert not outside
-
-
-def test_the_policy_lets_only_the_page_own_script_run(page) -> None:
+    labelled = {label.get("for") for label in page.all("label")}
+    for control in page.all("input"):
+        assert control["id"] in labelled or control["type"] == "radio"  # radio buttons lie in their labels
+    assert all(svg["role"] == "img" and svg["aria-label"] for svg in page.all("svg"))
+    assert all(i["alt"] and i["src"].startswith("data:image/png;base64,") for i in page.all("img"))
+    assert not page.all("link") and not re.findall(r"https?://[^\s\"'<]*|@import|url\(", page_text)
     policy = next(m["content"] for m in page.all("meta") if "http-equiv" in m)
-    own = page.texts["script"][-1]
-    digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
+    digest = base64.b64encode(hashlib.sha256(page.texts["script"][-1].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy
     assert [s.get("type", "") for s in page.all("script")] == ["application/json", ""]
 
 
-def test_every_control_and_picture_has_a_name(page) -> None:
-    labelled = {label.get("for") for label in page.all("label")}
-    for control in page.all("input"):
-        assert control["id"] in labelled or control["type"] == "radio"  # radio buttons lie in their labels
-    assert all(image["alt"] for image in page.all("img"))
-    assert all(svg["role"] == "img" and svg["aria-label"] for svg in page.all("svg"))
-
-
 def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
     stored = read_volume(files[1])
-    assert f"{stored.metrics['psnr_db']:.2f} dB" in page.words
-    assert f"{stored.metrics['ssim']:.4f}" in page.words
-    record = stored.provenance["record"]
-    assert (
-        f"Residual: from {record[0]['residual']:.4g} to {record[-1]['residual']:.4g} at iteration 3"
-        in page.words
-    )
+    residuals = [line["residual"] for line in stored.provenance["record"]]
+    for told in (
+        f"{stored.metrics['psnr_db']:.2f} dB",
+        f"{stored.metrics['ssim']:.4f}",
+        f"Residual: from {residuals[0]:.4g} to {residuals[-1]:.4g} at iteration 3",
+    ):
+        assert told in page.words
     curve = next(p for p in page.all("polyline") if p.get("class") == "curve")
     heights = [float(point.split(",")[1]) for point in curve["points"].split()]
-    residuals = [line["residual"] for line in record]
     drops = np.diff(heights[:3]) / -np.diff(residuals)
     assert np.allclose(drops, drops[0], rtol=0.02)  # one scale for all points
 
@@ -106,9 +87,8 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
 def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
     target = tmp_path / "short.h5"
     changes = {"iterations": 12, "gaussians": 50, "tv_weight": 0.0}
-    run_reconstruction(
-        ReconstructionJob(files[0], target, changes=changes), lambda: rt, lambda progress: None
-    )
+    job = ReconstructionJob(files[0], target, changes=changes)
+    run_reconstruction(job, lambda: rt, lambda progress: None)
     record = load_run(target).record
     assert [line["iteration"] for line in record] == list(range(1, 13))
     page = parse(report_page(load_run(target)))
@@ -152,12 +132,6 @@ def test_a_window_has_room_for_overshoots_and_says_what_lies_beyond() -> None:
     assert Window.of(0.0, 1.0, volume[1:3]) == Window(0.0, 1.0, 0.0, 1.0, (False, False))
 
 
-def test_what_rounding_left_of_zero_is_zero() -> None:
-    assert number(-3.495e-15, 0.1) == "0" and number(-3.495e-15) == "−3.495·10⁻¹⁵"
-    assert shown(-3.495e-15, "mm") == "0\N{NARROW NO-BREAK SPACE}mm" and shown([1e-14, 0.25], "°") == "0, 0.25°"
-    assert shown(1e-12, "1/mm").startswith("1·10⁻¹²")  # no resolution is known of it
-
-
 def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> None:
     run = load_run(files[1])
     views = computed_views(run, rt, 3)
@@ -192,31 +166,25 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     stored = read_volume(files[1])
     scan_path, volume_path = tmp_path / "s.h5", tmp_path / "<i>v.h5"
     write_scan(scan_path, replace(small_scan, title=HOSTILE))
-    nested = {
-        "options": {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]},
-        "method": HOSTILE,
-        HOSTILE: HOSTILE,
-    }
     record = [{"iteration": 1, HOSTILE: 2.0, "loss": HOSTILE}, {"iteration": 2, HOSTILE: 3.0}, HOSTILE]
-    facts = {**nested, "record": record, "scan": HOSTILE, "input": {"median_filter": HOSTILE}}
+    options = {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]}
+    facts = {"options": options, "input": {"median_filter": HOSTILE}, "record": record}
+    facts |= {"method": HOSTILE, HOSTILE: HOSTILE, "scan": HOSTILE}
     write_volume(volume_path, stored.volume, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
     write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
     text = (tmp_path / "p.html").read_text(encoding="utf-8")
     page = parse(text)
-    assert not page.open
-    assert len(page.all("script")) == 2 and len(page.all("title")) == 1
+    assert not page.open and len(page.all("script")) == 2 and len(page.all("title")) == 1
     assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
     assert not [image for image in page.all("img") if image["src"] == "x"]
     assert "alert(1)" in page.words  # it is shown, as text
 
 
 def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
-    volume = shutil.copy(files[1], tmp_path / "alone.h5")
-    stored = read_volume(volume)
-    write_volume(
-        volume, stored.volume, stored.grid, {**stored.provenance, "scan": "gone.h5"}, None, stored.metrics
-    )
-    run = write_report(Path(volume), tmp_path / "p.html", no_runtime)
+    volume, stored = tmp_path / "alone.h5", read_volume(files[1])
+    facts = {**stored.provenance, "scan": "gone.h5"}
+    write_volume(volume, stored.volume, stored.grid, facts, None, stored.metrics)
+    run = write_report(volume, tmp_path / "p.html", no_runtime)
     assert run.scan is None and "--scan" in run.notes[0] and "gone.h5" in caplog.text
     page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
     assert set(page.ids) & ALL == {"slices", "metrics", "convergence", "provenance"}
@@ -224,8 +192,7 @@ def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, c
 
 
 def test_a_scan_that_has_changed_is_not_taken_for_the_run_scan(files, small_scan, tmp_path, parse) -> None:
-    volume = Path(shutil.copy(files[1], tmp_path / "volume.h5"))
-    stored = read_volume(volume)
+    volume, stored = tmp_path / "volume.h5", read_volume(files[1])
     facts = {**stored.provenance, "scan": str(tmp_path / "other.h5")}
     write_volume(volume, stored.volume, stored.grid, facts)
     write_scan(tmp_path / "other.h5", replace(small_scan, reference=None))
@@ -245,27 +212,23 @@ def test_a_bare_result_is_a_picture_of_the_volume(any_volume, tmp_path, parse) -
     assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
 
 
-@pytest.mark.parametrize("name", ["volume", "scan"])
-def test_a_page_never_replaces_its_inputs(rt, files, name) -> None:
-    target = files[1] if name == "volume" else files[0]
-    with pytest.raises(InputError, match="itself"):
-        write_report(files[1], target, lambda: rt)
-
-
-def test_files_of_another_kind_are_named(files, tmp_path) -> None:
-    with pytest.raises(InputError, match="found a scan"):
-        write_report(files[0], tmp_path / "p.html", no_runtime)
-    with pytest.raises(InputError, match="--scan.*found a volume"):
-        write_report(files[1], tmp_path / "p.html", no_runtime, scan=files[1])
-    with pytest.raises(OutputError):
-        write_report(files[1], tmp_path / "nowhere" / "p.html", no_runtime)
+def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_path) -> None:
+    scan, volume = files
+    page = tmp_path / "p.html"
+    for arguments, error, said in (
+        ((scan, page), InputError, "found a scan"),
+        ((volume, page, volume), InputError, "--scan.*found a volume"),
+        ((volume, tmp_path / "nowhere" / "p.html"), OutputError, "nowhere"),
+        ((volume, volume), InputError, "itself"),
+        ((volume, scan), InputError, "itself"),
+    ):
+        with pytest.raises(error, match=said):
+            write_report(*arguments[:2], no_runtime, scan=arguments[2] if len(arguments) > 2 else None)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_writes_a_page_and_says_so(files, tmp_path) -> None:
-    app = typer.Typer()
-    app.command()(report_command)
+def test_the_command_writes_a_page_and_says_so(cli, files, tmp_path, capsys) -> None:
     page = tmp_path / "p.html"
-    done = CliRunner().invoke(app, [str(files[1]), "-o", str(page), "--views", "1"])
-    assert done.exit_code == 0 and done.output.startswith(f"{page}: ")
+    assert cli.run(["report", str(files[1]), "-o", str(page), "--views", "1"]) == 0
+    assert capsys.readouterr().out.startswith(f"{page}: ")
     assert page.read_text(encoding="utf-8").count('class="view"') == 1

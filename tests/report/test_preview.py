@@ -7,15 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import typer
 from skimage import io
-from typer.testing import CliRunner
 
-from phyradgs_cl.commands.view import view_command
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
-from phyradgs_cl.report import view_volume, write_preview
+from phyradgs_cl.report import write_preview
 from phyradgs_cl.report.pictures.preview import preview_image
 
 GAP = 4
@@ -49,10 +46,9 @@ def test_a_preview_replaces_the_last_one_whole(any_volume, tmp_path) -> None:
     write_preview(volume, grid, tmp_path / "p.png")
     write_preview(volume[::-1], grid, tmp_path / "p.png")
     assert [path.name for path in tmp_path.iterdir()] == ["p.png"]
-    with pytest.raises(InputError, match="NaN"):
-        write_preview(np.full(grid.shape, np.nan), grid, tmp_path / "p.png")
-    with pytest.raises(InputError, match="shape"):
-        write_preview(volume[1:], grid, tmp_path / "p.png")
+    for wrong, said in ((np.full(grid.shape, np.nan), "NaN"), (volume[1:], "shape")):
+        with pytest.raises(InputError, match=said):
+            write_preview(wrong, grid, tmp_path / "p.png")
     with pytest.raises(OutputError):
         write_preview(volume, grid, tmp_path / "none" / "p.png")
 
@@ -71,25 +67,18 @@ class FakeViewer(SimpleNamespace):
 opened: list[FakeViewer] = []
 
 
-def test_the_window_has_the_volume_in_millimetres(any_volume, tmp_path, monkeypatch) -> None:
+def test_the_window_has_the_volume_in_millimetres(cli, refused, any_volume, tmp_path, monkeypatch) -> None:
+    """Without napari one line says what to install."""
     volume, grid = any_volume
     write_volume(tmp_path / "v.h5", volume, grid, {})
     ran = []
     monkeypatch.setitem(sys.modules, "napari", SimpleNamespace(Viewer=FakeViewer, run=lambda: ran.append(1)))
-    app = typer.Typer()
-    app.command()(view_command)
-    assert CliRunner().invoke(app, [str(tmp_path / "v.h5")]).exit_code == 0 and ran
+    assert cli.run(["view", str(tmp_path / "v.h5")]) == 0 and ran
     ((data, how),) = opened[-1].images
     assert np.array_equal(data, volume)
     assert how["scale"] == grid.voxel_size_mm and how["translate"] == grid.first_centre_mm
     assert how["units"] == ("mm", "mm", "mm") and how["axis_labels"] == ("z", "y", "x")
     assert opened[-1].dims.axis_labels == ("z", "y", "x") and opened[-1].scale_bar.visible
     assert opened[-1].camera.orientation2d == ("up", "right")
-
-
-def test_without_napari_one_line_says_what_to_install(any_volume, tmp_path, monkeypatch) -> None:
-    write_volume(tmp_path / "v.h5", *any_volume, {})
     monkeypatch.setitem(sys.modules, "napari", None)
-    with pytest.raises(InputError, match="pip install 'napari") as caught:
-        view_volume(tmp_path / "v.h5")
-    assert "\n" not in str(caught.value)
+    refused(["view", tmp_path / "v.h5"], "pip install 'napari")

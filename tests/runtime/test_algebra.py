@@ -52,6 +52,9 @@ def test_numbers_are_their_twins(any_rt, shape) -> None:
     scale = HOST.norm(x) * HOST.norm(y)
     assert abs(space.inner(a, b) - HOST.inner(x, y)) <= SUMS * scale
     assert space.norm(a) == pytest.approx(HOST.norm(x), rel=SUMS)
+    between = (v for v in (a, b, a) if space.inner(a, b) is not None)  # other sums on the way
+    assert space.sum_squares(between) == pytest.approx(HOST.sum_squares([x, y, x]), rel=SUMS)
+    assert space.sum_squares([]) == HOST.sum_squares([]) == 0
     assert space.largest(a) == HOST.largest(x)
     assert space.largest(a, absolute=True) == HOST.largest(x, absolute=True)
     assert [space.inner(a, b) for _ in range(3)] == [space.inner(a, b)] * 3

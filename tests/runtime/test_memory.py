@@ -11,29 +11,16 @@ from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Runtime, bytes_of, with_smaller_bricks
 
 
-@pytest.mark.parametrize(
-    ("text", "nbytes"),
-    [
-        ("2GiB", 2 << 30),
-        ("2gb", 2 * 10**9),
-        ("1.5 G", 3 << 29),
-        ("512M", 512 << 20),
-        (" 64 kib ", 65_536),
-        ("100B", 100),
-        ("4096", 4096),
-        (4096, 4096),
-    ],
-)
-def test_sizes(text, nbytes) -> None:
-    assert bytes_of(text, "--memory") == nbytes
-
-
-@pytest.mark.parametrize(
-    "text", ["", "GiB", "-1G", "0", "0.0MiB", "2 GiBs", "two", "1e3", "nan", "1" * 40, True, "2,5G"]
-)
-def test_what_is_no_size(text) -> None:
-    with pytest.raises(InputError, match="--memory.*2GiB"):
-        bytes_of(text, "--memory")
+def test_sizes() -> None:
+    sizes = {
+        "2GiB": 2 << 30, "2gb": 2 * 10**9, "1.5 G": 3 << 29, "512M": 512 << 20, " 64 kib ": 65_536,
+        "100B": 100,
+    }
+    for text, nbytes in {**sizes, "4096": 4096, 4096: 4096}.items():
+        assert bytes_of(text, "--memory") == nbytes, text
+    for text in ("", "GiB", "-1G", "0", "0.0MiB", "2 GiBs", "two", "1e3", "nan", "1" * 40, True, "2,5G"):
+        with pytest.raises(InputError, match="--memory.*2GiB"):
+            bytes_of(text, "--memory")
 
 
 def test_the_limit_holds_for_all_buffers_together() -> None:
@@ -65,6 +52,8 @@ def test_without_a_limit_it_is_what_the_device_reports(rt) -> None:
     assert room.largest_bytes <= rt.device.largest_allocation_bytes
     assert room.holds(room.free_bytes) == (room.free_bytes <= room.largest_bytes)
     assert not room.holds(room.free_bytes, 1)
+    assert rt.download(rt.empty((0, 7))).shape == (0, 7)
+    assert rt.upload(np.zeros((3, 0), np.float32)).nbytes == 0
 
 
 def test_a_shortage_is_met_once(caplog) -> None:
@@ -87,6 +76,14 @@ def test_a_shortage_is_met_once(caplog) -> None:
         with_smaller_bricks("work", never)
 
 
-def test_a_buffer_of_nothing_takes_one_element(rt) -> None:
-    assert rt.download(rt.empty((0, 7))).shape == (0, 7)
-    assert rt.upload(np.zeros((3, 0), np.float32)).nbytes == 0
+def test_traffic_is_what_crosses_the_bus() -> None:
+    rt = Runtime()
+    x = rt.upload(np.arange(6, dtype=np.float32))
+    rt.write(x, np.zeros(6, np.float32))
+    y = rt.zeros(6)
+    rt.copy(x, y)
+    assert (rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking) == (48, 0, 2)
+    rt.download(y)
+    rt.read_item(y, 2)
+    rt.finish()
+    assert (rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking) == (48, 28, 5)

@@ -28,6 +28,9 @@ def test_launches_time_and_bytes_are_counted_by_kernel(profiled) -> None:
     assert all(use.seconds > 0 for use in uses.values())
     assert list(uses) == sorted(uses, key=lambda name: -uses[name].seconds)
     assert profiled.kernel_uses() == {}
+    rates = profiled.best_rates()
+    assert 1e8 < rates.copy_bytes_per_s < 1e14
+    assert 1e8 < rates.flops_per_s < 1e16
 
 
 def test_long_runs_do_not_keep_every_event(profiled, monkeypatch) -> None:
@@ -38,12 +41,6 @@ def test_long_runs_do_not_keep_every_event(profiled, monkeypatch) -> None:
         profiled.fill(array, 1.0)
         assert len(profiled._profile._events) < 4
     assert profiled.kernel_uses()["fill"].launches == 11
-
-
-def test_without_profile_nothing_is_kept() -> None:
-    rt = Runtime()
-    rt.zeros(10)
-    assert rt.kernel_uses() == {}
 
 
 def test_memory_held_at_one_time() -> None:
@@ -57,12 +54,9 @@ def test_memory_held_at_one_time() -> None:
     assert rt.peak_bytes == 4400
     rt.reset_peak()
     assert rt.peak_bytes == second.nbytes + third.nbytes
-
-
-def test_best_rates_are_those_of_a_computer(profiled) -> None:
-    rates = profiled.best_rates()
-    assert 1e8 < rates.copy_bytes_per_s < 1e14
-    assert 1e8 < rates.flops_per_s < 1e16
+    rt = Runtime()
+    rt.zeros(10)
+    assert rt.kernel_uses() == {}
 
 
 def test_the_table_says_shares_and_rates() -> None:

@@ -16,26 +16,18 @@ PROGRAMS = sorted(path.stem for path in resource("cl").glob("*.cl"))
 
 
 def test_a_kernel_is_built_once(rt) -> None:
-    first = rt.kernel("adam", "adam_step")
-    assert rt.kernel("adam", "adam_step") is first
-    assert rt.kernel("adam", "activate") is not first
-    assert rt.compile(rt.kernel("adam", "activate")).program == rt.compile(first).program
-
-
-def test_defines_are_told_apart(rt) -> None:
+    first, other = rt.kernel("adam", "adam_step"), rt.kernel("adam", "activate")
+    assert rt.kernel("adam", "adam_step") is first is not other
+    assert rt.compile(other).program == rt.compile(first).program
     exact, affine = (rt.kernel("splat_prepare", "splat_prepare", AFFINE=a, IMAGE_GUARD=16) for a in (0, 1))
-    assert exact is not affine
+    assert exact is not affine  # defines are told apart
     assert rt.kernel("splat_prepare", "splat_prepare", IMAGE_GUARD=16, AFFINE=0) is exact
 
 
 def test_programs_are_built_once_for_all_their_kernels(rt, monkeypatch) -> None:
     built: list[str] = []
     build = Runtime._build
-    monkeypatch.setattr(
-        Runtime,
-        "_build",
-        lambda self, program, options: built.append(program) or build(self, program, options),
-    )
+    monkeypatch.setattr(Runtime, "_build", lambda rt, name, how: built.append(name) or build(rt, name, how))
     runtime = Runtime()
     for _ in range(3):
         for name in ("bin_count", "bin_within", "bin_starts", "bin_fill"):
@@ -47,19 +39,14 @@ def test_programs_are_built_once_for_all_their_kernels(rt, monkeypatch) -> None:
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_headers_are_pasted_once_with_line_marks(program) -> None:
-    text = kernel_source(program)
-    assert "#include" not in text
-    marks = [line for line in text.splitlines() if line.startswith("#line")]
+    """Every line of the pasted text is that line of that file; a header's second mention leaves an empty one."""
+    lines, name, number = kernel_source(program).splitlines(), "", 0
+    marks = [line for line in lines if line.startswith("#line")]
     assert marks[0] == f'#line 1 "{program}.cl"'
     opened = [mark for mark in marks if mark.startswith("#line 1 ")]
     assert len(set(opened)) == len(opened)
-
-
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_line_marks_count_the_lines_of_their_file(program) -> None:
-    """Every line of the pasted text is that line of that file; a header's second mention leaves an empty one."""
-    name, number = "", 0
-    for line in kernel_source(program).splitlines():
+    for line in lines:
+        assert "#include" not in line
         if line.startswith("#line"):
             _, first, quoted = line.split()
             name, number = quoted.strip('"'), int(first)
@@ -74,62 +61,46 @@ def broken_folder(tmp_path, monkeypatch):
     """A ``cl`` folder (with a space in its path) whose header has an error on its third line."""
     folder = tmp_path / "with space" / "cl"
     (folder / "common").mkdir(parents=True)
-    (folder / "common" / "broken.h").write_text(
-        "inline float good(float x) { return x; }\n\nthis is not C;\n"
-    )
-    (folder / "uses_broken.cl").write_text(
-        '/* a comment */\n#include "common/broken.h"\n__kernel void nothing(__global float *x) { x[0] = good(x[0]); }\n'
-    )
-    (folder / "breaks_later.cl").write_text(
-        '#include "common/fine.h"\n__kernel void nothing(__global float *x) { x[0] = unknown_thing; }\n'
-    )
-    (folder / "common" / "fine.h").write_text("inline float fine(float x) { return x; }\n")
+    nothing = "__kernel void nothing(__global float *x) { x[0] = %s; }\n"
+    for name, text in {
+        "common/broken.h": "inline float good(float x) { return x; }\n\nthis is not C;\n",
+        "uses_broken.cl": f'/* a comment */\n#include "common/broken.h"\n{nothing % "good(x[0])"}',
+        "breaks_later.cl": f'#include "common/fine.h"\n{nothing % "unknown_thing"}',
+        "common/fine.h": "inline float fine(float x) { return x; }\n",
+    }.items():
+        (folder / name).write_text(text)
     monkeypatch.setattr(sources, "resource", lambda name: folder)
 
 
-@pytest.mark.parametrize(
-    ("program", "place"), [("uses_broken", "common/broken.h:3"), ("breaks_later", "breaks_later.cl:2")]
-)
-def test_a_build_error_names_file_and_line(rt, broken_folder, program, place) -> None:
-    with pytest.raises(DeviceError) as raised:
-        rt.launch(rt.kernel(program, "nothing"), 1, rt.zeros(1))
-    text = str(raised.value)
-    assert f"{program}.cl" in text and place in text and rt.device.name in text
+def test_a_build_error_names_file_and_line(rt, broken_folder) -> None:
+    for program, place in {"uses_broken": "common/broken.h:3", "breaks_later": "breaks_later.cl:2"}.items():
+        with pytest.raises(DeviceError) as raised:
+            rt.launch(rt.kernel(program, "nothing"), 1, rt.zeros(1))
+        assert all(word in str(raised.value) for word in (f"{program}.cl", place, rt.device.name))
 
 
 def test_lanes_follow_the_device_and_can_be_told(rt) -> None:
     assert rt.lanes == default_lanes(rt.device)
-    assert Runtime(lanes=4).lanes == 4
-    with pytest.raises(DeviceError, match="lanes"):
-        Runtime(lanes=3)
-    assert Runtime(fp64=False).fp64 is False
-
-
-def test_an_unknown_device_is_refused() -> None:
+    assert Runtime(lanes=4).lanes == 4 and Runtime(fp64=False).fp64 is False
+    for wrong in ({"lanes": 3}, {"lanes": 4, "pixel_items": True}):
+        with pytest.raises(DeviceError, match="lanes"):
+            Runtime(**wrong)
     with pytest.raises(DeviceError, match="no such device"):
         Runtime("no such device")
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.int32, np.float64])
-def test_memory_keeps_what_it_is_given(rt, dtype) -> None:
-    values = np.arange(24, dtype=dtype).reshape(2, 3, 4)
-    array = rt.upload(values)
-    assert array.shape == (2, 3, 4) and array.dtype == dtype and array.nbytes == values.nbytes
-    np.testing.assert_array_equal(rt.download(array), values)
-    assert rt.read_item(array, 7) == 7
-    other = rt.zeros((2, 3, 4), dtype)
-    np.testing.assert_array_equal(rt.download(other), 0)
-    rt.copy(array, other)
-    np.testing.assert_array_equal(rt.download(other), values)
-    rt.fill(other, 3)
-    np.testing.assert_array_equal(rt.download(other), 3)
-
-
-def test_empty_arrays_are_allowed(rt) -> None:
-    assert rt.download(rt.upload(np.zeros((0, 3), np.float32))).shape == (0, 3)
-
-
-def test_too_much_memory_is_refused_in_words(rt) -> None:
+def test_memory_keeps_what_it_is_given(rt) -> None:
+    for dtype in (np.float32, np.int32, np.float64):
+        values = np.arange(24, dtype=dtype).reshape(2, 3, 4)
+        array, other = rt.upload(values), rt.zeros((2, 3, 4), dtype)
+        assert array.shape == (2, 3, 4) and array.dtype == dtype and array.nbytes == values.nbytes
+        np.testing.assert_array_equal(rt.download(array), values)
+        assert rt.read_item(array, 7) == 7
+        np.testing.assert_array_equal(rt.download(other), 0)
+        rt.copy(array, other)
+        np.testing.assert_array_equal(rt.download(other), values)
+        rt.fill(other, 3)
+        np.testing.assert_array_equal(rt.download(other), 3)
     with pytest.raises(DeviceError, match="MiB"):
         rt.empty(rt.device.largest_allocation_bytes)  # four times that in bytes
 

@@ -13,7 +13,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path, read_volume, write_scan
-from phyradgs_cl.io.names import beside, shortened
+from phyradgs_cl.io.output import beside, shortened
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_scan
 

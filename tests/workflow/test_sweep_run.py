@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import tables.__main__ as tables_command
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.cluster import Workers
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import only_run, read_volume
@@ -62,19 +61,36 @@ def lines_of(job: SweepJob) -> list[dict]:
     return read_lines(job.folder / RESULTS)
 
 
+def records_of(job: SweepJob) -> list[dict]:
+    with open(job.folder / "results.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def test_every_run_is_in_the_file_once_with_what_it_depends_on(job) -> None:
+    """In the tables too; a scan that was replaced is run again."""
     told: list[SweepProgress] = []
     written, failed = run_sweep(job, told.append)
     lines = lines_of(job)
     assert failed == 0 and [path.name for path in written] == ["results.jsonl", "results.md", "results.csv"]
     assert len(lines) == RUNS == len({line["run"] for line in lines})
     needed = {"version", "device", "seed", "options", "seconds", "metrics", "numpy", "python", "scan", "host"}
-    assert all(needed <= line.keys() for line in lines)
-    assert all({"psnr_db", "ssim"} <= line["metrics"].keys() for line in lines)
+    assert all(needed <= line.keys() and {"psnr_db", "ssim"} <= line["metrics"].keys() for line in lines)
     stored = read_volume(job.folder / lines[0]["volume"])
     assert stored.metrics["psnr_db"] == pytest.approx(lines[0]["metrics"]["psnr_db"])
     assert [p.done for p in told if p.line is not None] == list(range(1, RUNS + 1))
     assert any(p.progress is not None for p in told)
+    text = (job.folder / "results.md").read_text()
+    (row,) = [line for line in text.splitlines() if line.startswith("| sirt iterations=4 |")]
+    scores = [line["metrics"]["psnr_db"] for line in lines if line["label"] == "sirt iterations=4"]
+    assert row.split("|")[2].strip() == "4" and f"{sum(scores) / 4:.2f} ±" in row
+    assert {record["iterations"] for record in records_of(job)} == {"2", "4", ""}
+    assert all((job.folder / record["volume"]).is_file() for record in records_of(job))
+    scan = job.grid.scans[0]
+    os.utime(scan, ns=(1, 1))
+    run_sweep(job)
+    again = lines_of(job)[RUNS:]
+    assert len(again) == RUNS // 2 and {line["scan"] for line in again} == {str(scan)}
+    assert len(records_of(job)) == RUNS
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(job) -> None:
@@ -106,18 +122,6 @@ def test_a_result_that_was_lost_on_its_way_is_not_made_again(job) -> None:
     assert task.make_run(run)["finished"] >= first["finished"] and run.job.output.exists()
 
 
-def test_a_scan_that_was_replaced_is_run_again(job) -> None:
-    run_sweep(job)
-    scan = job.grid.scans[0]
-    os.utime(scan, ns=(1, 1))
-    run_sweep(job)
-    lines = lines_of(job)
-    assert len(lines) == RUNS + RUNS // 2
-    assert {line["scan"] for line in lines[RUNS:]} == {str(scan)}
-    with open(job.folder / "results.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == RUNS
-
-
 def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
     original = task.go_on
 
@@ -131,10 +135,7 @@ def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
     monkeypatch.setattr(task, "go_on", failing)
     _, failed = run_sweep(job)
     errors = [line["error"] for line in lines_of(job) if "error" in line]
-    assert failed == 4 and sorted(set(errors)) == [
-        "ZeroDivisionError: a defect",
-        "scan: found no good | at all",
-    ]
+    assert failed == 4 and set(errors) == {"ZeroDivisionError: a defect", "scan: found no good | at all"}
     text = (job.folder / "results.md").read_text()
     assert f"{RUNS - 4} of {RUNS} runs, 4 failed" in text and "no good \\| at all" in text
     monkeypatch.undo()
@@ -162,78 +163,45 @@ def test_a_run_waits_for_one_that_its_scheduler_lost_sight_of(job, monkeypatch) 
     assert "error" not in task.make_run(run) and len(asked) == 2
 
 
-def test_two_sweeps_of_one_folder_refuse_each_other(job) -> None:
-    job.folder.mkdir()
+def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, job, no_dask, refused, capfd) -> None:
+    grid, install = job.folder.parent / "grid.toml", "pip install 'phyradgs-cl[cluster]'"
+    command = ["sweep", str(grid), "-o", str(job.folder)]
+    assert cli.run(command) == 0
+    said = capfd.readouterr()
+    assert f"{RUNS}/{RUNS} " in said.out and install in said.err
     with only_run(job.folder / RESULTS), pytest.raises(BusyError, match="another run"):
         run_sweep(job)
-
-
-def test_tables_have_settings_and_options(job) -> None:
-    run_sweep(job)
-    text = (job.folder / "results.md").read_text()
-    (row,) = [line for line in text.splitlines() if line.startswith("| sirt iterations=4 |")]
-    scores = [line["metrics"]["psnr_db"] for line in lines_of(job) if line["label"] == "sirt iterations=4"]
-    assert row.split("|")[2].strip() == "4" and f"{sum(scores) / 4:.2f} ±" in row
-    with open(job.folder / "results.csv", newline="") as file:
-        records = list(csv.DictReader(file))
-    assert {record["iterations"] for record in records} == {"2", "4", ""}
-    assert all((job.folder / record["volume"]).is_file() for record in records)
-
-
-def test_the_command_needs_no_dask_for_one_run_after_the_other(job, no_dask, capsys) -> None:
-    command = ["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]
-    assert load_cli().run(command) == 0
-    said = capsys.readouterr()
-    assert f"{RUNS}/{RUNS} " in said.out and "pip install 'phyradgs-cl[cluster]'" in said.err
+    (job.folder / RESULTS).unlink()
     for more in (["--workers", "2"], ["--scheduler", "local"], ["--scheduler", "tcp://host:1"]):
-        (job.folder / RESULTS).unlink()
-        assert load_cli().run([*command, *more]) == 2
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1 and "pip install 'phyradgs-cl[cluster]'" in error
-    assert load_cli().run([*command, "--device", "cpu,cpu"]) == 2
-    assert "one device" in capsys.readouterr().err
-
-
-def test_what_is_wrong_with_a_grid_is_one_line_without_dask_too(job, no_dask, capsys) -> None:
-    grid = job.folder.parent / "grid.toml"
+        refused([*command, *more], install)
+    refused([*command, "--device", "cpu,cpu"], "one device")
+    refused(["sweep", grid.with_name("none.toml"), "-o", job.folder])
     grid.write_text(TEXT.replace("iterations", "iteration"))
-    for name in (grid, grid.with_name("none.toml")):
-        assert load_cli().run(["sweep", str(name), "-o", str(job.folder)]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
+    refused(command)
+    bench = ["table1", "--rows", "FDK", "--size", "XS", "--scheduler", "local"]
+    assert tables_command.run([*bench, "-o", str(job.folder / "bench")]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and install in error
 
 
-def test_bench_says_what_to_install(tmp_path, no_dask, capsys) -> None:
-    options = ["table1", "--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out"), "--scheduler", "local"]
-    assert tables_command.run(options) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "pip install 'phyradgs-cl[cluster]'" in error
-
-
-def test_failed_runs_show_in_the_status(job, no_dask, monkeypatch, capsys) -> None:
+def test_failed_runs_show_in_the_status(cli, job, no_dask, monkeypatch, capsys) -> None:
     monkeypatch.setattr(task, "go_on", lambda *_: 1 / 0)
-    assert load_cli().run(["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]) == 2
+    assert cli.run(["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]) == 2
     assert f"{RUNS} runs failed" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_devices_are_given_out_in_turn_and_contradictions_refused() -> None:
+    assert Workers(device="cpu,0", count=3).devices() == ["cpu", "0", "cpu"]
+    assert len(Workers(device="cpu").devices()) == 1
+    for options, message in (
         ({"scheduler": "tcp://a:1", "count": 2}, "--workers: found 2 beside --scheduler"),
         ({"scheduler": "tcp://a:1", "device": "0"}, "--device: found '0' beside --scheduler"),
         ({"count": 0}, "--workers"),
         ({"scheduler": " "}, "--scheduler"),
-    ],
-)
-def test_contradicting_options_are_refused(options, message) -> None:
-    with pytest.raises(InputError, match=message):
-        Workers(**options)
-
-
-def test_devices_are_given_out_in_turn() -> None:
-    assert Workers(device="cpu,0", count=3).devices() == ["cpu", "0", "cpu"]
-    assert len(Workers(device="cpu").devices()) == 1
-    with pytest.raises(InputError, match="--device"):
-        Workers(device="cpu,").devices()
+        ({"device": "cpu,"}, "--device"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Workers(**options).devices()
 
 
 def test_lines_are_json_without_nan(job, monkeypatch) -> None:

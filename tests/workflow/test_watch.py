@@ -8,18 +8,18 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import pytest
 
-from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError
 from phyradgs_cl.io import only_run, read_volume
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import ReconstructionJob
-from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch, service
+from phyradgs_cl.workflow.watch import Arrivals, WatchEvent, WatchJob, run_watch, service
 
 
 @pytest.fixture
@@ -75,35 +75,25 @@ def test_a_failure_is_set_aside_until_its_file_changes(job, drop, rt) -> None:
     assert (job.output / "bad.error.txt").read_text().startswith(told["bad.h5"].error)
     assert watched(job, rt) == []
     drop("bad.h5")  # written again, and whole
-    assert [event.error for event in watched(job, rt)] == [""]
-    assert outputs(job) == ["bad.h5", "good.h5"]
-
-
-def test_removing_the_error_tries_again(job, rt) -> None:
     (job.folder / "text.h5").write_text("no HDF5")
-    assert len(watched(job, rt)) == 1 and watched(job, rt) == []
-    (job.output / "text.error.txt").unlink()
+    assert ["not HDF5" in event.error for event in watched(job, rt)] == [False, True]
+    assert watched(job, rt) == []
+    (job.output / "text.error.txt").unlink()  # tried again
     assert "not HDF5" in watched(job, rt)[0].error
+    assert outputs(job) == ["bad.h5", "good.h5", "text.error.txt"]
 
 
 def test_a_file_that_another_program_has_open_for_writing_waits(job, drop, rt) -> None:
     scan = drop("open.h5")
-    text = (
-        f"import h5py, sys; f = h5py.File({str(scan)!r}, 'r+'); print('open', flush=True); sys.stdin.read()"
-    )
+    text = f"import h5py; f = h5py.File({str(scan)!r}, 'r+'); print('open', flush=True); input()"
     environment = {**os.environ, "HDF5_USE_FILE_LOCKING": "TRUE"}
-    writer = subprocess.Popen(
-        [sys.executable, "-c", text],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    writer = subprocess.Popen([sys.executable, "-c", text], env=environment, **pipes)
     try:
         assert writer.stdout.readline() == "open\n"
         assert watched(job, rt) == [] and outputs(job) == []
     finally:
-        writer.communicate("")
+        writer.communicate("\n")
     assert [event.error for event in watched(job, rt)] == [""]
 
 
@@ -133,14 +123,11 @@ def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeyp
 
 
 def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt, monkeypatch) -> None:
-    for name in ("a.h5", "b.h5", "c.h5", "d.h5"):
+    errors = (ZeroDivisionError("a defect"), OutOfMemoryError("memory of it"), MemoryError())
+    failures = dict(zip(("a.h5", "b.h5", "c.h5"), errors, strict=True))
+    for name in (*failures, "d.h5"):
         drop(name)
     original = service.go_on
-    failures = {
-        "a.h5": ZeroDivisionError("a defect"),
-        "b.h5": OutOfMemoryError("memory of it"),
-        "c.h5": MemoryError(),
-    }
 
     def failing(given, *rest):
         if given.scan.name in failures:
@@ -152,16 +139,18 @@ def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt,
     assert outputs(job) == ["a.error.txt", "b.error.txt", "c.error.txt", "d.h5"]
 
 
-def test_a_device_that_fails_is_opened_anew_and_one_that_is_gone_ends_the_watch(
-    job, drop, rt, monkeypatch
-) -> None:
+def test_devices_and_disks_that_fail_are_no_fault_of_a_scan(job, drop, rt, monkeypatch) -> None:
+    """A lost device is opened anew; one that is gone, or a full disk, ends the watch."""
     drop("a.h5")
-    original, opened = service.go_on, []
+    original, opened, told = service.go_on, [], []
 
-    def failing_at_first(*arguments):
-        if len(opened) < 2:
-            raise DeviceError("device", "lost")
-        return original(*arguments)
+    def failing(error: Exception, times: int):
+        def go_on(*arguments):
+            if len(opened) < times:
+                raise error
+            return original(*arguments)
+
+        return go_on
 
     def opening():
         opened.append(1)
@@ -169,38 +158,28 @@ def test_a_device_that_fails_is_opened_anew_and_one_that_is_gone_ends_the_watch(
             raise DeviceError("OpenCL", "no device")
         return rt
 
-    monkeypatch.setattr(service, "go_on", failing_at_first)
-    told: list[WatchEvent] = []
+    monkeypatch.setattr(service, "go_on", failing(DeviceError("device", "lost"), 2))
     run_watch(job, opening, told.append)
     assert len(told) == 1 and len(opened) == 2 and outputs(job) == ["a.h5"]
     drop("b.h5")
-    opened[:] = [1]
-    monkeypatch.setattr(service, "go_on", lambda *_: (_ for _ in ()).throw(DeviceError("device", "lost")))
-    with pytest.raises(DeviceError, match="no device"):
-        run_watch(job, opening, told.append)
-    assert outputs(job) == ["a.h5"]
+    full = OutputError("out", "no room")
+    for error, end in ((DeviceError("device", "lost"), "no device"), (full, "no room")):
+        opened[:] = [1]
+        monkeypatch.setattr(service, "go_on", failing(error, 9))
+        with pytest.raises(type(error), match=end):
+            run_watch(job, opening, told.append)
+        assert outputs(job) == ["a.h5"]
 
 
-def test_a_full_disk_is_no_fault_of_a_scan(job, drop, rt, monkeypatch) -> None:
-    drop("a.h5")
-    monkeypatch.setattr(
-        service, "go_on", lambda *_: (_ for _ in ()).throw(OutputError("out", "no room left"))
-    )
-    with pytest.raises(OutputError, match="no room left"):
-        watched(job, rt)
-    assert outputs(job) == []
-
-
-def test_folders_and_locks_are_checked_first(job, rt, tmp_path, capsys) -> None:
+def test_folders_and_locks_are_checked_first(job, rt, refused, tmp_path) -> None:
     with pytest.raises(InputError, match="no folder"):
-        watched(WatchJob(tmp_path / "none", job.output, job.template, once=True), rt)
+        watched(replace(job, folder=tmp_path / "none"), rt)
     with pytest.raises(InputError, match="the watched folder itself"):
-        watched(WatchJob(job.folder, job.folder, job.template, once=True), rt)
+        watched(replace(job, output=job.folder), rt)
     job.output.mkdir()
     with only_run(job.output / "watch"), pytest.raises(BusyError, match="another run"):
         watched(job, rt)
-    assert load_cli().run(["watch", str(job.folder), "-o", str(job.output), "--poll-s", "0"]) == 2
-    assert "--poll-s" in capsys.readouterr().err
+    refused(["watch", job.folder, "-o", job.output, "--poll-s", "0"], "--poll-s")
 
 
 def test_a_folder_that_is_away_for_a_while_is_waited_for(job, drop, rt, monkeypatch, caplog) -> None:
@@ -218,39 +197,105 @@ def test_a_folder_that_is_away_for_a_while_is_waited_for(job, drop, rt, monkeypa
 
     monkeypatch.setattr(service.Arrivals, "look", away)
     with pytest.raises(KeyboardInterrupt):
-        run_watch(WatchJob(job.folder, job.output, job.template, 0.01, 0.0), lambda: rt, stop)
+        run_watch(replace(job, once=False), lambda: rt, stop)
     assert caplog.text.count("cannot be read") == 1 and outputs(job) == ["a.h5"]
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_keeps_a_checkpoint_that_the_next_start_goes_on_from(job, drop, number, status) -> None:
     drop("long.h5")
-    start = [sys.executable, "-m", "phyradgs_cl", "watch", str(job.folder), "-o", str(job.output)]
-    options = [
-        "--method",
-        "sirt",
-        "--iterations",
-        "1000000",
-        "--poll-s",
-        "0.05",
-        "--checkpoint-every",
-        "0.01",
-    ]
-    process = subprocess.Popen([*start, *options], stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "phyradgs_cl", "watch", str(job.folder), "-o", str(job.output)]
+    command += ["--method", "sirt", "--iterations", "1000000"]
+    command += ["--poll-s", "0.05", "--checkpoint-every", "0.01"]
     checkpoint = job.output / ".work" / "long.h5.checkpoint.npz"
-    deadline = time.monotonic() + 60
-    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
+
+    def version() -> int:
+        return checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0
+
+    def started_until_a_new_checkpoint() -> subprocess.Popen:
+        before, deadline = version(), time.monotonic() + 60
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        while version() == before and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        return process
+
+    process = started_until_a_new_checkpoint()
     process.send_signal(number)
     _, said = process.communicate(timeout=60)
     assert process.returncode == status
     assert said.splitlines()[-1].startswith("phyradgs: interrupted: finished volumes are in")
     assert outputs(job) == [] and checkpoint.exists()
     assert [path.name for path in job.output.iterdir()] == [".work"]  # no lock is left
-    again = subprocess.Popen([*start, *options], stderr=subprocess.DEVNULL)
-    before = checkpoint.stat().st_mtime_ns
-    while checkpoint.stat().st_mtime_ns == before and time.monotonic() < deadline + 60:
-        time.sleep(0.02)
+    again = started_until_a_new_checkpoint()
     again.kill()
-    again.wait()
+    again.communicate()
     assert not list(checkpoint.parent.glob("*.bak"))  # it was gone on from, not set aside
+
+
+# --- when a file is complete: it stood still long enough, or was renamed into place -----------------------------------
+
+
+@pytest.fixture
+def now() -> list[float]:
+    return [0.0]
+
+
+@pytest.fixture
+def arrivals(tmp_path: Path, now: list[float]) -> Arrivals:
+    return Arrivals(tmp_path, 5.0, lambda: now[0])
+
+
+def names(arrivals: Arrivals) -> list[str]:
+    return [arrival.path.name for arrival in arrivals.look()]
+
+
+def test_a_file_that_is_written_waits_until_it_stands_still(arrivals, now, tmp_path) -> None:
+    path = tmp_path / "scan.h5"
+    for second in range(0, 20, 4):  # it grows
+        with open(path, "ab") as file:
+            file.write(b"x")
+        now[0] = second
+        assert names(arrivals) == []
+    now[0] = 20.9
+    assert names(arrivals) == []
+    now[0] = 21.0
+    assert names(arrivals) == ["scan.h5"]
+    time.sleep(0.02)  # the clock of files ticks some hundred times per second
+    path.write_bytes(b"y" * 5)  # of the same size
+    assert names(arrivals) == []
+
+
+def test_a_file_renamed_into_place_is_complete_at_once(arrivals, tmp_path) -> None:
+    part = tmp_path / ".scan.h5.part"
+    part.write_bytes(b"whole")
+    assert names(arrivals) == []
+    time.sleep(0.02)
+    part.rename(tmp_path / "scan.h5")
+    assert names(arrivals) == ["scan.h5"]
+    (tmp_path / "copy.h5").write_bytes(b"whole")
+    os.utime(tmp_path / "copy.h5", ns=(10**18, 10**18))  # a copy that keeps its times
+    assert names(arrivals) == ["copy.h5", "scan.h5"]
+
+
+def test_only_regular_files_with_the_suffix_are_scans_and_the_oldest_comes_first(arrivals, tmp_path) -> None:
+    for age, name in enumerate(("b.h5", "a.h5", "notes.txt", ".hidden.h5", "c.h5.part")):
+        (tmp_path / name).write_bytes(b"x")
+        os.utime(tmp_path / name, (1000 + age, 1000 + age))
+    (tmp_path / "folder.h5").mkdir()
+    os.mkfifo(tmp_path / "pipe.h5")
+    (tmp_path / "nowhere.h5").symlink_to(tmp_path / "none")
+    (tmp_path / "empty.h5").touch()
+    os.utime(tmp_path / "empty.h5", (1, 1))
+    assert names(arrivals) == ["b.h5", "a.h5"]
+
+
+def test_an_arrival_knows_whether_it_is_still_the_file(arrivals, tmp_path) -> None:
+    path = tmp_path / "scan.h5"
+    path.write_bytes(b"whole")
+    os.utime(path, (1, 1))
+    (arrival,) = arrivals.look()
+    assert arrival.is_unchanged()
+    os.utime(path, (2, 2))
+    assert not arrival.is_unchanged()
+    path.unlink()
+    assert not arrival.is_unchanged()

@@ -67,15 +67,8 @@ def start(tmp_path: Path):
     started: list[subprocess.Popen] = []
 
     def starting(*more: str) -> subprocess.Popen:
-        command = [
-            sys.executable,
-            "-m",
-            "phyradgs_cl",
-            "watch",
-            str(tmp_path / "in"),
-            "-o",
-            str(tmp_path / "out"),
-        ]
+        folders = [str(tmp_path / "in"), "-o", str(tmp_path / "out")]
+        command = [sys.executable, "-m", "phyradgs_cl", "watch", *folders]
         pace = ["--poll-s", "0.05", "--settle-s", "0.4", "--checkpoint-every", "0.01"]
         with open(tmp_path / "log.txt", "a") as log:
             started.append(subprocess.Popen([*command, *METHOD, *pace, *more], stdout=log, stderr=log))

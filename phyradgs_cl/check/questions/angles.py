@@ -1,7 +1,5 @@
 """Are the views spread over the turn?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -16,10 +14,8 @@ _QUESTION = "angles"
 
 
 def check_angles(scan: Scan) -> Finding:
-    """The largest gap between neighbouring views, against three times the usual one; a short scan may leave its own gap.
-
-    Views that cover half a turn and the fan (or more) leave one gap that is no fault; less is one whatever the steps.
-    """
+    """The largest gap between neighbouring views, against three times the usual one. Views that cover half a turn and
+    the fan (or more) leave one gap that is no fault; less is one whatever the steps."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
     poses = np.stack([scan.trajectory.pose(f, middle_s[f : f + 1])[0] for f in range(scan.frames)])
     angles_rad = np.sort(azimuth_rad(poses) % (2 * np.pi))
@@ -27,10 +23,8 @@ def check_angles(scan: Scan) -> Finding:
     apart_deg = gaps_deg[gaps_deg > math.degrees(_SAME_RAD)]
     if apart_deg.size < 3:
         count = max(apart_deg.size, 1)
-        text, advice = (
-            f"{count} different angle{'s' if count > 1 else ''}",
-            "check rotation_angle and its unit (degrees)",
-        )
+        text = f"{count} different angle{'s' if count > 1 else ''}"
+        advice = "check rotation_angle and its unit (degrees)"
         return Finding(_QUESTION, SUSPICIOUS, float(apart_deg.size), 3.0, "angles", text, advice)
     usual_deg = float(np.median(apart_deg))
     widest = np.sort(apart_deg)[::-1]
@@ -51,9 +45,8 @@ def check_angles(scan: Scan) -> Finding:
 def _half_fan_deg(scan: Scan) -> float:
     """Half the fan that the reconstruction's box takes, no more than the panel sees."""
     geometry = scan.geometry
-    seen = math.atan2(
-        geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm
-    )
+    half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
+    seen = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2
     taken = math.asin(min(1.0, radius_mm / geometry.source_to_axis_mm))
     return math.degrees(min(seen, taken))

@@ -1,7 +1,5 @@
 """Do the frames fit together under what the file says of their order, angles and geometry?"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +11,7 @@ from phyradgs_cl.check.coarse import some_frames
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.frames import alike, odd_ones
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
-from phyradgs_cl.check.questions.timing import azimuth_rad, wrapped
+from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped
 from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
 from phyradgs_cl.check.statistics import t_statistic
 from phyradgs_cl.check.variants import Path, path_of, reversed_rotation, shifted, stretched, turned, with_path
@@ -34,10 +32,8 @@ CONSISTENCY = "consistency"
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The finding; the frames (indices) that fit together; whether other questions can be asked of them.
-
-    sees_angles: whether an object can be told from itself turned.
-    """
+    """The finding; the frames (indices) that fit together; whether other questions can be asked of them; sees_angles:
+    whether an object can be told from itself turned."""
 
     finding: Finding
     kept: np.ndarray
@@ -55,13 +51,12 @@ class Cause:
 
 
 def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
-    """The residual of a coarse ``scan``, over that of its frames in a random order; and whatever explains them far better.
-
-    A wrong sign of rotation or a shifted panel has a question of its own: the best of these is what other causes, an
-    order or step of angles or a size of pixels, have to halve. Frames that stand out of the rest are left out first.
-    """
+    """The residual of a coarse ``scan``, over that of its frames in a random order; and whatever explains them far
+    better. Rotation and shift have questions of their own: the best of these is what other causes (an order or step of
+    angles, a size of pixels) have to halve. Frames that stand out are left out first."""
     everything = np.arange(scan.frames)
-    if scan.frames < _FEWEST_FRAMES or _pixels(scan) < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
+    pixels = float(scan.valid.sum()) / scan.frames
+    if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
         return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
     kept, notes = _without_odd(scan)
@@ -70,7 +65,10 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
     left, part, stated, more = _without_outliers(rt, part, stated)
     kept, unshifted, notes = kept[left], some_frames(unshifted, left), notes + more
     spread = float(np.asarray(part.projections, np.float64).var()) * part.frames
-    random = _random_order(rt, part)
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(part.frames) for _ in range(_DRAWS)]
+    shuffled = (replace(part, projections=part.projections[order]) for order in orders)
+    random = float(np.mean([fitted(rt, draw).sum() for draw in shuffled]))
     share = float(np.sqrt(stated.total / max(random, 1e-30)))
     sees_angles = share * _SYMMETRIC < 1 or random > _SAME**2 * spread
     text = f"residual {share:.2g} of that of the frames in a random order"
@@ -90,12 +88,6 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
         return Consistency(_finding(SUSPICIOUS, share, "; ".join([*notes, text]), advice), kept, False, True)
     finding = _finding(SUSPICIOUS if notes else OK, share, "; ".join([*notes, text]), _about(notes))
     return Consistency(finding, kept, True, True)
-
-
-def _pixels(scan: Scan) -> float:
-    """How many pixels of a frame may be used, on average."""
-    pixels = scan.projections[0].size
-    return pixels if scan.pixel_mask is None else float((np.asarray(scan.pixel_mask) == 0).mean()) * pixels
 
 
 def _finding(verdict: str, share: float, text: str, advice: str) -> Finding:
@@ -137,9 +129,7 @@ def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan]:
 
 def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Scan, Fit, list[str]]:
     """(frames (indices) without those whose residual is far above the others', the scan of them, its fit, what to say).
-
-    The worst goes first; where one in five would go, it is not a few frames but something that all share.
-    """
+    The worst goes first; where one in five would go, it is something that all share."""
     everything = left = np.arange(scan.frames)
     current = stated
     out: list[int] = []
@@ -156,22 +146,12 @@ def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray,
     part = some_frames(scan, left)
     names = [_number(scan, f) for f in out]
     note = f"frame{'s' if len(out) > 1 else ''} {', '.join(map(str, sorted(names)))} (from 0) do not fit the others"
-    if len(out) == 2 and _fit_exchanged(rt, scan, out, stated):
+    order = np.arange(scan.frames)
+    order[out] = order[out[::-1]]
+    exchanged = replace(scan, projections=scan.projections[order])
+    if len(out) == 2 and fitted(rt, exchanged).sum() < _CLEAR * stated.total:
         note = f"frames {min(names)} and {max(names)} (from 0) fit if their order is exchanged"
     return left, part, current, [note]
-
-
-def _fit_exchanged(rt: Runtime, scan: Scan, pair: list[int], stated: Fit) -> bool:
-    order = np.arange(scan.frames)
-    order[pair] = order[pair[::-1]]
-    return fitted(rt, replace(scan, projections=scan.projections[order])).sum() < _CLEAR * stated.total
-
-
-def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Squared residual of the frames in orders that mean nothing."""
-    rng = np.random.default_rng(0)
-    orders = [rng.permutation(scan.frames) for _ in range(_DRAWS)]
-    return float(np.mean([fitted(rt, replace(scan, projections=scan.projections[o])).sum() for o in orders]))
 
 
 def _cause(rt: Runtime, scan: Scan, stated: Fit, most: float, looks_closely: bool) -> Cause | None:
@@ -218,8 +198,8 @@ def _azimuths(scan: Scan) -> np.ndarray:
         numbers = np.arange(scan.frames) if path.frames is None else path.frames
         at = [float(base.angle_rad(int(n), np.array([scan.frame_start_s[f]]))[0]) for f, n in enumerate(numbers)]
         return np.array(at) - at[0]
-    pose = np.concatenate([scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)])
-    return np.unwrap(azimuth_rad(pose)) - azimuth_rad(pose[:1])
+    angles = start_azimuths_rad(scan)
+    return np.unwrap(angles) - angles[:1]
 
 
 def _arcs(scan: Scan) -> Iterator[Cause]:

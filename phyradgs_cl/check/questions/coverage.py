@@ -1,7 +1,5 @@
 """Does the detector cover the object?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -24,16 +22,15 @@ _QUESTION = "coverage"
 def check_coverage(scan: Scan) -> Finding:
     """What the panel's side columns see, against a tenth of the largest line integral.
 
-    A border counts as touched where the mean over a few neighbouring rows of its two outermost columns is above the
-    threshold and above the noise, in a tenth of the frames. A displaced panel may cut the object on its short side.
-    Rows are not asked: objects longer than the panel are the rule. Frames in which nothing rises above the noise have no
-    object, or another sign; line integrals beyond 30 are something else.
+    A border counts as touched where the mean over a few rows of its two outermost columns is above threshold and noise in a
+    tenth of the frames; a displaced panel may cut the object on its short side, and rows are not asked. Frames in which
+    nothing rises above the noise have no object, or another sign; line integrals beyond 30 are something else.
     """
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")
-    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, p.shape)
-    largest = float(np.percentile(p if valid is None else p[valid], 99.9))
+    valid = scan.valid
+    largest = float(np.percentile(p[valid], 99.9))
     noise = _NOISES * noise_level(p, valid)
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
@@ -49,7 +46,7 @@ def check_coverage(scan: Scan) -> Finding:
         advice = "are these counts, or transmission? Say which: import --quantity, or quantity of the data"
         return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, OPAQUE, text, advice)
     threshold = max(_LARGEST_SHARE * largest, noise)
-    least = float(np.percentile(p if valid is None else p[valid], 100 * _BRIGHT))
+    least = float(np.percentile(p[valid], 100 * _BRIGHT))
     if least < -threshold:
         text = f"line integrals go down to {least:.3g}: pixels are brighter than the flats"
         advice = "are the flats those of this scan, at its exposure and beam? Without flats: is the flat value right?"
@@ -68,10 +65,10 @@ def check_coverage(scan: Scan) -> Finding:
     return Finding(_QUESTION, SUSPICIOUS, level, threshold, "line integral", text, advice)
 
 
-def _border(p: np.ndarray, valid: np.ndarray | None, columns: slice) -> float:
+def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
     """The largest mean over eight rows of the border's columns, in the frame at the 90th percentile."""
     edge = p[:, :, columns]
-    weight = np.ones(edge.shape) if valid is None else valid[:, :, columns].astype(float)
+    weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)
     starts = np.arange(0, edge.shape[1], rows)
     total = np.add.reduceat((edge * weight).sum(2), starts, axis=1)

@@ -1,7 +1,5 @@
 """Are there pixels that say the same in every frame, or always something other than their neighbours?"""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 
@@ -24,16 +22,15 @@ _QUESTION = "dead pixels"
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     """The share of pixels that are dead and not masked, against 0.02 %; and where they are (v, u) bool.
 
-    Dead is a pixel that never changes while those around it do, or one that lies beyond all its neighbours in 70 % of the
-    frames, its median distance from the median of 3 × 3 pixels being more than ten of the panel's usual deviations. Near the
-    axis, where small parts of the object stand still on the panel, it has to be sharper than these.
+    Dead is a pixel that never changes while those around it do, or one beyond all its neighbours in 70 % of the frames, more
+    than ten of the panel's usual deviations from the median of 3 × 3 pixels; near the axis, where small parts of the object
+    stand still on the panel, it has to be sharper than these.
     """
-    known = _masked(scan)
+    known = ~scan.valid.any(0)
     if scan.frames < _LEAST_FRAMES:
         text = f"fewer than {_LEAST_FRAMES} frames"
-        return Finding(_QUESTION, CANNOT_TELL, 0.0, _SHARE, "share of pixels", text), np.zeros(
-            known.shape, bool
-        )
+        finding = Finding(_QUESTION, CANNOT_TELL, 0.0, _SHARE, "share of pixels", text)
+        return finding, np.zeros(known.shape, bool)
     chosen = np.unique(np.linspace(0, scan.frames - 1, _MOST_FRAMES).round().astype(int))
     frames = np.asarray(scan.projections)[chosen]
     apart = _apart(frames) & ~(_shared(frames) & _near_axis(scan))
@@ -49,14 +46,6 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     return Finding(_QUESTION, SUSPICIOUS, share, _SHARE, "share of pixels", text, advice), dead
 
 
-def _masked(scan: Scan) -> np.ndarray:
-    """Pixels (v, u) that are masked in every frame."""
-    if scan.pixel_mask is None:
-        return np.zeros(scan.geometry.detector_shape, bool)
-    mask = np.asarray(scan.pixel_mask) != 0
-    return mask if mask.ndim == 2 else mask.all(0)
-
-
 def _constant(frames: np.ndarray) -> np.ndarray:
     """Pixels that never change while those around them do; air without noise never changes either, and is no fault."""
     swing = np.ptp(frames, axis=0)
@@ -64,16 +53,11 @@ def _constant(frames: np.ndarray) -> np.ndarray:
     sides = np.zeros_like(constant)
     sides[:, [0, -1]] = constant[:, [0, -1]]
     if sides[:, [0, -1]].mean() > _STILL_SIDES:
-        air = constant & _as_air(frames[0], sides)
+        level = float(np.median(frames[0][sides]))  # and what flats leave of a pattern about it
+        pattern = _NORMAL_MAD * float(np.median(np.abs(frames[0][sides] - level)))
+        air = constant & (np.abs(frames[0] - level) <= _DEVIATIONS * pattern)
         constant = constant & ~scipy.ndimage.binary_propagation(sides, _AROUND, mask=air)
     return constant & (scipy.ndimage.median_filter(swing, size=3) > 0)
-
-
-def _as_air(frame: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Pixels (v, u) of a frame whose value is one of those at the sides, give or take what flats leave of a pattern."""
-    air = float(np.median(frame[sides]))
-    pattern = _NORMAL_MAD * float(np.median(np.abs(frame[sides] - air)))
-    return np.abs(frame - air) <= _DEVIATIONS * pattern
 
 
 def _apart(frames: np.ndarray) -> np.ndarray:

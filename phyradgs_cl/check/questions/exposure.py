@@ -1,7 +1,5 @@
 """Is the exposure as long as it is said to be?"""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
@@ -21,9 +19,8 @@ EXPOSURE = "exposure"
 def check_exposure(rt: Runtime, scan: Scan) -> Finding:
     """The stated exposure of a coarse ``scan`` against half of it and twice, by the squared residuals.
 
-    A steady turn blurs every frame alike, which an object that is blurred itself explains as well: only detail as fine as
-    the arc tells. A sharper model fits a little better by itself, so that half the exposure has to leave 40 % less; it is
-    ``ok`` where both half and twice fit worse.
+    Only detail as fine as the arc tells a steady blur from a blurred object. A sharper model fits a little better by itself,
+    so half the exposure has to leave 40 % less; it is ``ok`` where both half and twice fit worse.
     """
     if not scan.is_fly:
         text = "a gantry that turns while it exposes would leave a blurred object, and fit as well"

@@ -1,14 +1,12 @@
 """Does the gain of source or detector change over the scan?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.questions.timing import azimuth_rad
+from phyradgs_cl.check.questions.timing import start_azimuths_rad
 from phyradgs_cl.check.residual import fit, system_of
 from phyradgs_cl.runtime import Runtime
 
@@ -19,16 +17,12 @@ GAIN = "gain drift"
 
 
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
-    """The change of gain that the levels of the frames (line integrals that are the same in all pixels) give.
-
-    A ramp and the largest step are fitted beside what turns with the gantry, which an object beyond the panel does too. More
-    than 1.5 % and five standard deviations is suspicious.
-    """
+    """The change of gain that the levels of the frames (line integrals that are the same in all pixels) give: a ramp
+    and the largest step, beside what turns with the gantry. More than 1.5 % and five standard deviations is suspicious."""
     if scan.frames < _FEWEST:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST, "share", f"fewer than {_FEWEST} frames")
     level = fit(system_of(rt, scan)).level
-    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
-    angle = azimuth_rad(np.concatenate(starts))
+    angle = start_azimuths_rad(scan)
     share = np.linspace(-0.5, 0.5, scan.frames)
     turning = np.stack([np.ones(scan.frames), np.cos(angle), np.sin(angle)], 1)
     frames = np.arange(scan.frames)

@@ -1,7 +1,5 @@
 """Where is the axis of rotation on the panel?"""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Are lines read in the order, along the axis and in the time that the file says?"""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 
@@ -27,11 +25,8 @@ READOUT = "sign of readout"
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:
-    """Reconstructions of a moderately coarse fly-scan with lines read as stated, and otherwise.
-
-    The wrong order of rows twists the object about the axis, which only the cone gives away; that of columns bends it, and
-    shows. The residuals differ frame by frame, and have to by four standard errors and a share.
-    """
+    """A moderately coarse fly-scan with lines read as stated, and otherwise. The wrong order of rows only twists the object,
+    which the cone gives away; that of columns bends it. Residuals have to differ by four standard errors and a share."""
     stated = fitted(rt, scan)
     others: dict[str, np.ndarray] = {}
     for name, variant in _others(scan).items():

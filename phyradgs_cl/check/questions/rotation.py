@@ -1,7 +1,5 @@
 """Does the gantry turn the way that the angles say?"""
 
-from __future__ import annotations
-
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.questions.offset import Offset
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
@@ -18,10 +16,8 @@ def is_clear(stated: Offset, other: Offset) -> bool:
 
 
 def check_rotation(stated: Offset, other: Offset) -> Finding:
-    """Coarse reconstructions with the angles as they are and turned round, each with its own best panel shift.
-
-    Four standard errors decide, and 20 % of the squared residual: a mirror image in a narrow fan fits as well.
-    """
+    """Coarse reconstructions with the angles as they are and turned round, each with its own best panel shift. Four
+    standard errors decide, and 20 % of the squared residual: a mirror image in a narrow fan fits as well."""
     errors, ratio = t_statistic(stated.residuals, other.residuals), residual_ratio(stated.residuals, other.residuals)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)

@@ -1,8 +1,6 @@
 """Are pixels at the end of the detector's range?"""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -22,14 +20,11 @@ _QUESTION = "saturation"
 
 @dataclass
 class CountReader:
-    """Turns stored frames into line integrals, as ``counts_to_attenuation`` does, and remembers what the counts say.
-
-    For ``read_scan``; ``at_ceiling`` is the share of the projections' pixels at ``ceiling``, the largest count that any
-    frame has, None where the file does not hold counts.
-    """
+    """``counts_to_attenuation`` for ``read_scan``, which remembers what the counts say: ``at_ceiling`` is the share of
+    the projections' pixels at ``ceiling``, the largest count of any frame; None of files without counts."""
 
     ceiling: float | None = None
-    at_ceiling: float = field(default=0.0)
+    at_ceiling: float = 0.0
 
     def __call__(
         self, data: np.ndarray, image_key: np.ndarray, quantity: str
@@ -42,19 +37,14 @@ class CountReader:
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
-    """The share of pixels that sit, with all their neighbours, at the same extreme value; 0.1 % is suspicious.
-
-    Noise that is cut off at 0 puts single pixels there, saturation whole areas. Areas of exactly 0 are
-    air in simulated scans, and saturation where the flats are saturated too: they cannot tell.
-    """
+    """The share of pixels that sit, with all their neighbours, at the same extreme value; 0.1 % is suspicious. Noise
+    cut off at 0 puts single pixels there, saturation whole areas; areas of exactly 0 may be air, and cannot tell."""
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _SHARE:
         return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
     if scan.saturation is not None and scan.saturation.share > _SHARE:
         return _clipped(scan.saturation, "lower the exposure; the import has masked these pixels, or taken them as air")
     p = np.asarray(scan.projections)
-    masked = (
-        np.zeros(p.shape, bool) if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask != 0, p.shape)
-    )
+    masked = ~scan.valid
     cliffs = _cliffs(p, masked)
     if cliffs > _CLIFFS:
         text = f"from a pixel to the next {100 * cliffs:.3g} % go from brightest to darkest"
@@ -99,10 +89,8 @@ def _cliffs(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """The share of pixels (F, v, u) that are at their own least value again and again: counts clipped before the flats.
-
-    Pixels that never change are dead, and line integrals of 0 are air in scans without noise.
-    """
+    """The share of pixels (F, v, u) at their own least value again and again: counts clipped before the flats. Pixels
+    that never change are dead, and line integrals of 0 are air in scans without noise."""
     least = p.min(0)
     at = (p == least) & ~masked & (np.abs(least) > _ZERO) & (p.max(0) > least)
     return clustered_share(at & (at.sum(0) >= _AGAIN))

@@ -1,7 +1,5 @@
 """Do exposure, readout and the frames' times fit each other and the angles?"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -16,30 +14,26 @@ _QUESTION = "timing"
 
 def check_timing(scan: Scan) -> Finding:
     """A line cannot open while it is open, nor a frame be read while the last one is, nor a gantry be at two angles.
-
-    The number is the worst of three shares: the exposure and the readout of the shortest time between frames (at most 1),
-    and one more than how far the angles between frames are from those that the speed within the frames gives.
-    """
+    The number is the worst of: exposure and readout over the shortest time between frames (at most 1), and one more
+    than how far the angles between frames are from those that the speed within the frames gives."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_QUESTION, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
     period_s = float(np.diff(starts_s).min())
     if period_s <= 0:
         advice = "correct frame_start_time; frames must follow each other"
-        return Finding(
-            _QUESTION, SUSPICIOUS, period_s, 0.0, "s", "frames that start before their predecessors", advice
-        )
+        text = "frames that start before their predecessors"
+        return Finding(_QUESTION, SUSPICIOUS, period_s, 0.0, "s", text, advice)
     if not scan.is_fly:
-        return Finding(
-            _QUESTION, OK, 0.0, 1.0, "share", "the gantry stands while it exposes: any timing fits"
-        )
+        return Finding(_QUESTION, OK, 0.0, 1.0, "share", "the gantry stands while it exposes: any timing fits")
     found = [
         _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
         found.append(_speed(scan, starts_s))  # tables say the same within frames and between them
-    return _worst(*found)
+    wrong = [f for f in found if f.verdict == SUSPICIOUS]
+    return wrong[0] if wrong else max(found, key=lambda f: f.value / f.threshold)
 
 
 def exposure_arc_rad(scan: Scan) -> float:
@@ -50,6 +44,12 @@ def exposure_arc_rad(scan: Scan) -> float:
     start_s = float(scan.frame_start_s[frame])
     ends = azimuth_rad(scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s])))
     return abs(float(wrapped(ends[1:] - ends[:1])[0]))
+
+
+def start_azimuths_rad(scan: Scan) -> np.ndarray:
+    """Angles (F,) about +z at which the source stands as each frame starts."""
+    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
+    return azimuth_rad(np.concatenate(starts))
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
@@ -86,11 +86,6 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
         "exposure time, frame_start_time or rotation_angle_end"
     )
     return Finding(_QUESTION, SUSPICIOUS, 1 + apart, 1 + _APART, "share", text, advice)
-
-
-def _worst(*findings: Finding) -> Finding:
-    wrong = [f for f in findings if f.verdict == SUSPICIOUS]
-    return wrong[0] if wrong else max(findings, key=lambda f: f.value / f.threshold)
 
 
 def wrapped(angle: np.ndarray | float) -> np.ndarray:

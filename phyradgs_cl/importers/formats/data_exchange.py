@@ -1,30 +1,19 @@
 """Data Exchange files (HDF5) of synchrotron beamlines: /exchange with data, data_white, data_dark and theta.
 
-The format describes parallel beams, so distances and pixel sizes usually come from the options. Angles are the
-sample's, in degrees unless a units attribute differs; row 0 is the top of the image.
+The format describes parallel beams: distances and pixel sizes usually come from the options. Angles are the sample's,
+in degrees unless units differ; row 0 is the top of the image.
 """
-
-from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
+from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.reading.hdf5_frames import (
-    distance_to_detector,
-    gantry_sign,
-    opened,
-    optional_length,
-    read_frames,
-    stored_pitch,
-)
 from phyradgs_cl.importers.scan_parts import checked, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import read_array, read_title
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.units import ANGLE, TIME
 
 _EXCHANGE = "/exchange"
@@ -35,39 +24,31 @@ _DETECTOR = f"{_INSTRUMENT}/detector"
 def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
     """The projections of /exchange, with its flats and darks."""
     options.refuse_unused("data-exchange", OF_BARE_FRAMES)
-    with opened(path) as source:
-        frames = read_frames(source, f"{_EXCHANGE}/data")
+    with open_hdf5(path) as source:
+        frames = hdf5_frames.read_frames(source, f"{_EXCHANGE}/data")
         panel = (frames.shape[1], frames.shape[2])
-        stacks = {name: _optional_frames(source, name, panel) for name in ("data_white", "data_dark")}
+        places = {name: f"{_EXCHANGE}/data_{name}" for name in ("white", "dark")}
+        there = {name: address for name, address in places.items() if source.find(address) is not None}
+        stacks = {name: hdf5_frames.read_frames(source, there[name], panel) for name in there}
         theta_rad = read_array(source, f"{_EXCHANGE}/theta", (len(frames),), ANGLE)
         geometry = _geometry(source, panel, options)
-        exposure_s = optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
+        exposure_s = hdf5_frames.optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
         title = read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
-    turned = {name: None if s is None else oriented(s, options, "top") for name, s in stacks.items()}
-    integrals = line_integrals(
-        f"{path}:{_EXCHANGE}/data",
-        oriented(frames, options, "top"),
-        options,
-        flats=turned["data_white"],
-        darks=turned["data_dark"],
-    )
-    trajectory = turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
+    turned = {name: oriented(stack, options, "top") for name, stack in stacks.items()}
+    culprit, flats, darks = f"{path}:{_EXCHANGE}/data", turned.get("white"), turned.get("dark")
+    integrals = line_integrals(culprit, oriented(frames, options, "top"), options, flats=flats, darks=darks)
+    trajectory = turning(geometry, hdf5_frames.gantry_sign(options, "sample") * theta_rad, timing)
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
-def _optional_frames(source: Hdf5Source, name: str, panel: tuple[int, int]) -> np.ndarray | None:
-    address = f"{_EXCHANGE}/{name}"
-    return None if source.find(address) is None else read_frames(source, address, panel)
-
-
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:
-    """Distances and pitches: the options, else the instrument's group where it has them."""
-    to_axis = options.source_to_axis_mm or optional_length(source, f"{_INSTRUMENT}/source/distance")
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(f"{_INSTRUMENT}/source/distance"))
-    to_detector = distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
+    where = f"{_INSTRUMENT}/source/distance"
+    to_axis = options.source_to_axis_mm or hdf5_frames.optional_length(source, where)
+    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
+    to_detector = hdf5_frames.distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
     pitch = options.pixel_size_mm or (
-        stored_pitch(source, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
-        stored_pitch(source, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
+        hdf5_frames.stored_pitch(source, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
+        hdf5_frames.stored_pitch(source, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
     )
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, options.detector_offset_mm or (0.0, 0.0)))

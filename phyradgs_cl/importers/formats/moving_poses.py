@@ -1,13 +1,12 @@
 """Poses that no circle describes: tables of them over time, row 0 the lowest, with a plain geometry to go by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition import ConeGeometry, PoseTable
+from phyradgs_cl.acquisition import PoseTable
+from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.importers.timing import Timing
 
 _SLACK = 1e-6  # of a span: how far a table runs beyond the times that are asked for
@@ -44,32 +43,13 @@ def turn_of(pose: np.ndarray) -> Turned:
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
 
 
-def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
-    """The circular geometry nearest to poses (F, 12), by mean distances and offsets; sizes are taken from it.
-
-    The detector's distance is that of its plane, its offset that of its middle from the source's foot on the plane.
-    """
-    source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
-    pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
-    u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
-    centre = first + (panel[1] - 1) / 2 * step_u + (panel[0] - 1) / 2 * step_v
-    normal = np.cross(u_hat, v_hat)
-    ray = centre - source
-    offset_v, offset_u, away = (np.einsum("ij,ij->i", ray, axis) for axis in (v_hat, u_hat, normal))
-    to_axis = np.linalg.norm(source[:, :2], axis=1)
-    means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
-    return ConeGeometry(means[0], means[1], panel, (means[2], means[3]), (means[4], means[5]))
-
-
 def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, culprit: str) -> PoseTable:
-    """A pose table that covers every frame's window.
-
-    ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to frame 3, and beyond the
-    ends it goes on as it went. A gantry at rest gets a table whose value at each frame's middle is that frame's pose.
-    """
+    """A pose table that covers every frame's window. ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5 is
+    halfway from frame 2 to 3; a gantry at rest has each frame's pose at its middle."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
-        return _standing(pose_at, timing, at_s, culprit)
+        poses = pose_at(np.arange(len(at_s), dtype=np.float64))
+        return resting_poses(poses, at_s, timing.shutter.span_s, f"{culprit} poses")
     at_s = timing.angle_time_s
     span_s = timing.shutter.span_s
     before, after = at_s[0] - timing.start_s[0] + _SLACK * span_s, timing.start_s[-1] + span_s - at_s[-1]
@@ -82,13 +62,3 @@ def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing,
         [len(at_s) - 1 + (last - at_s[-1]) / (at_s[-1] - at_s[-2])],
     ])  # fmt: skip
     return PoseTable(time_s, pose_at(position), f"{culprit} poses")
-
-
-def _standing(
-    pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, at_s: np.ndarray, culprit: str
-) -> PoseTable:
-    """Each frame's pose held from its opening to its closing, so that nothing moves inside a window."""
-    frames = np.arange(len(at_s))
-    half_s = max(timing.shutter.span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
-    time_s = np.stack([at_s - half_s, at_s + half_s], -1).ravel()
-    return PoseTable(time_s, np.repeat(pose_at(frames.astype(np.float64)), 2, axis=0), f"{culprit} poses")

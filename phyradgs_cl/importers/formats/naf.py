@@ -1,9 +1,4 @@
-"""Pickles of NAF and SAX-NeRF: one dictionary with geometry, projections and the true volume.
-
-Lengths are in mm, densities in 1/m and projections in density × metre: dimensionless line integrals.
-"""
-
-from __future__ import annotations
+"""Pickles of NAF and SAX-NeRF: a dictionary of geometry (mm), projections (dimensionless) and true volume (1/m)."""
 
 from pathlib import Path
 
@@ -11,7 +6,6 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import tigre_frame
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
@@ -53,7 +47,6 @@ def import_naf(path: Path, options: ImportOptions) -> Scan:
 
 
 def _frames(data: Fields, parts: tuple[str, ...], panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Projections (F, v, u) as stored and their angles (F,)."""
     stacks, angles = [], []
     for part in parts:
         table = data.table(part)
@@ -68,7 +61,7 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
     values = table.get(key)
     if not isinstance(values, np.ndarray) or values.ndim != ndim or values.dtype.kind not in "iuf":
         found = f"shape {values.shape}" if isinstance(values, np.ndarray) else described(values)
-        raise InputError(table.name(key), found, f"an array of numbers with {ndim} axes")
+        raise table.error(key, found, f"an array of numbers with {ndim} axes")
     if 0 in values.shape:
-        raise InputError(table.name(key), f"shape {values.shape}", "no empty axis")
+        raise table.error(key, f"shape {values.shape}", "no empty axis")
     return np.asarray(values)

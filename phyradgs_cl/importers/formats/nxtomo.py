@@ -1,11 +1,8 @@
 """NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from options.
 
-The format does not say which row is on top. Row 0 is taken as the lowest, as that reader takes it, and this is said;
-flips that the file declares, in either of the ways in which the nxtomo package has written them, are undone first. The
-rotation axis's column becomes a detector offset.
+The format does not say which row is on top: row 0 is taken as the lowest, and this is said, after flips that the file
+declares in either of the nxtomo package's ways. The rotation axis's column becomes a detector offset.
 """
-
-from __future__ import annotations
 
 import logging
 from dataclasses import replace
@@ -14,28 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.moving_poses import Turned
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed, option_name
+from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.reading.hdf5_frames import (
-    distance_to_detector,
-    gantry_sign,
-    opened,
-    read_frames,
-    stored_pitch,
-)
 from phyradgs_cl.importers.scan_parts import checked, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
-from phyradgs_cl.io.hdf5.datasets import (
-    read_array,
-    read_attribute,
-    read_integers,
-    read_number,
-    read_title,
-    read_values,
-)
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5 import datasets as h5
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.detector import read_duration
@@ -49,83 +32,69 @@ _MOVES = ("x_translation", "y_translation", "z_translation")
 def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     """The projections of the file's NXtomo entry, with its flats and darks."""
     options.refuse_unused("nxtomo", OF_BARE_FRAMES)
-    with opened(path) as source:
+    with open_hdf5(path) as source:
         entry = find_entry(source)
-        _refuse_ours(source, entry)
+        if source.find(ours := f"{entry}/{schema.EXTRA}") is not None:  # it has more to say than an import keeps
+            found, expected = "a scan file of this package", "a file of another program"
+            raise source.error(ours, found, expected, "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
-        frames = read_frames(source, f"{detector}/data")
+        frames = hdf5_frames.read_frames(source, f"{detector}/data")
         key = _image_key(source, detector, len(frames))
         used = key == schema.PROJECTION
         turn = _turned(source, detector)
         mask = _mask(source, detector, frames.shape, used)
         geometry = _geometry(source, entry, (frames.shape[1], frames.shape[2]), turn, options)
         timing, trajectory = _motion(source, entry, used, geometry, options)
-        quantity = read_attribute(source, f"{detector}/data", "quantity")
+        quantity = h5.read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, used)
-        title = read_title(source, f"{entry}/title", path.stem)
+        title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
         _log.warning(text, path, option_name("row_0"))
     frames = oriented(turn.frames(frames), options, "bottom")
-    integrals = line_integrals(
-        f"{path}:{detector}/data",
-        frames[used],
-        options,
-        flats=frames[key == schema.FLAT],
-        darks=frames[key == schema.DARK],
-        custom=quantity,
-    )
+    flats, darks = (frames[key == kind] for kind in (schema.FLAT, schema.DARK))
+    where = f"{path}:{detector}/data"
+    integrals = line_integrals(where, frames[used], options, flats=flats, darks=darks, custom=quantity)
     if mask is not None:
         mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
-def _refuse_ours(source: Hdf5Source, entry: str) -> None:
-    """A scan of this package has more to say than an import would keep."""
-    if source.find(f"{entry}/{schema.EXTRA}") is not None:
-        found, expected = "a scan file of this package", "a file of another program"
-        raise InputError(source.name(f"{entry}/{schema.EXTRA}"), found, expected, "use it as it is")
-
-
 def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
-    """What every frame is (F,); all projections where the file does not say."""
     for name in ("image_key", "image_key_control"):
         if source.find(f"{detector}/{name}") is not None:
-            key = read_integers(source, f"{detector}/{name}", (frames,))
+            key = h5.read_integers(source, f"{detector}/{name}", (frames,))
             key = np.where(key == -1, schema.INVALID, key)  # nxtomo's frames taken to check the alignment
             if not np.any(key == schema.PROJECTION):
-                raise InputError(source.name(f"{detector}/{name}"), "no projection", "at least one 0")
+                raise source.error(f"{detector}/{name}", "no projection", "at least one 0")
             return key
     return np.full(frames, schema.PROJECTION)
 
 
 def _turned(source: Hdf5Source, detector: str) -> Turned:
     """Flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
-    flips = [_flag(source, f"{detector}/{name}") for name in ("y_flipped", "x_flipped")]
+    flips = [False, False]
+    for index, address in enumerate((f"{detector}/y_flipped", f"{detector}/x_flipped")):
+        if source.find(address) is not None:
+            flips[index] = bool(np.any(h5.read_values(source, address, source.dataset(address), kinds="biu")))
     for index, name in enumerate(("rx", "ry")):
         address = f"{detector}/transformations/{name}"
         if source.find(address) is not None:
-            half_turns = read_number(source, address, ANGLE) / np.pi
+            half_turns = h5.read_number(source, address, ANGLE) / np.pi
             if abs(half_turns - round(half_turns)) > 1e-6:
-                raise InputError(source.name(address), f"{half_turns * 180:g}°", "0° or 180°: a flip")
+                raise source.error(address, f"{half_turns * 180:g}°", "0° or 180°: a flip")
             flips[index] ^= bool(round(half_turns) % 2)
     return Turned(rows=flips[0], columns=flips[1])
-
-
-def _flag(source: Hdf5Source, address: str) -> bool:
-    if source.find(address) is None:
-        return False
-    return bool(np.any(read_values(source, address, source.dataset(address), kinds="biu")))
 
 
 def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.ndarray) -> np.ndarray | None:
     address = f"{detector}/pixel_mask"
     if source.find(address) is None:
         return None
-    mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
+    mask = h5.read_values(source, address, source.dataset(address), kinds="biu") != 0
     if mask.shape not in (shape, shape[1:]):
-        raise InputError(source.name(address), f"shape {mask.shape}", f"{shape[1:]} or {shape}")
+        raise source.error(address, f"shape {mask.shape}", f"{shape[1:]} or {shape}")
     mask = mask if mask.ndim == 2 else mask[used]
     return mask if mask.any() else None
 
@@ -136,13 +105,12 @@ def _geometry(
     detector, where = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
     to_axis = options.source_to_axis_mm
     if to_axis is None and source.find(where) is not None:
-        to_axis = abs(read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
+        to_axis = abs(h5.read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
-    to_detector = distance_to_detector(source, f"{detector}/distance", to_axis, options)
-    pitch = options.pixel_size_mm or (
-        stored_pitch(source, f"{detector}/y_pixel_size"),
-        stored_pitch(source, f"{detector}/x_pixel_size"),
-    )
+    to_detector = hdf5_frames.distance_to_detector(source, f"{detector}/distance", to_axis, options)
+    v, u = f"{detector}/y_pixel_size", f"{detector}/x_pixel_size"
+    stored = hdf5_frames.stored_pitch
+    pitch = options.pixel_size_mm or (stored(source, v), stored(source, u))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
 
@@ -155,7 +123,7 @@ def _axis_offset(
         address = f"{detector}/{name}"
         if source.find(address) is None:
             continue
-        column = read_number(source, address)
+        column = h5.read_number(source, address)
         flipped = turn.columns != (options.column_0 == "right")
         if column != 0:
             _log.warning("%s: taken as %g columns from the panel's middle", source.name(address), column)
@@ -168,11 +136,11 @@ def _motion(
 ) -> tuple[Timing, CircularOrbit]:
     """Timing and orbit; a stored ``rotation_angle_end`` is each frame's own sweep, else angles follow each other."""
     detector, sample = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}"
-    sign = gantry_sign(options, read_attribute(source, f"{sample}/rotation_angle", "rotates") or "sample")
-    angle = sign * read_array(source, f"{sample}/rotation_angle", used.shape, ANGLE)[used]
+    rotates = h5.read_attribute(source, f"{sample}/rotation_angle", "rotates") or "sample"
+    sign = hdf5_frames.gantry_sign(options, rotates)
+    angle = sign * h5.read_array(source, f"{sample}/rotation_angle", used.shape, ANGLE)[used]
     sweeps = source.find(f"{sample}/rotation_angle_end") is not None and options.frame_time_s is None
-    starts = f"{detector}/frame_start_time"
-    start_s = read_array(source, starts, used.shape, TIME)[used] if sweeps else None
+    start_s = h5.read_array(source, f"{detector}/frame_start_time", used.shape, TIME)[used] if sweeps else None
     stored = StoredTiming(
         exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
         readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
@@ -181,10 +149,9 @@ def _motion(
     timing = make_timing(source.name(entry), int(used.sum()), options, stored)
     if not sweeps:
         return timing, turning(geometry, angle, timing)
-    last = sign * read_array(source, f"{sample}/rotation_angle_end", used.shape, ANGLE)[used]
-    return timing, CircularOrbit(
-        geometry, FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
-    )
+    last = sign * h5.read_array(source, f"{sample}/rotation_angle_end", used.shape, ANGLE)[used]
+    sweep = FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
+    return timing, CircularOrbit(geometry, sweep)
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
@@ -193,8 +160,8 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
         address = f"{entry}/{schema.SAMPLE}/{name}"
         if source.find(address) is None:
             continue
-        values = read_array(source, address, (None,), LENGTH)
+        values = h5.read_array(source, address, (None,), LENGTH)
         values = values[used] if values.shape == used.shape else values
         if np.ptp(values) > 0:
             found = f"{values.min():.6g} to {values.max():.6g} mm"
-            raise InputError(source.name(address), found, "a sample that stays where it is")
+            raise source.error(address, found, "a sample that stays where it is")

@@ -1,11 +1,9 @@
 """Real scans of PhyRadGS: a JSON of calibrated views with the arcs of their rolling shutter, and 16-bit TIFF frames.
 
 A view's ``detector`` is a 4×4 matrix from the panel to the world (mm): column 0 along the rows of the image, column 1
-down them, column 3 the panel's centre. The matrix holds where the panel stands on its circle; at other times of the
-frame it has turned about +z by as much as its angle. Rows are read one after the other, the first stored one first.
+down them, column 3 the panel's centre. It holds where the panel stands on its circle, else turned about +z by its
+angle. The first stored row is read first.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,13 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
+from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.formats.moving_poses import plain_geometry, turn_of
-from phyradgs_cl.importers.formats.phyradgs_synthetic import (
-    exposure_of_blurred_s,
-    readout_ratio,
-    start_times_s,
-)
+from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
+from phyradgs_cl.importers.formats.moving_poses import turn_of
 from phyradgs_cl.importers.options import ImportOptions, option_name
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_json
@@ -49,14 +44,14 @@ class Circle:
     angle_rad: np.ndarray
 
     @classmethod
-    def read(cls, common: Fields, views: list[Fields], body: str) -> Circle:
+    def read(cls, common: Fields, views: list[Fields], body: str) -> "Circle":
         """The circle of "source" or "detector"."""
         circle = common.table(body)
         tables = [view.table("rolling_shutter").table(body) for view in views]
         angles = np.deg2rad([[table.number(key) for key in _ANGLES] for table in tables])
         centre = circle.numbers("center")
         if len(centre) < 2:
-            raise InputError(circle.name("center"), f"{len(centre)} numbers", "x, y and perhaps z")
+            raise circle.error("center", f"{len(centre)} numbers", "x, y and perhaps z")
         z = np.array([table.number("z") for table in tables])
         return cls(centre[:2], circle.length("radius"), z, angles)
 
@@ -134,11 +129,11 @@ def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
 
 def _timing(culprit: str, detector: Circle, options: ImportOptions) -> Timing:
     """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
-    exposure_s = exposure_of_blurred_s(options)
+    exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
-    ratio = readout_ratio(culprit, closed - first, done - closed)
+    ratio = synthetic.readout_ratio(culprit, closed - first, done - closed)
     shutter = Shutter(exposure_s, ratio * exposure_s)
-    start_s = start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
+    start_s = synthetic.start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
     least_s = shutter.span_s * (1 + _GAP)
     steps_s = np.maximum(np.diff(start_s), least_s)
     return Timing(shutter, np.concatenate([[0.0], np.cumsum(steps_s)]), True)
@@ -180,12 +175,11 @@ def _view_poses(
 
 
 def _matrix(view: Fields) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and centre (3,) of a view's detector matrix."""
     rows = view.get("detector")
     if not isinstance(rows, list) or len(rows) != 4:
-        raise InputError(view.name("detector"), "no 4×4 matrix", "four rows of four numbers")
+        raise view.error("detector", "no 4×4 matrix", "four rows of four numbers")
     matrix = np.array([Fields(view.name("detector"), {"row": row}).numbers("row", 4) for row in rows])
     rotation = matrix[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
-        raise InputError(view.name("detector"), "columns that are not orthonormal", "a rotation and a centre")
+        raise view.error("detector", "columns that are not orthonormal", "a rotation and a centre")
     return rotation, matrix[:3, 3]

@@ -1,10 +1,7 @@
 """Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame where its first and last line began and ended.
 
-The arcs are all that the files say about time: the exposure takes ``exposure_s`` (1 s unless it is given), and the
-gantry turns at the speed that makes the exposure's arc of it.
+The exposure takes ``exposure_s`` (1 s unless given); the gantry turns at the speed that makes the exposure's arc of it.
 """
-
-from __future__ import annotations
 
 from pathlib import Path
 
@@ -14,7 +11,6 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.r2_gaussian import R2Folder, entries_of
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io.tables import Fields
 
@@ -32,26 +28,12 @@ def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
     marks = np.array([[entry.number(key) for key in _KEYS] for entry in entries])
     timing = timing_of_marks(opened.meta, marks, options)
     sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
-    grid, reference = opened.reference()
-    integrals = opened.projections(entries, options)
-    return put_together(
-        integrals,
-        CircularOrbit(opened.geometry, sweeps),
-        opened.geometry,
-        timing,
-        options,
-        title=path.resolve().name,
-        source=str(path),
-        grid=grid,
-        reference=reference,
-    )
+    return opened.scan(path, entries, CircularOrbit(opened.geometry, sweeps), timing, options)
 
 
 def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Timing from angles (F, 3): first line's start and end, last line's end.
-
-    The first stored line is read first: column 0, or with a readout along rows the one at the top.
-    """
+    """Timing from angles (F, 3): first line's start and end, last line's end. The first stored line is read first:
+    column 0, or with a readout along rows the one at the top."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(
         culprit.culprit, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]

@@ -1,14 +1,12 @@
 """Folders of R2-Gaussian: meta_data.json beside .npy projections and the true volume; taken at rest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -18,7 +16,7 @@ from phyradgs_cl.importers.reading.bounded import read_json, read_npy
 from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
 from phyradgs_cl.importers.scan_parts import put_together
-from phyradgs_cl.importers.timing import make_timing, turning
+from phyradgs_cl.importers.timing import Timing, make_timing, turning
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
@@ -35,7 +33,7 @@ class R2Folder:
     unit_mm: float
 
     @classmethod
-    def opened(cls, given: Path, usual: str, unit_mm: float) -> R2Folder:
+    def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
         """Read the description called ``usual`` of a folder, or the description that is given itself."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name
@@ -75,6 +73,15 @@ class R2Folder:
         volume = read_npy(path, 3)
         return grid, tigre_frame.turned_volume(str(path), volume, grid, 1 / self.unit_mm)
 
+    def scan(
+        self, path: Path, entries: list[Fields], orbit: CircularOrbit, timing: Timing, options: ImportOptions
+    ) -> Scan:
+        """The listed frames along ``orbit``, with the truth."""
+        grid, reference = self.reference()
+        integrals, title = self.projections(entries, options), path.resolve().name
+        found = {"title": title, "source": str(path), "grid": grid, "reference": reference}
+        return put_together(integrals, orbit, self.geometry, timing, options, **found)  # type: ignore[arg-type]
+
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
     """The frames of a part, "all" meaning train, then test."""
@@ -89,16 +96,4 @@ def import_r2(path: Path, options: ImportOptions) -> Scan:
     entries = entries_of(opened.meta, "proj_", options.part)
     angle_rad = np.array([entry.number("angle") for entry in entries])
     timing = make_timing(str(path), len(entries), options)
-    grid, reference = opened.reference()
-    integrals = opened.projections(entries, options)
-    return put_together(
-        integrals,
-        turning(opened.geometry, angle_rad, timing),
-        opened.geometry,
-        timing,
-        options,
-        title=path.resolve().name,
-        source=str(path),
-        grid=grid,
-        reference=reference,
-    )
+    return opened.scan(path, entries, turning(opened.geometry, angle_rad, timing), timing, options)

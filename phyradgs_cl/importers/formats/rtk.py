@@ -1,19 +1,19 @@
 """Scans of RTK: a geometry XML and a stack of projections as MetaImage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
+from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.formats.moving_poses import Turned, plain_geometry, table_over_time, turn_of
+from phyradgs_cl.importers.formats.moving_poses import Turned, table_over_time, turn_of
 from phyradgs_cl.importers.formats.rtk_xml import RtkGeometry, read_rtk_xml
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.frames import line_integrals
-from phyradgs_cl.importers.reading.meta_image import SUFFIXES, MetaStack, read_meta_stack
+from phyradgs_cl.importers.reading.meta_image import SUFFIXES, read_meta_stack
+from phyradgs_cl.importers.reading.voxels import Voxels
 from phyradgs_cl.importers.scan_parts import put_together
 from phyradgs_cl.importers.timing import Timing, make_timing, turning
 
@@ -27,25 +27,27 @@ def import_rtk(path: Path, options: ImportOptions) -> Scan:
     description = path if path.is_file() else folder.only("geometry", ".xml")
     stack_path = folder.only("stack of projections", *SUFFIXES)
     rtk, stack = read_rtk_xml(description), read_meta_stack(stack_path)
-    if len(stack.frames) != rtk.frames:
-        found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
+    if len(stack.values) != rtk.frames:
+        found = f"{len(stack.values)} frames, {rtk.frames} projections in {description.name}"
         raise InputError(str(stack_path), found, "one frame per projection")
     timing = make_timing(str(description), rtk.frames, options)
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
-    custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
-    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
+    custom = "attenuation" if stack.values.dtype.kind == "f" and options.flat_value is None else None
+    integrals = line_integrals(str(stack_path), turn.frames(stack.values), options, custom=custom)
     title = description.stem
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _trajectory(
-    rtk: RtkGeometry, stack: MetaStack, timing: Timing, culprit: str
+    rtk: RtkGeometry, stack: Voxels, timing: Timing, culprit: str
 ) -> tuple[CircularOrbit | PoseTable, ConeGeometry, Turned]:
     """A circular orbit where one describes the file, else a table of poses; and how images have to be turned."""
-    panel = (stack.frames.shape[1], stack.frames.shape[2])
+    panel = (stack.values.shape[1], stack.values.shape[2])
+    assert stack.steps_mm is not None and stack.origin_mm is not None  # every MetaImage has them
+    place = stack.origin_mm[:2], stack.steps_mm[0, :2], stack.steps_mm[1, :2]
 
     def stored(position: np.ndarray) -> np.ndarray:
-        return rtk.poses(position, stack.origin_mm, stack.step_u_mm, stack.step_v_mm)
+        return rtk.poses(position, *place)
 
     turn = turn_of(stored(np.zeros(1))[0])
 
@@ -54,6 +56,6 @@ def _trajectory(
 
     at_frames = poses(np.arange(rtk.frames, dtype=np.float64))
     geometry = plain_geometry(at_frames, panel)
-    if rtk.is_circular and stack.step_u_mm[1] == 0 and stack.step_v_mm[0] == 0:
+    if rtk.is_circular and stack.steps_mm[0, 1] == stack.steps_mm[1, 0] == 0:
         return turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
     return table_over_time(poses, timing, culprit), geometry, turn

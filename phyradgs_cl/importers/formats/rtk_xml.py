@@ -1,9 +1,7 @@
 """RTK's geometry files (RTKThreeDCircularGeometry, version 3): nine numbers per projection, and the poses they mean.
 
-No entity is declared, no external file is looked at. RTK's own files carry an empty DOCTYPE, the only one that passes.
+No entity is declared, no external file looked at: an empty DOCTYPE, as in RTK's own files, is the only one that passes.
 """
-
-from __future__ import annotations
 
 import math
 import re
@@ -39,29 +37,21 @@ class RtkGeometry:
 
     @property
     def frames(self) -> int:
-        """How many projections there are."""
         return len(self.values["GantryAngle"])
 
     @property
     def is_circular(self) -> bool:
         """Whether every projection stands on one untilted circle with one panel."""
-        still = all(np.ptp(self.values[name]) <= 1e-9 * (1 + np.abs(v).max()) for name, v in self.steady)
+        steady = [v for name, v in self.values.items() if name != "GantryAngle"]
+        still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)
         tilts = ("SourceOffsetX", "SourceOffsetY", "InPlaneAngle", "OutOfPlaneAngle")
         return still and all(np.all(self.values[name] == 0) for name in tilts)
-
-    @property
-    def steady(self) -> list[tuple[str, np.ndarray]]:
-        """Everything but the gantry's angle."""
-        return [(name, values) for name, values in self.values.items() if name != "GantryAngle"]
 
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Poses (T, 12) at frame positions (T,), numbers between and beyond frames by straight lines.
-
-        ``origin_mm`` (2,): place (u, v) of pixel (0, 0) in the image's own plane; ``step_u``, ``step_v`` (2,): steps
-        from column to column and row to row there.
-        """
+        """Poses (T, 12) at frame positions (T,), straight lines between and beyond frames. ``origin_mm`` (2,): place (u, v)
+        of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to row."""
         at = {
             name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
         }
@@ -124,7 +114,6 @@ def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _root(path: Path) -> ElementTree.Element:
-    """The root element, of the version that is known here."""
     data, culprit = read_bytes(path), str(path)
     if _DECLARATIONS.search(data):
         expected, remedy = "plain elements", "nothing outside of the file is read"

@@ -1,27 +1,17 @@
 """A folder of TIFF frames and one TOML that says what they are, where things stood and when they were taken.
 
-The tables [source], [detector], [volume], [readout] and [beam] are those of a scanner file; [frames], [angles] and
-[timing] are added. Row 0 of an image is its top, column 0 its left, seen from the source.
+Its tables are a scanner file's, and [frames], [angles], [timing]. Row 0 is the top, column 0 the left, seen from the source.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import (
-    ANGLE_AT,
-    COLUMN_0,
-    OF_BARE_FRAMES,
-    QUANTITIES,
-    ROTATES,
-    ROW_0,
-    ImportOptions,
-)
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_numbers
 from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
@@ -81,18 +71,14 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
     """The options, and under them what the file says in the same words."""
-    said = {
-        "quantity": frames.word("quantity", QUANTITIES) if frames.has("quantity") else None,
-        "flat_value": frames.length("flat_value") if frames.has("flat_value") else None,
-        "row_0": frames.word("row_0", ROW_0) if frames.has("row_0") else None,
-        "column_0": frames.word("column_0", COLUMN_0) if frames.has("column_0") else None,
-        "rotates": angles.word("rotates", ROTATES) if angles.has("rotates") else None,
-    }
-    return ImportOptions(**{**vars(options), **{k: getattr(options, k) or v for k, v in said.items()}})
+    tables = {"quantity": frames, "row_0": frames, "column_0": frames, "rotates": angles}
+    said: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in tables.items() if t.has(k)}
+    if frames.has("flat_value"):
+        said["flat_value"] = frames.length("flat_value")
+    return replace(options, **{k: v for k, v in said.items() if not getattr(options, k)})
 
 
 def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
-    """All images (n, v, u) that [frames] names, as stored."""
     found = {}
     for name in ("projections", "flats", "darks", "mask"):
         if name != "projections" and not frames.has(name):
@@ -107,7 +93,6 @@ def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.
 def _line_integrals(
     stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, culprit: str
 ) -> LineIntegrals:
-    """Line integrals of the projections, with the pixels not to be used."""
     turned = {name: oriented(stack, said, "top") for name, stack in stacks.items()}
     stack = turned["projections"]
     found = line_integrals(culprit, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
@@ -117,17 +102,16 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
-    """The files that match a pattern, in natural order of their names."""
     pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
     below, last = PurePosixPath(pattern).parent, PurePosixPath(pattern).name
     if "*" in str(below) or "**" in last:
-        raise InputError(frames.name(name), repr(pattern), "a pattern for files of one folder")
+        raise frames.error(name, repr(pattern), "a pattern for files of one folder")
     found = []
     if (folder.root / below).is_dir():
         names = [str(below / path.name) for path in (folder.root / below).iterdir() if path.match(last)]
         found = in_natural_order([folder.file(text, frames.name(name)) for text in names])
     if not found:
-        raise InputError(frames.name(name), f"no file that matches {pattern!r}", "at least one TIFF")
+        raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF")
     return found
 
 
@@ -143,11 +127,11 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
 
 
 def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTiming:
-    exposure_s = timing.number("exposure_s") if timing.has("exposure_s") else None
-    readout_s = timing.number("readout_s") if timing.has("readout_s") else None
+    names = ("exposure_s", "readout_s")
+    exposure_s, readout_s = (timing.number(name) if timing.has(name) else None for name in names)
     if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
         readout_s = scanner.readout_ratio * exposure_s
-    written = [timing.name(key) for key in ("exposure_s", "readout_s") if timing.has(key)]
+    written = [timing.name(key) for key in names if timing.has(key)]
     return StoredTiming(
         exposure_s=exposure_s,
         readout_s=readout_s,
@@ -156,7 +140,7 @@ def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTi
         axis=scanner.readout_axis,
         direction=scanner.readout_direction,
         pulse=scanner.pulse,
-        angle_at=angles.word("at", ANGLE_AT, default="start"),
+        angle_at=angles.word("at", WORDS["angle_at"], default="start"),
         written=(*written, *([angles.name("at")] if angles.has("at") else [])),
     )
 
@@ -167,7 +151,7 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
     if len(given) != 1:
         raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
     if angles.has("unit") and not angles.has("file"):
-        raise InputError(angles.name("unit"), "no file beside it", "the unit of a file of angles", "leave it out")
+        raise angles.error("unit", "no file beside it", "the unit of a file of angles", "leave it out")
     if angles.has("file"):
         unit = angles.word("unit", tuple(_TO_RAD), default="deg")
         path = folder.file(angles.get("file"), angles.name("file"))
@@ -181,7 +165,6 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
 
 
 def _mask(stack: np.ndarray, shape: tuple[int, ...], culprit: str) -> np.ndarray:
-    """Bad pixels (v, u) or (F, v, u) from images whose non-zero pixels are bad."""
     if stack.shape == (1, *shape[1:]):
         return stack[0] != 0
     if stack.shape != shape:

@@ -1,9 +1,4 @@
-"""What R2-Gaussian's, PhyRadGS's and NAF's files share: TIGRE's frame, with images and volumes turned.
-
-Projections are stored [v, u] with row 0 at +z, volumes [x, y, z]; angles are the gantry's, in radians.
-"""
-
-from __future__ import annotations
+"""TIGRE's frame, which R2-Gaussian, PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z]."""
 
 import numpy as np
 
@@ -17,26 +12,18 @@ ROW_0 = "top"
 
 
 def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
-    """The cone of a scanner's table; its lengths count in ``unit_mm``.
-
-    ``nDetector``, ``sDetector`` and ``dDetector`` run [v, u], ``offDetector`` [u, v].
-    """
+    """The cone of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v]."""
     mode = scanner.word("mode", default="cone")
     if mode != "cone":
-        raise InputError(scanner.name("mode"), repr(mode), "'cone'", "parallel beams have no source distance")
+        raise scanner.error("mode", repr(mode), "'cone'", "parallel beams have no source distance")
     to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
     if to_detector <= to_axis:
-        raise InputError(scanner.name("DSD"), f"{to_detector:g}", f"more than DSO ({to_axis:g})")
+        raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
     rows, columns = scanner.counts("nDetector", 2)
-    pitch = pitches(scanner, "Detector", (rows, columns))
-    offset_u, offset_v = offset(scanner, "offDetector", 2)
-    return ConeGeometry(
-        to_axis * unit_mm,
-        to_detector * unit_mm,
-        (rows, columns),
-        (float(pitch[0] * unit_mm), float(pitch[1] * unit_mm)),
-        (float(offset_v * unit_mm), float(offset_u * unit_mm)),
-    )
+    pitch_v, pitch_u = (float(p * unit_mm) for p in pitches(scanner, "Detector", (rows, columns)))
+    offset_u, offset_v = (float(o * unit_mm) for o in offset(scanner, "offDetector", 2))
+    sides = (rows, columns), (pitch_v, pitch_u), (offset_v, offset_u)
+    return ConeGeometry(to_axis * unit_mm, to_detector * unit_mm, *sides)
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:
@@ -60,7 +47,7 @@ def offset(scanner: Fields, key: str, count: int) -> np.ndarray:
         return np.zeros(count)
     values = scanner.numbers(key)
     if len(values) < count:
-        raise InputError(scanner.name(key), f"{len(values)} values", f"{count} numbers")
+        raise scanner.error(key, f"{len(values)} values", f"{count} numbers")
     return values[:count]
 
 

@@ -1,7 +1,5 @@
 """Reading small texts and NumPy arrays whose size is bounded by the file's own, and by this machine's memory."""
 
-from __future__ import annotations
-
 import json
 import math
 import zlib

@@ -1,10 +1,4 @@
-"""Files of a foreign folder, opened only where they really lie inside it.
-
-Names come from strangers' JSON, XML headers and listings: no absolute path, no "..", no symbolic link, nothing
-but regular files.
-"""
-
-from __future__ import annotations
+"""Files of a foreign folder, opened only where they really lie in it: no absolute path, "..", link or device."""
 
 import re
 from collections.abc import Sequence
@@ -72,9 +66,8 @@ def checked_name(name: object, culprit: str) -> str:
     text = name.replace("\\", "/")
     outside = PureWindowsPath(name).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if outside:
-        raise InputError(
-            culprit, repr(name)[:80], "a name inside the folder", "copy the file into the folder"
-        )
+        expected = "a name inside the folder"
+        raise InputError(culprit, repr(name)[:80], expected, "copy the file into the folder")
     return text
 
 
@@ -85,9 +78,7 @@ def in_natural_order(paths: Sequence[Path]) -> list[Path]:
 
 def check_numbering(paths: Sequence[Path], remedy: str) -> None:
     """InputError for frames, in natural order, that share a number or leave one out: all later angles would be wrong.
-
-    Numbers are those in the one place where the names differ; names that differ elsewhere too are no numbering.
-    """
+    Numbers are those in the one place where names differ; names that differ elsewhere too are no numbering."""
     names = [_natural(path.stem) for path in paths]
     places = [place for place in zip(*names, strict=False) if len(set(place)) > 1]
     if len({len(name) for name in names}) > 1 or len(places) > 1 or any(word for _, _, word in sum(places, ())):

@@ -1,7 +1,5 @@
 """Raw frames of any origin to line integrals with row 0 the lowest, with bad pixels masked."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 
@@ -36,17 +34,11 @@ def line_integrals(
     darks: np.ndarray | None = None,
     custom: str | None = None,
 ) -> LineIntegrals:
-    """Line integrals of ``frames`` (P, v, u); clipped counts and values that no object has are masked, and said.
-
-    Args:
-        culprit: the file, for messages.
-        frames: as stored, in any real type.
-        options: its ``quantity`` wins over everything, its ``flat_value`` stands in for flats.
-        flats, darks: (n, v, u) or None.
-        custom: the quantity that the format, or the file, gives; None where nothing is said: then frames with
-            flats are counts, and floats without any are refused.
-    """
-    quantity = options.quantity or custom or ("counts" if has_flats(flats, options) else None)
+    """Line integrals of ``frames`` (P, v, u) of any real type; clipped counts and values that no object has are masked,
+    and said. ``culprit`` names the file; ``flats``, ``darks``: (n, v, u) or None. The options' ``quantity`` wins over
+    ``custom``, the format's or file's; where neither says, frames with flats are counts and others refused."""
+    has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
+    quantity = options.quantity or custom or ("counts" if has_flats else None)
     if quantity is None:
         remedy = f"say {option_name('quantity')} attenuation, transmission or counts"
         raise InputError(f"{culprit} quantity", "nothing that says it", "what the pixels hold", remedy)
@@ -55,8 +47,9 @@ def line_integrals(
         if options.flat_value is not None or flats is None or len(flats) == 0:
             flats = _constant_flat(culprit, frames, options)
         for stack in (flats, darks):
-            if stack is not None and len(stack):
-                _check_panel(culprit, stack, frames)
+            if stack is not None and len(stack) and stack.shape[1:] != frames.shape[1:]:
+                found = f"flats or darks of {stack.shape[1:]}"
+                raise InputError(culprit, found, f"the projections' {frames.shape[1:]} pixels")
         with np.errstate(over="ignore", invalid="ignore"):
             flat = flats.mean(axis=0, dtype=np.float64)
             saturation = find_saturation(frames, flat)
@@ -72,11 +65,9 @@ def line_integrals(
 def _mask_clipped(
     culprit: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
 ) -> None:
-    """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object.
-
-    Where the flat is clipped too the integral is 0: right for air, which is most of it, and without air in the frames a
-    reconstruction is further off (2 to 3 times) than with thin parts that are lost.
-    """
+    """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object. Where the
+    flat is clipped too the integral is 0: right for air, which is most of it; without air a reconstruction is 2 to 3
+    times further off than with thin parts lost."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
@@ -85,27 +76,19 @@ def _mask_clipped(
     _log.warning(text, culprit, 100 * saturation.share, saturation.level, fate)
 
 
-def has_flats(flats: np.ndarray | None, options: ImportOptions) -> bool:
-    """Whether there is anything to divide counts by."""
-    return (flats is not None and len(flats) > 0) or options.flat_value is not None
-
-
 def compact(mask: np.ndarray) -> Mask:
     """A mask (P, v, u) as (v, u) where all frames agree, and None where it marks nothing."""
     if not mask.any():
         return None
     if mask.all():
-        raise InputError(
-            "pixels", "no usable value", "frames brighter than the dark", "check flats and darks"
-        )
+        expected = "frames brighter than the dark"
+        raise InputError("pixels", "no usable value", expected, "check flats and darks")
     return mask[0] if all(np.array_equal(frame, mask[0]) for frame in mask) else mask
 
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
-    """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source.
-
-    ``row_0`` and ``column_0`` are the format's custom; the options win.
-    """
+    """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source; ``row_0`` and
+    ``column_0`` are the format's custom, over which the options win."""
     if (options.row_0 or row_0) == "top":
         array = array[..., ::-1, :]
     if (options.column_0 or column_0) == "right":
@@ -118,9 +101,3 @@ def _constant_flat(culprit: str, frames: np.ndarray, options: ImportOptions) -> 
         remedy = f"add flat frames, or say {option_name('flat_value')}"
         raise InputError(f"{culprit} flats", "none", "flat frames to divide counts by", remedy)
     return np.full((1, *frames.shape[1:]), options.flat_value, np.float32)
-
-
-def _check_panel(culprit: str, stack: np.ndarray, frames: np.ndarray) -> None:
-    if stack.shape[1:] != frames.shape[1:]:
-        found = f"flats or darks of {stack.shape[1:]}"
-        raise InputError(culprit, found, f"the projections' {frames.shape[1:]} pixels")

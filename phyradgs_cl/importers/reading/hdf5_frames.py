@@ -1,33 +1,12 @@
 """What importers of HDF5 share: numeric frames of any type, optional numbers with units, the sense of angles."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
 import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions, needed, option_name
 from phyradgs_cl.io.hdf5.datasets import read_length, read_values
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[Hdf5Source]:
-    """``open_hdf5``, for files whose root or names are damaged as well.
-
-    h5py has a KeyError for the one, and hands out names that are no text as bytes, which no path can be joined with.
-    """
-    try:
-        with open_hdf5(path) as source:
-            yield source
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
-        ) from error
 
 
 def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:
@@ -38,8 +17,7 @@ def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None 
     if panel is not None and dataset.shape == panel:
         return read_values(source, address, dataset)[None]
     if dataset.ndim != 3 or min(dataset.shape) < 1:
-        expected = "three axes (frame, v, u), none of them empty"
-        raise InputError(culprit, f"shape {dataset.shape}", expected)
+        raise InputError(culprit, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
     if panel is not None and dataset.shape[1:] != panel:
         expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
         raise InputError(culprit, f"shape {dataset.shape}", expected)
@@ -58,8 +36,7 @@ def stored_pitch(source: Hdf5Source, *addresses: str) -> float:
     """The size of a pixel in mm at the first of some addresses, which somebody has to give."""
     size = optional_length(source, *addresses)
     if size is None:
-        remedy = f"say {option_name('pixel_size_mm')} V,U"
-        raise InputError(source.name(addresses[0]), "nothing", "a length", remedy)
+        raise source.error(addresses[0], "nothing", "a length", f"say {option_name('pixel_size_mm')} V,U")
     return size
 
 

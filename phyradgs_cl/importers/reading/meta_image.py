@@ -1,8 +1,5 @@
 """MetaImage (.mha, .mhd), volumes and stacks of projections: a text, then voxels, raw or deflated, here or beside."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,37 +10,20 @@ from phyradgs_cl.importers.reading.folder import SafeFolder
 from phyradgs_cl.importers.reading.voxels import Voxels, header_numbers
 
 SUFFIXES = (".mha", ".mhd")
-_TYPES = {
-    **{"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4"},
-    **{
-        "MET_UINT": "u4",
-        "MET_LONG_LONG": "i8",
-        "MET_ULONG_LONG": "u8",
-        "MET_FLOAT": "f4",
-        "MET_DOUBLE": "f8",
-    },
-}
+_NAMES = ("CHAR", "UCHAR", "SHORT", "USHORT", "INT", "UINT", "LONG_LONG", "ULONG_LONG", "FLOAT", "DOUBLE")
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+_TYPES = {f"MET_{name}": code for name, code in zip(_NAMES, _CODES, strict=True)}
 
 
-@dataclass(frozen=True, eq=False)
-class MetaStack:
-    """Frames (F, v, u) as stored, and where pixels are: place (2,) of pixel (0, 0) and steps (2,), all (u, v) in mm."""
-
-    frames: np.ndarray
-    origin_mm: np.ndarray
-    step_u_mm: np.ndarray
-    step_v_mm: np.ndarray
-
-
-def read_meta_stack(path: Path) -> MetaStack:
-    """A stack of projections, third axis the frames, which must lie on top of each other."""
+def read_meta_stack(path: Path) -> Voxels:
+    """A stack of projections (F, v, u), third axis the frames, which must lie on top of each other; u, v are its x, y."""
     image = read_meta_image(path)
-    assert image.steps_mm is not None and image.origin_mm is not None  # every MetaImage has them
     step = image.steps_mm
+    assert step is not None  # every MetaImage has them
     if np.abs(step[:2, 2]).max() + np.abs(step[2, :2]).max() > 1e-9 * np.abs(step).max():
         found = str(step.tolist())[:80]
         raise InputError(f"{path} TransformMatrix", found, "axes of a stack: columns, rows, frames")
-    return MetaStack(image.values, image.origin_mm[:2], step[0, :2], step[1, :2])
+    return image
 
 
 def read_meta_image(path: Path) -> Voxels:
@@ -58,7 +38,8 @@ def read_meta_image(path: Path) -> Voxels:
     word = header.get("ElementType", "nothing")
     if word not in _TYPES:
         raise InputError(f"{culprit} ElementType", word[:40], ", ".join(_TYPES))
-    big = _first(header, "BinaryDataByteOrderMSB", "ElementByteOrderMSB") in ("True", "true", "1")
+    orders = [header[key] for key in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB") if key in header]
+    big = orders[:1] and orders[0] in ("True", "true", "1")
     dtype = np.dtype(_TYPES[word]).newbyteorder(">" if big else "<")
     values = _voxels(path, header, start, shape, dtype)
     spacing = header_numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
@@ -71,7 +52,6 @@ def read_meta_image(path: Path) -> Voxels:
 
 
 def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
-    """(3, 3): row i is the direction of axis i."""
     keys = [key for key in ("TransformMatrix", "Rotation", "Orientation") if key in header]
     key = keys[0] if keys else "TransformMatrix"
     axes = header_numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
@@ -81,7 +61,6 @@ def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
-    """Keys and values, and where the data begin."""
     text = read_head(path)
     header: dict[str, str] = {}
     position = 0
@@ -108,7 +87,3 @@ def _voxels(
         raise InputError(f"{path} HeaderSize", header["HeaderSize"][:20], "0")
     packed = header.get("CompressedData", "False").lower() in ("true", "1")
     return read_raw(data_path, start, shape, dtype, packed)
-
-
-def _first(header: dict[str, str], *keys: str) -> str:
-    return next((header[key] for key in keys if key in header), "False")

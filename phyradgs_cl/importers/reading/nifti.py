@@ -1,7 +1,5 @@
 """NIfTI-1 volumes (.nii, .nii.gz)."""
 
-from __future__ import annotations
-
 import gzip
 import math
 import zlib

@@ -1,7 +1,5 @@
 """NRRD volumes (.nrrd) with their data in the same file: https://teem.sourceforge.net/nrrd/format.html"""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -69,7 +67,6 @@ def _frame(culprit: str, header: dict[str, str]) -> tuple[np.ndarray | None, np.
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
-    """Fields by their names, and where the data begin."""
     text = read_head(path)
     end = re.search(rb"\r?\n\r?\n", text)
     if not re.match(rb"NRRD000\d\r?\n", text) or end is None:

@@ -1,11 +1,8 @@
 """Pickles without trust: the standard library's unpickler, with an allow-list in place of whatever a file names.
 
-What a name of the list stands for is a function of this module, not NumPy's: none of them allocates by a number in the
-file or takes a state that it does not check. The unpickler is the one written in Python, because the one in C hashes keys
-before anyone can look at them: integers that share one hash, or tuples of tuples, keep it for hours.
+What a name stands for is a function of this module that neither allocates by a number in the file nor takes a state
+unchecked. The unpickler is the one in Python: that in C hashes keys before anyone looks, and equal hashes keep it for hours.
 """
-
-from __future__ import annotations
 
 import io
 import math
@@ -73,7 +70,6 @@ class PlainUnpickler(pickle._Unpickler):
         return self._names[known]
 
     def persistent_load(self, pid: object) -> NoReturn:
-        """An object that lies elsewhere."""
         self.refuse("a persistent object")
 
     def refuse(self, found: str) -> NoReturn:
@@ -98,8 +94,6 @@ class PlainUnpickler(pickle._Unpickler):
 
 
 class _Opcodes(dict[int, Callable[..., None]]):
-    """What each opcode does, for as many of them as an import may take."""
-
     left = _MOST_OPCODES
 
     def __getitem__(self, code: int) -> Callable[..., None]:
@@ -164,7 +158,7 @@ class _Array(np.ndarray):
 
     _spend: Callable[[int], None]
 
-    def __new__(cls, spend: Callable[[int], None]) -> _Array:
+    def __new__(cls, spend: Callable[[int], None]) -> "_Array":
         made = super().__new__(cls, (0,), np.uint8)
         made._spend = spend
         return made

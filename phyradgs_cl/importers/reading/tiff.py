@@ -1,7 +1,5 @@
 """Grey TIFF images, plain or deflated, one per file or many in one, of a size that the file can hold."""
 
-from __future__ import annotations
-
 import logging
 import math
 import zlib
@@ -29,18 +27,14 @@ _ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
 
 @dataclass(frozen=True)
 class _Header:
-    """What a file promises: so many images (v, u) of one shape and type."""
-
     images: int
     shape: tuple[int, int]
     dtype: np.dtype
 
 
 def read_tiffs(paths: list[Path]) -> np.ndarray:
-    """Frames (F, v, u) in the files' own type, row 0 as stored; every image of every file, in order.
-
-    All headers are read before any pixel, so that the frames are unpacked into one array of a known size.
-    """
+    """Every image of every file, in order: frames (F, v, u) in their own type, row 0 as stored. All headers are read
+    before any pixel, so that the frames are unpacked into one array of a known size."""
     headers = [_header(path) for path in paths]
     first = headers[0]
     for path, header in zip(paths, headers, strict=True):
@@ -55,7 +49,9 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
         with _opened(path) as tiff:
             for page in tiff.pages:
                 images = math.prod(page.shape[:-2])
-                _decode(path, page, stack[at : at + images])
+                if page.compression in _DEFLATED:
+                    _check_inflation(path, page, _chunk(page))
+                page.asarray(maxworkers=1, out=stack[at : at + images].reshape(page.shape))
                 at += images
     return stack
 
@@ -101,10 +97,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Voxel sizes (x, y, z) mm and the origin's place (x, y, z) in voxels, where a stack states them; and its "Info".
-
-    Of ImageJ's own stacks, and of BigTIFF in which tifffile keeps the same words as JSON. Call ``read_pages`` first.
-    """
+    """Voxel sizes (x, y, z) mm, the origin's place (x, y, z) in voxels and "Info", where a stack states them: ImageJ's
+    own, and BigTIFF in which tifffile keeps the same words as JSON. Call ``read_tiffs`` first."""
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
@@ -154,15 +148,7 @@ def _check_page(path: Path, page: Any, before_bytes: int) -> None:
 
 
 def _chunk(page: Any) -> int:
-    """Bytes of a strip or tile."""
     return math.prod(page.chunks) * page.dtype.itemsize
-
-
-def _decode(path: Path, page: Any, into: np.ndarray) -> None:
-    """Unpack a page into frames (n, v, u)."""
-    if page.compression in _DEFLATED:
-        _check_inflation(path, page, _chunk(page))
-    page.asarray(maxworkers=1, out=into.reshape(page.shape))
 
 
 def _check_inflation(path: Path, page: Any, most: int) -> None:

@@ -1,7 +1,5 @@
 """Voxels as another program stored them, and the turn into this package's order, frame and unit."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,11 +19,9 @@ _OBLIQUE = 1e-3  # of a step
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Values (k, j, i) as stored, and where they are in the frame LPS, the world's x, y, z (exporters/placed.py).
-
-    steps_mm (3, 3): rows are the ways from voxel to voxel along i, j, k; None of bare values, which have no scale.
-    origin_mm (3,): centre of voxel (0, 0, 0); None centres the volume on the axis. note: what the file says of its values.
-    """
+    """Values (k, j, i) as stored, and where they are in LPS, the world's x, y, z. steps_mm (3, 3): rows are the ways
+    from voxel to voxel along i, j, k; None of bare values. origin_mm (3,): centre of voxel (0, 0, 0); None centres the
+    volume on the axis. note: what the file says of its values."""
 
     values: np.ndarray
     steps_mm: np.ndarray | None = None
@@ -34,11 +30,8 @@ class Voxels:
 
 
 def along_world_axes(culprit: str, stored: Voxels) -> LoadedVolume:
-    """The volume (z, y, x) float32 along rising world axes, and its grid; bare integers as shares of their type's maximum.
-
-    Raises:
-        InputError: Hounsfield units, axes that are oblique to the world's, lengths that are absurd, NaN or infinity.
-    """
+    """The volume (z, y, x) float32 along rising world axes, and its grid; bare integers as shares of their type's
+    maximum. InputError: Hounsfield units, axes that are oblique, lengths that are absurd, NaN or infinity."""
     if "HU" in stored.note.split():
         raise InputError(culprit, "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
     values, steps = stored.values, stored.steps_mm

@@ -1,7 +1,5 @@
 """Typed reads from an Hdf5Source: numbers with units, words and whole numbers, each checked at once."""
 
-from __future__ import annotations
-
 import logging
 import math
 import posixpath
@@ -37,7 +35,6 @@ def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: 
 
 
 def _unfolded(dataset: h5py.Dataset) -> object:
-    """All that a dataset holds, in no more memory than its header promises and its filters need."""
     if dataset.nbytes > HOST_SHARE * host_bytes():
         raise MemoryError
     chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
@@ -51,10 +48,7 @@ def _damage(error: Exception) -> str:
 
 
 def read_array(
-    source: Hdf5Source,
-    address: str,
-    shape: Sequence[int | None],
-    quantity: Quantity | None = None,
+    source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None
 ) -> np.ndarray:
     """A required numeric dataset as float64 in the package's unit; every value finite."""
     dataset = source.dataset(address)
@@ -68,46 +62,40 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     """A required number above zero; a dataset of one element will do."""
     value = read_number(source, address, quantity)
     if value <= 0:
-        raise InputError(source.name(address), str(value), f"a {quantity.name} above 0", "correct the value")
+        raise source.error(address, str(value), f"a {quantity.name} above 0", "correct the value")
     if value < 1 / quantity.largest:
-        raise InputError(source.name(address), str(value), f"a {quantity.name} of a real scanner")
+        raise source.error(address, str(value), f"a {quantity.name} of a real scanner")
     return value
 
 
-def read_number(
-    source: Hdf5Source, address: str, quantity: Quantity | None = None
-) -> float:
+def read_number(source: Hdf5Source, address: str, quantity: Quantity | None = None) -> float:
     """A required finite number in the package's unit; a dataset of one element will do."""
     dataset = source.dataset(address)
     if dataset.size != 1:
-        raise InputError(source.name(address), f"shape {dataset.shape}", "one number")
+        raise source.error(address, f"shape {dataset.shape}", "one number")
     values = read_values(source, address, dataset).astype(np.float64)
     checks.finite(source.name(address), values)
     return float((in_unit(source, address, values, quantity) if quantity else values).reshape(()))
 
 
-def read_integers(
-    source: Hdf5Source, address: str, shape: Sequence[int | None]
-) -> np.ndarray:
+def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None]) -> np.ndarray:
     """A required dataset of whole numbers as int64."""
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     return read_values(source, address, dataset, kinds="iu").astype(np.int64)
 
 
-def read_word(
-    source: Hdf5Source, address: str, allowed: Collection[str] | None = None
-) -> str:
+def read_word(source: Hdf5Source, address: str, allowed: Collection[str] | None = None) -> str:
     """A required string, one of ``allowed`` where they are given."""
     dataset = source.dataset(address)
     if dataset.size != 1:  # many entries may all be one long text, which the file's size does not bound
-        raise InputError(source.name(address), f"shape {dataset.shape}", "a string")
+        raise source.error(address, f"shape {dataset.shape}", "a string")
     try:
         word = as_text(_unfolded(dataset))
     except (MemoryError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(source.name(address), _damage(error), "a string") from error
+        raise source.error(address, _damage(error), "a string") from error
     if word is None:
-        raise InputError(source.name(address), f"type {dataset.dtype}, shape {dataset.shape}", "a string")
+        raise source.error(address, f"type {dataset.dtype}, shape {dataset.shape}", "a string")
     if allowed is not None:
         checks.one_of(source.name(address), word, allowed)
     return word
@@ -124,9 +112,7 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
     size = np.abs(values).max(initial=0.0)
     if size > quantity.largest:
         expected = f"at most {quantity.largest:g} of the package's unit for a {quantity.name}"
-        raise InputError(
-            source.name(address), f"a value of size {size:.6g}", expected, "correct the value or its unit"
-        )
+        raise source.error(address, f"a value of size {size:.6g}", expected, "correct the value or its unit")
     return values
 
 

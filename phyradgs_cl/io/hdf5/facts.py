@@ -1,10 +1,4 @@
-"""What a file says of how it was made: fields of known kinds, read so that damage to one costs that one.
-
-Provenance and results are JSON that anybody may have edited. A schema states the kind of every field that the package
-computes with; of all others it asks no more than that they can be shown.
-"""
-
-from __future__ import annotations
+"""What a file says of how it was made: JSON that anybody may have edited, in which damage to one field costs that one."""
 
 import json
 import logging
@@ -37,9 +31,7 @@ WHOLE = Kind("a whole number", lambda value: type(value) is int)
 NUMBER = Kind("a finite number", lambda value: _is_number(value) and abs(value) < _LARGEST)  # type: ignore[arg-type]
 SECONDS = Kind("a time of at least 0 s", lambda value: NUMBER.fits(value) and value >= 0)  # type: ignore[operator]
 TABLE = Kind("a table", lambda value: isinstance(value, dict))
-TABLES = Kind(
-    "a list of tables", lambda value: isinstance(value, list) and all(isinstance(v, dict) for v in value)
-)
+TABLES = Kind("a list of tables", lambda value: isinstance(value, list) and all(map(TABLE.fits, value)))
 FINITE = Kind(
     "a table of finite numbers",
     lambda value: isinstance(value, dict) and all(v is None or NUMBER.fits(v) for v in value.values()),
@@ -68,10 +60,7 @@ def damage(facts: Mapping[str, object], schema: Schema, required: Collection[str
 
 
 def read_facts(culprit: str, text: str, schema: Schema) -> Facts:
-    """The JSON object in ``text`` without its damaged fields, of which the log has a word.
-
-    Raises InputError for text that is no JSON object.
-    """
+    """The JSON object in ``text`` (else InputError) without its damaged fields, of which the log has a word."""
     try:
         if len(text) > MOST_BYTES:
             raise ValueError(f"{len(text)} characters")

@@ -1,14 +1,10 @@
 """The voxel grid in files, and the one that a scan without a grid gets."""
 
-from __future__ import annotations
-
 import math
 
 import h5py
 
-from phyradgs_cl.acquisition import ConeGeometry
-from phyradgs_cl.acquisition.field_of_view import field_of_view_mm
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.acquisition.field_of_view import default_grid as default_grid
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.hdf5.datasets import new_group, read_array, read_integers, write_number
@@ -24,13 +20,12 @@ def read_grid(source: Hdf5Source, address: str) -> Grid:
     if source.optional(f"{address}/offset") is not None:
         offset_mm = tuple(read_array(source, f"{address}/offset", (3,), LENGTH).tolist())
     if shape.min() < 1:
-        raise InputError(source.name(f"{address}/shape"), str(shape.tolist()), "three counts of at least 1")
+        raise source.error(f"{address}/shape", str(shape.tolist()), "three counts of at least 1")
     if math.prod(shape.tolist()) > MOST_VOXELS:
         expected = f"at most {MOST_VOXELS:.3g} voxels"
-        raise InputError(source.name(f"{address}/shape"), str(shape.tolist()), expected, "correct the counts")
+        raise source.error(f"{address}/shape", str(shape.tolist()), expected, "correct the counts")
     if voxel_size_mm.min() < 1 / LENGTH.largest:
-        found = str(voxel_size_mm.tolist())
-        raise InputError(source.name(f"{address}/voxel_size"), found, "three lengths above 0")
+        raise source.error(f"{address}/voxel_size", str(voxel_size_mm.tolist()), "three lengths above 0")
     return Grid(tuple(shape.tolist()), tuple(voxel_size_mm.tolist()), offset_mm)
 
 
@@ -40,10 +35,3 @@ def write_grid(parent: h5py.Group, grid: Grid) -> None:
     write_number(group, "shape", grid.shape)
     write_number(group, "voxel_size", grid.voxel_size_mm, "mm")
     write_number(group, "offset", grid.offset_mm, "mm")
-
-
-def default_grid(geometry: ConeGeometry) -> Grid:
-    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
-    side_mm = 2 * field_of_view_mm(geometry)[1]
-    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
-    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)

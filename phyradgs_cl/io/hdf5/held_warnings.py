@@ -1,7 +1,5 @@
 """Warnings about a file that wait until it is read: of a file that is refused, the error is all there is to say."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

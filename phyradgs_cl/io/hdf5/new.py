@@ -1,10 +1,8 @@
 """New HDF5 files whose writing may fail without the HDF5 library hearing of it.
 
-The library does not survive a disk that is full: it leaves objects that it cannot close, and crashes at the latest when the
-process ends. So it writes through a file of ours that takes everything; what went wrong is raised afterwards.
+On a full disk the library leaves objects that it cannot close, and crashes at the latest when the process ends. So it
+writes through a file of ours that takes everything; what went wrong is raised afterwards.
 """
-
-from __future__ import annotations
 
 import io
 from collections.abc import Iterator

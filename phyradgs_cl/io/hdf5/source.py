@@ -1,10 +1,4 @@
-"""HDF5 files from strangers: opened, walked and measured without leaving the file.
-
-An `Hdf5Source` follows links inside the file only, and refuses datasets whose bytes lie elsewhere or
-whose declared size the file cannot hold. Every defect is an InputError about "FILE:/hdf5/path".
-"""
-
-from __future__ import annotations
+"""HDF5 files from strangers, walked without leaving the file: no link, dataset or declared size leads out of it."""
 
 import difflib
 import math
@@ -37,11 +31,8 @@ _FREE_BYTES = 64 << 20
 
 
 @contextmanager
-def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
-    """Open a file for reading; InputError for what is missing, a folder, truncated, not HDF5, or more than HDF5 survives.
-
-    Errors of HDF5 in the body come out as InputError too, so the body should do nothing but read.
-    """
+def open_hdf5(path: str | Path) -> "Iterator[Hdf5Source]":
+    """Open a file for reading; InputError for whatever is no readable HDF5, errors of HDF5 in the body included."""
     path = Path(path)
     if regular_file(path, str(path), "an HDF5 file").st_size == 0:  # of /proc, or cut off
         raise InputError(str(path), "an empty file", "an HDF5 file", "copy or write it again")
@@ -54,9 +45,8 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Source]:
         with file:
             yield Hdf5Source(file, path)
     except (OSError, RuntimeError, KeyError, TypeError, UnicodeError) as error:  # damage between datasets
-        raise InputError(
-            str(path), f"a damaged file ({error})", "readable HDF5", "copy the file again"
-        ) from error
+        expected = "readable HDF5"
+        raise InputError(str(path), f"a damaged file ({error})", expected, "copy the file again") from error
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
@@ -64,9 +54,8 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     if "truncated" in reason:
         return InputError(str(path), "a truncated HDF5 file", "a complete file", "copy or write it again")
     if "signature not found" in reason:
-        return InputError(
-            str(path), "a file that is not HDF5", "an HDF5 file", "check the path or convert it"
-        )
+        expected = "an HDF5 file"
+        return InputError(str(path), "a file that is not HDF5", expected, "check the path or convert it")
     return InputError(str(path), f"a file that HDF5 cannot open ({reason})", "a readable HDF5 file")
 
 
@@ -81,15 +70,18 @@ class Hdf5Source:
         """How messages name an object of the file."""
         return f"{self.path}:{address}"
 
+    def error(self, address: str, found: str, expected: str, remedy: str = "") -> InputError:
+        """What to raise about an object of the file."""
+        return InputError(self.name(address), found, expected, remedy)
+
     def find(self, address: str) -> h5py.Group | h5py.Dataset | None:
         """The object at an absolute address, or None; links that lead out of the file are refused."""
         return self._walk(address, _MOST_SOFT_LINKS)
 
     def root_groups(self) -> list[str]:
         """Addresses of the groups at the root that are in this file and no mere links."""
-        names = [
-            name for name in self.file if isinstance(self._link(self.file, name, "/", False), h5py.HardLink)
-        ]
+        links = {name: self._link(self.file, name, "/", False) for name in self.file}
+        names = [name for name, link in links.items() if isinstance(link, h5py.HardLink)]
         return [f"/{name}" for name in names if isinstance(self.find(f"/{name}"), h5py.Group)]
 
     def group(self, address: str) -> h5py.Group:
@@ -101,13 +93,13 @@ class Hdf5Source:
         if found is None and parent != "/":
             self.group(parent)
         what = "nothing there" if found is None else "a dataset"
-        raise InputError(self.name(address), what, f"a group {name!r}", self.near_miss(parent, name))
+        raise self.error(address, what, f"a group {name!r}", self.near_miss(parent, name))
 
     def optional_group(self, address: str) -> h5py.Group | None:
         """The group at an address or None; InputError if there is one under a misspelt name instead."""
         found = self.find(address)
         if isinstance(found, h5py.Dataset):
-            raise InputError(self.name(address), "a dataset", "a group", "store the values inside a group")
+            raise self.error(address, "a dataset", "a group", "store the values inside a group")
         if found is None:
             self._refuse_near_miss(address, "a group")
         return found
@@ -121,7 +113,7 @@ class Hdf5Source:
         if parent != "/":
             self.group(parent)
         remedy = self.near_miss(parent, name) or "add it to the file"
-        raise InputError(self.name(address), "nothing there", f"a dataset {name!r}", remedy)
+        raise self.error(address, "nothing there", f"a dataset {name!r}", remedy)
 
     def optional(self, address: str) -> h5py.Dataset | None:
         """The dataset at an address or None; InputError if there is one under a misspelt name instead."""
@@ -130,17 +122,15 @@ class Hdf5Source:
             self._refuse_near_miss(address, "a dataset")
             return None
         if not isinstance(found, h5py.Dataset):
-            raise InputError(self.name(address), "a group", "a dataset", "store the values as a dataset")
+            raise self.error(address, "a group", "a dataset", "store the values as a dataset")
         self._check_storage(address, found)
         return found
 
     def near_miss(self, parent: str, name: str, cutoff: float = 0.6) -> str:
         """What to do about a name that is nearly ``name`` and means nothing else; "" if there is none."""
         group = self.find(parent)
-        strangers = (
-            [n for n in group if n != name and n not in _KNOWN] if isinstance(group, h5py.Group) else []
-        )
-        by_lower = {n.lower(): n for n in strangers}
+        names = group if isinstance(group, h5py.Group) else ()
+        by_lower = {n.lower(): n for n in names if n != name and n not in _KNOWN}
         close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
         return f"rename {by_lower[close[0]]!r} to {name!r}" if close else ""
 
@@ -148,7 +138,7 @@ class Hdf5Source:
         parent, name = posixpath.split(address)
         remedy = self.near_miss(parent, name, cutoff=0.8)
         if remedy:
-            raise InputError(self.name(address), "nothing there", f"{what} {name!r}", remedy)
+            raise self.error(address, "nothing there", f"{what} {name!r}", remedy)
 
     def _walk(self, address: str, soft_links_left: int) -> h5py.Group | h5py.Dataset | None:
         here: h5py.Group | h5py.Dataset = self.file["/"]
@@ -159,9 +149,7 @@ class Hdf5Source:
                 return None
             if isinstance(link, h5py.SoftLink):
                 if soft_links_left == 0:
-                    raise InputError(
-                        self.name(address), "a loop of links", "a dataset", "store the data itself"
-                    )
+                    raise self.error(address, "a loop of links", "a dataset", "store the data itself")
                 target = posixpath.normpath(posixpath.join(walked, link.path, *parts[index + 1 :]))
                 return self._walk(target, soft_links_left - 1)
             walked = posixpath.join(walked, part)
@@ -173,25 +161,19 @@ class Hdf5Source:
         try:
             link = group.get(part, getlink=True)
         except (TypeError, RuntimeError, OSError) as error:
-            raise InputError(
-                self.name(address), f"a link that cannot be followed ({error})", "a plain link"
-            ) from error
+            raise self.error(address, f"a link that cannot be followed ({error})", "a plain link") from error
         if strict and isinstance(link, h5py.ExternalLink):
             found = f"a link to the file {link.filename!r}"
-            raise InputError(
-                self.name(address), found, "data inside this file", "copy the data into the file"
-            )
+            raise self.error(address, found, "data inside this file", "copy the data into the file")
         return link
 
     def _opened(self, group: h5py.Group, part: str, address: str) -> h5py.Group | h5py.Dataset:
         try:
             found = group[part]
         except (KeyError, OSError, RuntimeError) as error:
-            raise InputError(
-                self.name(address), f"a damaged object ({error})", "a group or dataset"
-            ) from error
+            raise self.error(address, f"a damaged object ({error})", "a group or dataset") from error
         if not isinstance(found, (h5py.Group, h5py.Dataset)):
-            raise InputError(self.name(address), "a named type", "a group or dataset")
+            raise self.error(address, "a named type", "a group or dataset")
         return found
 
     def _check_storage(self, address: str, dataset: h5py.Dataset) -> None:
@@ -201,18 +183,16 @@ class Hdf5Source:
             shape, chunks, declared_bytes = dataset.shape, dataset.chunks, dataset.nbytes
             chunk_bytes = math.prod(chunks or ()) * dataset.dtype.itemsize
         except (OSError, RuntimeError, TypeError, ValueError) as error:
-            raise InputError(self.name(address), f"a damaged dataset ({error})", "numbers or text") from error
+            raise self.error(address, f"a damaged dataset ({error})", "numbers or text") from error
         if elsewhere:
             remedy = "copy the data into the file"
-            raise InputError(self.name(address), "data kept in other files", "data inside this file", remedy)
+            raise self.error(address, "data kept in other files", "data inside this file", remedy)
         if shape is None:
-            raise InputError(self.name(address), "an empty dataset", "a value")
+            raise self.error(address, "an empty dataset", "a value")
         file_bytes = self.path.stat().st_size
         most = file_bytes if chunks is None else _MOST_EXPANSION * file_bytes + _FREE_BYTES
         if max(declared_bytes, chunk_bytes) > most:
             what, size = ("shape", shape) if declared_bytes > most else ("chunks of", chunks)
             declared = f"{max(declared_bytes, chunk_bytes) / 2**30:.3g} GiB"
             found = f"{what} {size}, {declared} in a file of {file_bytes} bytes"
-            raise InputError(
-                self.name(address), found, "a size that the file can hold", "write the file again"
-            )
+            raise self.error(address, found, "a size that the file can hold", "write the file again")

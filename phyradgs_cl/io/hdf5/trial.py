@@ -1,12 +1,8 @@
-"""A first look at an HDF5 file by another process, which may crash or hang in place of this one.
+"""A first look at an HDF5 file by another process (`look`), which may crash or hang in place of this one.
 
-The HDF5 library follows damaged headers without looking: a flipped bit can end the process that reads it, or keep it for
-ever. The other process (`look`) opens every object, reads every attribute and every small dataset; a file that it does
-not survive is refused. Damage inside large datasets is met, and reported, by the reading itself. Linux copies this process
-for it, which takes milliseconds; elsewhere, where a copy may not use the system's libraries, an interpreter is started.
+A flipped bit in a header can end the process that reads it, or keep it for ever. Damage inside large datasets is met by
+the reading itself. Linux copies this process, in milliseconds; elsewhere an interpreter is started.
 """
-
-from __future__ import annotations
 
 import faulthandler
 import logging

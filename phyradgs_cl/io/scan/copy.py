@@ -1,7 +1,5 @@
 """A copy of a scan file in which the panel stands elsewhere; everything else stays as it is, raw counts included."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -17,10 +15,8 @@ from phyradgs_cl.io.scan.header import read_header
 
 
 def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
-    """Copy a scan file with its panel ``shift_u_mm`` further along u: in detector_offset, and in poses where it has them.
-
-    Raises InputError for a file that is no scan, OutputError where the copy cannot be written.
-    """
+    """Copy a scan file with its panel ``shift_u_mm`` further along u: detector_offset, and poses where it has them.
+    Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         poses = f"{header.entry}/{schema.POSES}/pose"
@@ -30,11 +26,8 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:
             entry = file[header.entry]
-            extra = (
-                entry[schema.EXTRA]
-                if schema.EXTRA in entry
-                else new_group(entry, schema.EXTRA, "NXcollection")
-            )
+            there = schema.EXTRA in entry
+            extra = entry[schema.EXTRA] if there else new_group(entry, schema.EXTRA, "NXcollection")
             _replace(extra, "detector_offset", np.array([offset_v_mm, offset_u_mm + shift_u_mm]))
             if table is not None:
                 step = table[:, 6:9]

@@ -1,7 +1,5 @@
 """The detector's part of a scan file: frames, keys, geometry, shutter and mask, all but the pixels."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 
@@ -9,16 +7,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Shutter
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.hdf5.datasets import (
-    in_unit,
-    read_array,
-    read_attribute,
-    read_integers,
-    read_length,
-    read_number,
-    read_values,
-    read_word,
-)
+from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import LENGTH, TIME
 from phyradgs_cl.io.scan import schema
@@ -32,49 +21,45 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
         raise InputError(culprit, f"shape {data.shape}", "three axes (frame, v, u), none of them empty")
     if (data.dtype.kind, data.dtype.itemsize) not in (("f", 4), ("u", 2)):
         raise InputError(culprit, f"type {data.dtype}", "float32 or uint16", "convert the frames")
-    quantity = read_attribute(source, address, "quantity")
+    quantity = h5.read_attribute(source, address, "quantity")
     if quantity is None:
         remedy = "add the attribute to the dataset"
-        raise InputError(
-            f"{culprit} @quantity", "no attribute", "one of " + ", ".join(schema.QUANTITIES), remedy
-        )
+        expected = "one of " + ", ".join(schema.QUANTITIES)
+        raise InputError(f"{culprit} @quantity", "no attribute", expected, remedy)
     checks.one_of(f"{culprit} @quantity", quantity, schema.QUANTITIES)
     if quantity != "counts" and data.dtype.kind == "u":
-        raise InputError(
-            culprit, f"{quantity} as {data.dtype}", "float32", "store float32, or counts as uint16"
-        )
+        remedy = "store float32, or counts as uint16"
+        raise InputError(culprit, f"{quantity} as {data.dtype}", "float32", remedy)
     return data, quantity
 
 
 def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
     """What each stored frame is (F,): at least one of them a projection."""
     address = f"{entry}/{schema.DETECTOR}/image_key"
-    image_key = read_integers(source, address, (frames,))
+    image_key = h5.read_integers(source, address, (frames,))
     wrong = ~np.isin(image_key, (schema.PROJECTION, schema.FLAT, schema.DARK, schema.INVALID))
     if wrong.any():
         at = int(np.argmax(wrong))
         expected = "0 projection, 1 flat, 2 dark or 3 invalid"
-        raise InputError(source.name(address), f"{image_key[at]} at index {at}", expected)
+        raise source.error(address, f"{image_key[at]} at index {at}", expected)
     if not np.any(image_key == schema.PROJECTION):
-        raise InputError(
-            source.name(address), "no projection", "at least one 0", "mark the projections with 0"
-        )
+        raise source.error(address, "no projection", "at least one 0", "mark the projections with 0")
     return image_key
 
 
 def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int]) -> ConeGeometry:
     """The circular geometry that the distances, pitches and offset describe."""
     detector, address = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
-    to_axis_mm = abs(read_number(source, address, LENGTH))  # NeXus gives it a minus sign
+    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus gives it a minus sign
     if to_axis_mm == 0:
-        raise InputError(source.name(address), "0", "a length other than 0", "correct the value")
-    pitch_v_mm = read_length(source, f"{detector}/y_pixel_size", LENGTH)
-    pitch_u_mm = read_length(source, f"{detector}/x_pixel_size", LENGTH)
-    to_detector_mm = to_axis_mm + read_length(source, f"{detector}/distance", LENGTH)
+        raise source.error(address, "0", "a length other than 0", "correct the value")
+    pitch_v_mm = h5.read_length(source, f"{detector}/y_pixel_size", LENGTH)
+    pitch_u_mm = h5.read_length(source, f"{detector}/x_pixel_size", LENGTH)
+    to_detector_mm = to_axis_mm + h5.read_length(source, f"{detector}/distance", LENGTH)
     offset = f"{entry}/{schema.EXTRA}/detector_offset"
     offset_mm = (0.0, 0.0)
     if source.optional(offset) is not None:
-        offset_mm = tuple(read_array(source, offset, (2,), LENGTH).tolist())
+        offset_mm = tuple(h5.read_array(source, offset, (2,), LENGTH).tolist())
     return ConeGeometry(to_axis_mm, to_detector_mm, detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
 
 
@@ -87,9 +72,9 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
     rolling = needed and readout_s > 0  # only then does it matter which line comes first
     word, way = "rows", 1
     if rolling or source.optional(axis) is not None:
-        word = read_word(source, axis, AXES)
+        word = h5.read_word(source, axis, AXES)
     if rolling or source.optional(direction) is not None:
-        number = read_number(source, direction)
+        number = h5.read_number(source, direction)
         checks.one_of(source.name(direction), number, (1, -1))
         way = int(number)
     pulse_s = _read_pulse(source, entry, exposure_s + readout_s)
@@ -97,16 +82,15 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
 
 
 def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, float] | None:
-    """When the beam is on (start, length) in s after a frame's start, or None: always."""
     start, length = f"{entry}/{schema.EXTRA}/pulse_start", f"{entry}/{schema.EXTRA}/pulse_length"
     if source.optional(start) is None and source.optional(length) is None:
         return None
-    start_s = read_number(source, start, TIME)
-    length_s = read_length(source, length, TIME)
+    start_s = h5.read_number(source, start, TIME)
+    length_s = h5.read_length(source, length, TIME)
     if start_s >= span_s or start_s + length_s <= 0:
         found = f"a pulse from {start_s:g} to {start_s + length_s:g} s"
         expected = f"one that meets the frame's window, 0 to {span_s:g} s"
-        raise InputError(source.name(start), found, expected, "correct the pulse, or remove both datasets")
+        raise source.error(start, found, expected, "correct the pulse, or remove both datasets")
     return start_s, length_s
 
 
@@ -118,16 +102,15 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
     culprit = source.name(address)
     if dataset.shape not in ((), (1,), used.shape):
         raise InputError(culprit, f"shape {dataset.shape}", f"one number or shape {used.shape}")
-    values = read_values(source, address, dataset).astype(np.float64).reshape(-1)
+    values = h5.read_values(source, address, dataset).astype(np.float64).reshape(-1)
     values = values if values.shape != used.shape else values[used]
     checks.finite(culprit, values)
-    values = in_unit(source, address, values, TIME)
+    values = h5.in_unit(source, address, values, TIME)
     if values.min() < 0:
         raise InputError(culprit, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
     if np.ptp(values) > 1e-6 * values.max():
-        raise InputError(
-            culprit, f"{values.min():.6g} to {values.max():.6g} s", "one time for all projections"
-        )
+        expected = "one time for all projections"
+        raise InputError(culprit, f"{values.min():.6g} to {values.max():.6g} s", expected)
     return float(values[0])
 
 
@@ -138,7 +121,7 @@ def read_starts(
     address = f"{entry}/{schema.DETECTOR}/frame_start_time"
     if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
-    return read_array(source, address, used.shape, TIME)[used]
+    return h5.read_array(source, address, used.shape, TIME)[used]
 
 
 def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:
@@ -149,9 +132,7 @@ def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> t
         return None
     if mask.shape not in (data_shape, data_shape[1:]):
         expected = f"{data_shape[1:]} (v, u) or {data_shape} (frame, v, u)"
-        raise InputError(source.name(address), f"shape {mask.shape}", expected)
+        raise source.error(address, f"shape {mask.shape}", expected)
     if mask.dtype.kind not in "biu":
-        raise InputError(
-            source.name(address), f"type {mask.dtype}", "whole numbers", "non-zero marks a bad pixel"
-        )
+        raise source.error(address, f"type {mask.dtype}", "whole numbers", "non-zero marks a bad pixel")
     return mask.shape

@@ -1,7 +1,5 @@
 """Everything in a scan file except its large arrays, checked in full before those are read."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 
@@ -10,22 +8,15 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.facts import read_facts
-from phyradgs_cl.io.hdf5.grid import default_grid, read_grid
+from phyradgs_cl.io.hdf5.grid import read_grid
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.scan import schema
-from phyradgs_cl.io.scan.detector import (
-    check_mask,
-    read_data_kind,
-    read_geometry,
-    read_image_key,
-    read_shutter,
-    read_starts,
-)
+from phyradgs_cl.io.scan import detector, schema
 from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
 
 _log = logging.getLogger(__name__)
@@ -33,11 +24,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ScanHeader:
-    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
-
-    ``entry`` is the NXtomo group's address, image_key (F,) runs over all stored frames, ``mask_shape`` and
-    ``has_reference`` tell which optional arrays the file has.
-    """
+    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory. ``entry``: address of the
+    NXtomo group; image_key (F,) of all stored frames; ``mask_shape``, ``has_reference``: optional arrays."""
 
     scan: Scan
     entry: str
@@ -48,36 +36,23 @@ class ScanHeader:
     has_reference: bool
     has_grid: bool
 
-    @property
-    def data_address(self) -> str:
-        """Where the frames are stored."""
-        return f"{self.entry}/{schema.DETECTOR}/data"
-
-    @property
-    def mask_address(self) -> str:
-        """Where the pixel mask is stored, if there is one."""
-        return f"{self.entry}/{schema.DETECTOR}/pixel_mask"
-
-    @property
-    def reference_address(self) -> str:
-        """Where the ground truth is stored, if there is one."""
-        return f"{self.entry}/{schema.REFERENCE}/volume"
-
 
 def read_header(source: Hdf5Source) -> ScanHeader:
     """Read and check everything but pixels, mask and reference; InputError names what is wrong."""
     entry = find_entry(source)
-    data, quantity = read_data_kind(source, entry)
-    image_key = read_image_key(source, entry, len(data))
+    data, quantity = detector.read_data_kind(source, entry)
+    image_key = detector.read_image_key(source, entry, len(data))
     used = image_key == schema.PROJECTION
-    geometry = read_geometry(source, entry, (data.shape[1], data.shape[2]))
+    geometry = detector.read_geometry(source, entry, (data.shape[1], data.shape[2]))
     moving = has_motion(source, entry)
-    shutter = read_shutter(source, entry, used, moving)
+    shutter = detector.read_shutter(source, entry, used, moving)
     is_fly = moving and shutter.exposure_s > 0
-    start_s = read_starts(source, entry, used, shutter, moving)
+    start_s = detector.read_starts(source, entry, used, shutter, moving)
     shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
+    model, told = (f"{entry}/{schema.EXTRA}/{name}" for name in ("detector_model", "provenance"))
+    has_model, has_told = source.optional(model) is not None, source.optional(told) is not None
     scan = Scan(
         projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])),
         geometry=geometry,
@@ -86,18 +61,21 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         frame_start_s=start_s,
         grid=grid,
         is_fly=is_fly,
-        detector_model=_read_model(source, entry),
+        detector_model=read_word(source, model, DETECTOR_MODELS) if has_model else "log",
         title=read_title(source, f"{entry}/title", "cone-beam scan"),
-        provenance=_read_provenance(source, entry),
+        provenance=read_facts(source.name(told), read_word(source, told), {}) if has_told else {},
         lag=_read_lag(source, entry),
         saturation=_read_saturation(source, entry),
     )
     scan.check_timing()
-    mask_shape = check_mask(source, entry, data.shape)
+    mask_shape = detector.check_mask(source, entry, data.shape)
     has_reference = _check_reference(source, entry, grid)
     if not has_grid:
-        _warn_of_grid(source, entry, grid)
-    _warn_of_ignored(source, entry)
+        where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
+        _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
+    for address in (f"{entry}/{name}" for name in schema.IGNORED):
+        if source.find(address) is not None:
+            _log.warning("%s: not read by this package", source.name(address))
     return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, has_grid)
 
 
@@ -111,7 +89,7 @@ def find_entry(source: Hdf5Source) -> str:
     if len(entries) == 1:
         return entries[0]
     found = f"{len(entries)} NXentry groups" if entries else "no NXentry group"
-    raise InputError(source.name("/entry"), found, "a group 'entry'", source.near_miss("/", "entry"))
+    raise source.error("/entry", found, "a group 'entry'", source.near_miss("/", "entry"))
 
 
 def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry) -> tuple[Grid, bool]:
@@ -122,22 +100,8 @@ def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry)
         grid = default_grid(geometry)
     except InputError as error:
         remedy = "correct the geometry, or store the grid"
-        raise InputError(
-            source.name(address), "no grid, and none that follows", error.expected, remedy
-        ) from error
+        raise source.error(address, "no grid, and none that follows", error.expected, remedy) from error
     return grid, False
-
-
-def _warn_of_grid(source: Hdf5Source, entry: str, grid: Grid) -> None:
-    where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
-    _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
-
-
-def _read_model(source: Hdf5Source, entry: str) -> str:
-    address = f"{entry}/{schema.EXTRA}/detector_model"
-    if source.optional(address) is None:
-        return "log"
-    return read_word(source, address, DETECTOR_MODELS)
 
 
 def _read_lag(source: Hdf5Source, entry: str) -> float:
@@ -158,13 +122,6 @@ def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
     return found
 
 
-def _read_provenance(source: Hdf5Source, entry: str) -> dict[str, object]:
-    address = f"{entry}/{schema.EXTRA}/provenance"
-    if source.optional(address) is None:
-        return {}
-    return read_facts(source.name(address), read_word(source, address), {})
-
-
 def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
     if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False
@@ -172,11 +129,5 @@ def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
     volume = source.dataset(address)
     if volume.shape != grid.shape:
         remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
-        raise InputError(source.name(address), f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
+        raise source.error(address, f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
     return True
-
-
-def _warn_of_ignored(source: Hdf5Source, entry: str) -> None:
-    for address in (f"{entry}/{name}" for name in schema.IGNORED):
-        if source.find(address) is not None:
-            _log.warning("%s: not read by this package", source.name(address))

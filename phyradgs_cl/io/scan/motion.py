@@ -1,7 +1,5 @@
 """Where θ(t) comes from in a scan file: pose table, encoder table, or each frame's own two angles."""
 
-from __future__ import annotations
-
 import logging
 import math
 from dataclasses import replace
@@ -92,35 +90,29 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
     sample = entry[schema.SAMPLE]
     write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
     if scan.is_fly and scan.shutter.exposure_s > 0:
-        last_deg = np.rad2deg(last_rad)[frame_of]
-        write_number(sample, "rotation_angle_end", last_deg, "degree", rotates="gantry")
+        write_number(sample, "rotation_angle_end", np.rad2deg(last_rad)[frame_of], "degree", rotates="gantry")
     path = scan.trajectory
     if isinstance(path, PoseTable):
-        _write_poses(entry, path, 0.0 if scan.is_fly else scan.shutter.middle_s)
+        # a stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts
+        time_s = path.time_s - (0.0 if scan.is_fly else scan.shutter.middle_s)
+        write_number(_table_group(entry, "poses", time_s), "pose", path.table, "mm")
     elif scan.is_fly and isinstance(path, CircularOrbit) and isinstance(path.kinematics, EncoderTable | SpeedRamp):
-        _write_kinematics(entry, *_angle_table(scan, path.kinematics))
+        time_s, angle_rad = _angle_table(scan, path.kinematics)
+        group = _table_group(entry, "kinematics", time_s)
+        write_number(group, "angle_deg", np.rad2deg(angle_rad), "degree", rotates="gantry")
 
 
-def _write_poses(entry: h5py.Group, table: PoseTable, earlier_s: float) -> None:
-    """A stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts."""
-    group = new_group(entry[schema.EXTRA], "poses", "NXcollection")
-    write_number(group, "time_s", table.time_s - earlier_s, "s")
-    write_number(group, "pose", table.table, "mm")
-
-
-def _write_kinematics(entry: h5py.Group, time_s: np.ndarray, angle_rad: np.ndarray) -> None:
-    group = new_group(entry[schema.EXTRA], "kinematics", "NXcollection")
+def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group:
+    group = new_group(entry[schema.EXTRA], name, "NXcollection")
     write_number(group, "time_s", time_s, "s")
-    write_number(group, "angle_deg", np.rad2deg(angle_rad), "degree", rotates="gantry")
+    return group
 
 
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """Gantry angles (F,) as each exposure starts and ends; both at mid-window if the gantry stands."""
     shutter = scan.shutter
     offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
-    pairs = np.array(
-        [_angles(scan, frame, start_s + offsets_s) for frame, start_s in enumerate(scan.frame_start_s)]
-    )
+    pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
     return pairs[:, 0], pairs[:, 1]
 
 
@@ -135,10 +127,7 @@ def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.n
     """The encoder's table, or a speed ramp sampled until straight pieces follow it to a nanoradian."""
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
-    first_s, last_s = (
-        float(np.min(scan.frame_start_s)),
-        float(np.max(scan.frame_start_s)) + scan.shutter.span_s,
-    )
+    first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s)) + scan.shutter.span_s
     step_s = math.sqrt(8 * _RAMP_ERROR_RAD / max(abs(kinematics.acceleration_rad_per_s2), 1e-12))
     samples = min(_MOST_RAMP_SAMPLES, max(2, math.ceil((last_s - first_s) / step_s) + 1))
     time_s = np.linspace(first_s, last_s, samples)
@@ -148,11 +137,11 @@ def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.n
 def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
     time_s = read_array(source, address, (None,), TIME)
     if len(time_s) < 2:
-        raise InputError(source.name(address), f"{len(time_s)} samples", "at least 2")
+        raise source.error(address, f"{len(time_s)} samples", "at least 2")
     if np.any(np.diff(time_s) <= 0):
         at = int(np.argmax(np.diff(time_s) <= 0)) + 1
         found = f"times that do not increase at index {at}"
-        raise InputError(source.name(address), found, "strictly increasing times", "sort the table by time")
+        raise source.error(address, found, "strictly increasing times", "sort the table by time")
     return time_s
 
 
@@ -170,7 +159,5 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
     """The table wins, but a wrong sense of rotation should not pass in silence."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
-        worst_deg = math.degrees(apart_rad.max())
-        _log.warning(
-            "%s: up to %.3g° from rotation_angle; the table is used", source.name(address), worst_deg
-        )
+        text = "%s: up to %.3g° from rotation_angle; the table is used"
+        _log.warning(text, source.name(address), math.degrees(apart_rad.max()))

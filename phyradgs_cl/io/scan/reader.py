@@ -1,7 +1,5 @@
 """Scan files: a NeXus NXtomo entry in HDF5, read into a Scan of line integrals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,17 +24,10 @@ ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.nda
 def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     """Read a scan file; the frames become line integrals by ``to_attenuation``.
 
-    Everything but the pixels is checked before the pixels are read. Flat, dark and invalid frames are
-    gone from the result; pixels that the file or the conversion calls bad are in its ``pixel_mask``.
-    Pixels that are not finite must be masked.
-
-    Args:
-        path: the HDF5 file.
-        to_attenuation: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P
-            projections and a mask (v, u) or (P, v, u) of unusable values, or None.
-
-    Returns:
-        The scan, with projections (P, v, u) float32 and a bool ``pixel_mask`` or None.
+    That takes (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P projections and a mask (v, u)
+    or (P, v, u) of unusable values, or None. Everything but the pixels is checked before they are read; flat, dark and
+    invalid frames are left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None: what the file
+    or the conversion calls bad, as everything that is not finite must be.
 
     Raises:
         InputError: the file is missing, damaged or incomplete; its culprit is "FILE:/hdf5/path".
@@ -46,31 +37,26 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
         mask = _read_mask(source, header)
         reference = _read_reference(source, header)
         data = _read_frames(source, header, mask)
-    projections, bad = _convert(source.name(header.data_address), header, data, to_attenuation)
+    projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
     kept = mask[used] if mask is not None and mask.ndim == 3 else mask
     return replace(header.scan, projections=projections, pixel_mask=united(kept, bad), reference=reference)
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
-    """Facts about a scan file, for people: checked as for reading, but without touching the pixels.
-
-    sha256: of the file, where it is known already.
-    """
+    """Facts about a scan file, checked but for its pixels. sha256: of the file, where it is known already."""
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
-    counts = {
-        name: int(np.count_nonzero(key == number))
-        for number, name in enumerate(("projections", "flats", "darks", "invalid"))
-    }
+    kinds = ("projections", "flats", "darks", "invalid")
+    counts = {name: int(np.count_nonzero(key == number)) for number, name in enumerate(kinds)}
     return {
         "title": scan.title,
         **counts,
         "data": f"{header.data_type} {header.quantity}",
         "fly_scan": scan.is_fly,
         "trajectory": _trajectory_word(scan),
-        **_geometry_facts(scan),
+        **vars(scan.geometry),
         **_timing_facts(scan),
         "detector_model": scan.detector_model,
         **_panel_facts(scan),
@@ -80,17 +66,6 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         "grid_stored": header.has_grid,
         "reference": header.has_reference,
         "sha256": sha256 or sha256_of(path),
-    }
-
-
-def _geometry_facts(scan: Scan) -> dict[str, object]:
-    geometry = scan.geometry
-    return {
-        "source_to_axis_mm": geometry.source_to_axis_mm,
-        "source_to_detector_mm": geometry.source_to_detector_mm,
-        "detector_shape": geometry.detector_shape,
-        "pixel_size_mm": geometry.pixel_size_mm,
-        "detector_offset_mm": geometry.detector_offset_mm,
     }
 
 
@@ -106,9 +81,7 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
     }
     if isinstance(scan.trajectory, CircularOrbit):
         orbit, last = scan.trajectory, scan.frames - 1
-        ends = [
-            float(orbit.angle_rad(frame, scan.frame_start_s[frame : frame + 1])[0]) for frame in (0, last)
-        ]
+        ends = [float(orbit.angle_rad(f, scan.frame_start_s[f : f + 1])[0]) for f in (0, last)]
         facts["first_angle_deg"], facts["last_angle_deg"] = np.rad2deg(ends).tolist()
     if scan.is_fly and isinstance(scan.trajectory, CircularOrbit):
         marks_s = scan.frame_start_s[0] + np.array([0.0, shutter.exposure_s, shutter.span_s])
@@ -118,7 +91,6 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
 
 
 def _panel_facts(scan: Scan) -> dict[str, object]:
-    """Pulse and lag, where there are any."""
     facts: dict[str, object] = {}
     if scan.shutter.pulse_s is not None:
         facts["pulse_start_s"], facts["pulse_length_s"] = scan.shutter.pulse_s
@@ -137,37 +109,31 @@ def _trajectory_word(scan: Scan) -> str:
 
 
 def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
-    """Bad pixels, bool (v, u) or (F, v, u)."""
     if header.mask_shape is None:
         return None
-    address = header.mask_address
+    address = f"{header.entry}/{schema.MASK}"
     mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
     used = mask if mask.ndim == 2 else mask[header.image_key == schema.PROJECTION]
     if used.all():
-        remedy = "non-zero means: do not use"
-        raise InputError(source.name(address), "every pixel masked", "at least one zero", remedy)
+        raise source.error(address, "every pixel masked", "at least one zero", "non-zero means: do not use")
     return mask
 
 
 def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
-    """The ground truth (z, y, x) float32 in 1/mm."""
     if not header.has_reference:
         return None
-    address = header.reference_address
+    address = f"{header.entry}/{schema.TRUTH}"
     values = read_values(source, address, source.dataset(address))
     checks.finite(source.name(address), values)
     if values.max() <= 0:
-        found, expected = (
-            f"no voxel above 0 (the largest is {values.max() + 0.0:g})",
-            "a truth to compare with",
-        )
-        raise InputError(source.name(address), found, expected, "take the reference out of the file")
+        found = f"no voxel above 0 (the largest is {values.max() + 0.0:g})"
+        raise source.error(address, found, "a truth to compare with", "take the reference out of the file")
     return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 
 def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None) -> np.ndarray:
     """All stored frames (F, v, u); every value of a frame in use is finite unless it is masked."""
-    data = read_values(source, header.data_address, source.dataset(header.data_address))
+    data = read_values(source, f"{header.entry}/{schema.DATA}", source.dataset(f"{header.entry}/{schema.DATA}"))
     if data.dtype.kind == "f":
         for frame in np.flatnonzero(header.image_key != schema.INVALID):
             bad = ~np.isfinite(data[frame])
@@ -179,7 +145,7 @@ def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None
                     f"NaN or infinity in frame {frame} at ({row}, {column}), {int(bad.sum())} in this frame"
                 )
                 remedy = "set them, or mark them in pixel_mask"
-                raise InputError(source.name(header.data_address), found, "finite values", remedy)
+                raise source.error(f"{header.entry}/{schema.DATA}", found, "finite values", remedy)
     return data
 
 

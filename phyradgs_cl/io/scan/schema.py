@@ -1,8 +1,7 @@
 """Where things stand in a scan file (a NeXus NXtomo entry; see docs on file formats)."""
 
-from __future__ import annotations
-
 DETECTOR = "instrument/detector"
+DATA, MASK = f"{DETECTOR}/data", f"{DETECTOR}/pixel_mask"
 SOURCE = "instrument/source"
 SAMPLE = "sample"
 EXTRA = "phyradgs"
@@ -10,6 +9,7 @@ KINEMATICS = f"{EXTRA}/kinematics"
 POSES = f"{EXTRA}/poses"
 GRID = f"{EXTRA}/grid"
 REFERENCE = f"{EXTRA}/reference"
+TRUTH = f"{REFERENCE}/volume"
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")
@@ -17,14 +17,8 @@ ROTATES = ("gantry", "sample")
 
 # Standard fields that would move the geometry and that this package does not read.
 IGNORED = (
-    f"{DETECTOR}/transformations",
-    f"{DETECTOR}/x_rotation_axis_pixel_position",
-    f"{DETECTOR}/y_rotation_axis_pixel_position",
-    f"{DETECTOR}/estimated_cor_from_motor",
-    f"{DETECTOR}/x_flipped",
-    f"{DETECTOR}/y_flipped",
-    f"{SAMPLE}/transformations",
-    f"{SAMPLE}/x_translation",
-    f"{SAMPLE}/y_translation",
-    f"{SAMPLE}/z_translation",
+    *(f"{DETECTOR}/{name}" for name in ("transformations", "x_rotation_axis_pixel_position")),
+    *(f"{DETECTOR}/{name}" for name in ("y_rotation_axis_pixel_position", "estimated_cor_from_motor")),
+    *(f"{DETECTOR}/{name}" for name in ("x_flipped", "y_flipped")),
+    *(f"{SAMPLE}/{name}" for name in ("transformations", "x_translation", "y_translation", "z_translation")),
 )

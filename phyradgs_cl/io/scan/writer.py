@@ -1,7 +1,5 @@
 """Writing scan files: the NXtomo entry of scan_schema, as other programs read it too."""
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path
@@ -31,22 +29,20 @@ def write_scan(
     image_key: np.ndarray | None = None,
     quantity: str = "attenuation",
 ) -> None:
-    """Write a scan file, whole or not at all.
+    """Write a scan file, whole or not at all; one that exists is replaced.
 
-    Args:
-        path: the HDF5 file; one that exists is replaced.
-        scan: geometry, timing, masks, reference, and the line integrals unless ``data`` is given. A trajectory of one's own
-            is sampled into a table of poses.
-        data: (F, v, u) float32 or uint16 raw frames, flats and darks included, in place of them.
-        image_key: (F,) 0 projection, 1 flat, 2 dark, 3 invalid; it has as many 0 as ``scan`` has frames.
-        quantity: what ``data`` holds: "attenuation", "transmission" or "counts".
+    ``scan`` has the line integrals unless ``data`` is given, (F, v, u) float32 or uint16 raw frames, flats and darks
+    included, whose ``quantity`` is "attenuation", "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2 dark,
+    3 invalid, as many 0 as ``scan`` has frames. A trajectory of one's own becomes a table of poses.
 
     Raises:
         InputError: arguments that do not fit each other, or a scan that the format cannot express.
         OutputError: the file cannot be written.
     """
     frames, key = _checked_frames(scan, data, image_key, quantity)
-    _check_expressible(scan)
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file it would stand
+        remedy = "give the exposure its real length"
+        raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
     with written_beside(path) as temporary, new_hdf5(temporary) as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
@@ -65,13 +61,11 @@ def write_scan(
 def _checked_frames(
     scan: Scan, data: np.ndarray | None, image_key: np.ndarray | None, quantity: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What to store: frames (F, v, u) float32 or uint16, and their keys (F,)."""
     checks.one_of("quantity", quantity, schema.QUANTITIES)
     if data is None:
         if quantity != "attenuation" or image_key is not None:
-            raise InputError(
-                "data", "None", "raw frames with an image_key", "pass the frames of this quantity"
-            )
+            expected = "raw frames with an image_key"
+            raise InputError("data", "None", expected, "pass the frames of this quantity")
         data = scan.projections
     key = np.zeros(len(data), np.int64) if image_key is None else np.asarray(image_key)
     frames = data if data.dtype == np.uint16 else data.astype(np.float32, copy=False)
@@ -83,13 +77,6 @@ def _checked_frames(
     if frames.dtype == np.uint16 and quantity != "counts":
         raise InputError("data", f"{quantity} as uint16", "float32", "only counts may be whole numbers")
     return frames, key
-
-
-def _check_expressible(scan: Scan) -> None:
-    """In a file a scan is a fly-scan only with an exposure."""
-    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:
-        remedy = "give the exposure its real length"
-        raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
 
 
 def _write_instrument(
@@ -150,7 +137,6 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
 
 
 def _write_links(entry: h5py.Group) -> None:
-    """The NXdata group that viewers open first."""
     group = new_group(entry, "data", "NXdata")
     group.attrs["signal"] = "data"
     group.attrs["axes"] = ["rotation_angle", ".", "."]

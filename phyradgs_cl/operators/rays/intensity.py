@@ -27,8 +27,8 @@ _HOST = HostSpace()
 class IntensityOperator:
     """I(x), and J and Jᵀ at the volume for which I was asked last (A and Aᵀ before that).
 
-    Arguments as for ``RayOperator``, whose rule for NumPy's and device arrays holds here too; one operator is used with one
-    kind. It holds frames (F, rows, columns) once for every cell of a line, which is what the softmax weights need.
+    Arguments as for ``RayOperator``, whose rule for NumPy's and device arrays holds here too. It holds frames (F, rows,
+    columns) once for every cell of a line, which is what the softmax weights need.
     """
 
     def __init__(
@@ -52,9 +52,9 @@ class IntensityOperator:
         return self._operators[0].memory
 
     @property
-    def layers(self) -> int:
-        """The most cells of a line: so many times I hold frames."""
-        return len(self._operators)
+    def holds(self) -> tuple[int, int]:
+        """Volumes and stacks of frames that I take on a device beside ``memory``: p and share of every cell of a line."""
+        return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
@@ -122,7 +122,11 @@ class IntensityOperator:
         return out
 
     def _shares_for(self, like: Array) -> list[Any]:
-        if not self._shares and isinstance(like, DeviceArray):
+        is_there = isinstance(like, DeviceArray)
+        if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:  # ``expected`` had the other kind
+            brought = self._device.array if is_there else self._device.numpy
+            self._shares = [brought(share) for share in self._shares]
+        if not self._shares and is_there:
             spread = [self._device.empty(self.frames_shape) for _ in self._operators]
             for weights, share in zip(self._uploaded(), spread, strict=True):
                 self._launch("layer_weights", weights, share)
@@ -155,5 +159,6 @@ class IntensityOperator:
         """Weights (F, lines) of each layer on the device, which keeps them."""
         if not self._line_weights:
             shape = (self.frames_shape[0], -1)
-            self._line_weights = [self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights]
+            # in place: a copy of me that stays at a volume has them too
+            self._line_weights.extend(self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights)
         return self._line_weights

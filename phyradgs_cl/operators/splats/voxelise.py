@@ -33,6 +33,7 @@ class Voxeliser:
         self.tile = self.lists.tile
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self.volume = padded_zeros(rt, nz * ny, nx)
+        self._index: tuple[Grid, DeviceArray] | None = None
         self._records = rt.empty(1)
         self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
@@ -117,7 +118,7 @@ class Voxeliser:
             self._prepare,
             stride // rt.lanes,
             gaussians.rows,
-            split_coefficients(rt, index_matrix(grid)),
+            self._index_of(grid),
             _pitch4(grid),
             np.array([*start[::-1], 0], np.int32),
             self._shape4,
@@ -128,6 +129,12 @@ class Voxeliser:
             self._extents,
             group=rt.group(),
         )
+
+    def _index_of(self, grid: Grid) -> DeviceArray:
+        """``index_matrix`` on the device; it stays there from call to call."""
+        if self._index is None or self._index[0] != grid:
+            self._index = grid, split_coefficients(self.rt, index_matrix(grid))
+        return self._index[1]
 
     def voxelise(self, rows: np.ndarray, grid: Grid) -> np.ndarray:
         """Parameter rows (11, G) to the volume (z, y, x) float32."""

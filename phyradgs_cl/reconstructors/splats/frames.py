@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Exact, Scan, TimeCells
+from phyradgs_cl.acquisition import Exact, Motion, Scan, TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.operators import DeviceCells
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
@@ -36,7 +36,8 @@ class DeviceFrames:
         self.count = scan.frames
         readout = scan.shutter.readout
         self.lines, self.width = readout.shape(scan.geometry.detector_shape)
-        tables, merges = cells_of_scan(scan, options)
+        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        tables, merges = tables_of(scan, options.motion, model)
         self._cells = [DeviceCells.upload(rt, table.scaled(1 / scale.length_mm)) for table in tables]
         self.intensity_unit = scale.line_integral if merges else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
@@ -66,13 +67,10 @@ class DeviceFrames:
         return self._cells[frame], self._measured[frame], self._mask[shared], self._pixels[shared]
 
 
-def cells_of_scan(scan: Scan, options: SplatOptions) -> tuple[list[TimeCells], bool]:
-    """The time cells of every frame, in mm, and whether the detector merges intensities of several."""
-    model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+def tables_of(scan: Scan, motion: Motion, model: str) -> tuple[list[TimeCells], bool]:
+    """The time cells of every frame, in mm, and whether a detector of this model merges intensities of several."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
-    cells, motion = options.motion.cells, options.motion
-    if isinstance(motion, Exact):
-        cells = partial(motion.cells, intensity_peak=peak)
+    cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
     tables = [cells(scan, frame) for frame in range(scan.frames)]
     # of one value both models are the mean
     return tables, model == "intensity" and any(table.averages for table in tables)

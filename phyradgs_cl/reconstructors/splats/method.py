@@ -47,7 +47,7 @@ def reconstruct_splats(
     """
     started = time.perf_counter()
     # a volume that one rank alone has on its host
-    scale, population, rng = rt.ranks.bcast(_start(rt, scan, options, seed) if rt.ranks.rank == 0 else None)
+    scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
     loop = Loop(run, rt.ranks, report, started, record_interval(options.iterations), REPORT_EVERY)
@@ -79,7 +79,7 @@ def reconstruct_splats(
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
 
 
-def _start(
+def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int
 ) -> tuple[Scale, Population, np.random.Generator]:
     """Internal units, the first cloud, and the generator from which it was drawn, all from an FDK volume."""

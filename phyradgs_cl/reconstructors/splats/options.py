@@ -13,6 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
+from phyradgs_cl.text import short_repr
 
 _WEIGHT = (0, 1e6)
 _RANGES = {
@@ -36,7 +37,7 @@ _RANGES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SplatOptions:
     """Everything that a splatting run can be told; lengths in half-sides of the volume, densities relative.
 
@@ -77,6 +78,8 @@ class SplatOptions:
     batch: int = 0
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         checks.within("--iterations", self.iterations, 0, 1_000_000_000)

@@ -107,8 +107,8 @@ class AsdPocs:
         return residual
 
     def state(self) -> dict[str, np.ndarray]:
-        volume = self.system.space.numpy(self.volume)
-        return {**self.sart.state(), "volume": volume, "tv_step": np.array(self.tv_step)}
+        self.sart.volume = self.volume
+        return {**self.sart.state(), "tv_step": np.array(self.tv_step)}
 
     def restore(self, state: State) -> None:
         self.sart.restore(state)

@@ -6,7 +6,7 @@ Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jian
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,17 +133,20 @@ class Sart:
         self._column_weights = [column_weights(subset) for subset in self.subsets[:kept]]
 
     def step(self) -> float:
-        space, squares, clip = self.system.space, 0.0, self.options.nonnegative
-        for index in self._pass():
-            subset = self.subsets[index]
-            residual = subset.residual(self.volume)
-            squares += space.norm(residual) ** 2
-            update = subset.back(space.multiply(residual, self._row_weights[index]))
-            columns = self._columns(index)
-            self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
+        squares = self.system.space.sum_squares(self._corrections())
         self.relaxation *= self.options.relaxation_reduction
         self.iteration += 1
         return float(np.sqrt(squares))
+
+    def _corrections(self) -> Iterator[Any]:
+        """Corrects for all subsets; the residual of each just before its correction."""
+        space, clip = self.system.space, self.options.nonnegative
+        for index in self._pass():
+            subset, columns = self.subsets[index], self._columns(index)
+            residual = subset.residual(self.volume)
+            yield residual
+            update = subset.back(space.multiply(residual, self._row_weights[index]))
+            self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
 
     def _pass(self) -> list[int]:
         count = len(self.subsets)

@@ -71,9 +71,11 @@ class System:
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, (RayOperator, IntensityOperator))]
         if len(operators) < 1 + (self.intensity is not None):
             return self
-        layers = self.intensity.layers if isinstance(self.intensity, IntensityOperator) else 0
+        if isinstance(self.intensity, IntensityOperator):
+            more_volumes, more_frames = self.intensity.holds
+            volumes, frames = volumes + more_volumes, frames + more_frames
         volume_bytes, frames_bytes = 4 * math.prod(self.operator.volume_shape), self.measured.nbytes
-        sizes_bytes = [volume_bytes] * volumes + [frames_bytes] * (frames + layers)
+        sizes_bytes = [volume_bytes] * volumes + [frames_bytes] * frames
         try:
             whole = all(o.memory.holds_all(self.frames) for o in operators)
         except MemoryShortage:

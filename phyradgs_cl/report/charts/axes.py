@@ -1,7 +1,5 @@
 """The frame of a small chart in SVG: data to picture coordinates, ticks, labels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How a run converged: a chart for each quantity of its record that changed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from phyradgs_cl.report.charts.axes import Axes, svg

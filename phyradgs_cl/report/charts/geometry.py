@@ -1,7 +1,5 @@
 """The scanner to scale: the orbit from above, and the fan from the side, from the poses themselves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +24,7 @@ class Plan:
     high: Points
 
     @classmethod
-    def around(cls, *points: Points) -> Plan:
+    def around(cls, *points: Points) -> "Plan":
         every = np.concatenate([p.reshape(-1, 2) for p in points])
         return cls(every.min(axis=0), every.max(axis=0))
 
@@ -70,7 +68,9 @@ class Plan:
 
 def orbit_drawing(scan: Scan) -> Markup:
     """From above: source positions of all frames, the first frame's arc, its fan of rays, panel and volume."""
-    middles, arc = _middle_poses(scan), _first_arc(scan)
+    times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
+    middles = np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
+    arc = _first_arc(scan)
     panels = [panel_corners(pose, scan.geometry.detector_shape) for pose in arc[[0, -1]]]
     first, last = ([c[[0, 1]].mean(0), c[[2, 3]].mean(0)] for c in panels)
     ends, later = np.array(first)[:, :2], np.array(last)[:, :2]
@@ -136,11 +136,6 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
     rows, columns = detector_shape
     u, v = np.array([-0.5, columns - 0.5]), np.array([-0.5, rows - 0.5])
     return np.array([pose[3:6] + a * pose[6:9] + b * pose[9:12] for a in u for b in v])
-
-
-def _middle_poses(scan: Scan) -> Points:
-    times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
-    return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
 
 
 def _first_arc(scan: Scan) -> Points:

@@ -1,7 +1,5 @@
 """Space and time: which detector line sees light when (the paper's Fig. 3), in one frame and in successive ones."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, LineMiddles, MicroViews, Motion, PerRow, Scan, StaticStart
@@ -38,15 +36,8 @@ def frames_drawing(scan: Scan) -> Markup:
     room_s, last = _ROOM * (high_s - low_s), max(scan.lines - 1, 1)
     axes = Axes((low_s - room_s, high_s + room_s), (-_ROOM * last, last * (1 + _ROOM)))
     windows = [w for s in start_s for w in _windows(axes, scan, float(s))]
-    names = [
-        axes.text(
-            s + scan.shutter.delay_s(scan.lines).max() / 2 + scan.shutter.exposure_s / 2,
-            last / 2,
-            str(k),
-            class_="strong over",
-        )
-        for k, s in enumerate(start_s)
-    ]
+    middle_s = scan.shutter.delay_s(scan.lines).max() / 2 + scan.shutter.exposure_s / 2
+    names = [axes.text(s + middle_s, last / 2, str(k), class_="strong over") for k, s in enumerate(start_s)]
     drawn = joined(axes.frame("time (s)", f"detector {scan.shutter.axis[:-1]}"), *windows, *names)
     return svg(drawn, f"Exposure windows of the first {count} frames", shutter_words(scan))
 
@@ -72,11 +63,9 @@ def _windows(axes: Axes, scan: Scan, start_s: float) -> list[Markup]:
         shapes.append((shutter.line_windows_s(scan.lines), "lit"))
     drawn = []
     for windows, class_ in shapes:
-        kept = np.unique(
-            np.linspace(0, scan.lines - 1, 129).round().astype(int)
-        )  # corners of a pulse are few
-        outline = [(start_s + float(windows[r, 0]), float(lines[r])) for r in kept]
-        outline += [(start_s + float(windows[r, 1]), float(lines[r])) for r in kept[::-1]]
+        kept = np.unique(np.linspace(0, scan.lines - 1, 129).round().astype(int))  # corners of a pulse are few
+        ends = [(r, 0) for r in kept] + [(r, 1) for r in kept[::-1]]
+        outline = [(start_s + float(windows[r, end]), float(lines[r])) for r, end in ends]
         drawn.append(axes.polygon(outline, class_))
     return drawn
 
@@ -105,22 +94,17 @@ def _sample_times(scan: Scan, motion: Motion) -> list[tuple[float, float]]:
     if not isinstance(motion, MicroViews):
         shown = np.isin(line, np.unique(np.linspace(0, scan.lines - 1, _LINES_WITH_DOTS).round()))
     times_s = cells.time_s - float(scan.frame_start_s[0])
-    chosen = np.flatnonzero(shown)[:_MOST_DOTS]
-    return [(float(times_s[c]), float(line[c])) for c in chosen]
+    return [(float(times_s[c]), float(line[c])) for c in np.flatnonzero(shown)[:_MOST_DOTS]]
 
 
 def _spans(axes: Axes, scan: Scan) -> list[Markup]:
     """How long a line is open, and how long the panel reads: two bars at the first-read and last-read line."""
     shutter = scan.shutter
     first, last = (0.0, float(max(scan.lines - 1, 1)))[:: shutter.direction]
-    drawn = []
     below, above = (14, -7) if first < last else (-7, 14)
-    drawn += _span(axes, (0.0, shutter.exposure_s), first, f"exposure {number(shutter.exposure_s)} s", below)
-    if shutter.readout_s > 0:
-        drawn += _span(
-            axes, (shutter.exposure_s, shutter.span_s), last, f"readout {number(shutter.readout_s)} s", above
-        )
-    return drawn
+    drawn = _span(axes, (0.0, shutter.exposure_s), first, f"exposure {number(shutter.exposure_s)} s", below)
+    words = f"readout {number(shutter.readout_s)} s"
+    return drawn + _span(axes, (shutter.exposure_s, shutter.span_s), last, words, above) * (shutter.readout_s > 0)
 
 
 def _span(axes: Axes, times_s: tuple[float, float], line: float, words: str, shift: float) -> list[Markup]:

@@ -1,7 +1,5 @@
 """PNG pictures of 8-bit values, grey or by a table of colours, and the tables."""
 
-from __future__ import annotations
-
 import base64
 import io
 
@@ -12,10 +10,7 @@ _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
 
 
 def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
-    """A PNG of an image (rows, columns) uint8, row 0 at the top.
-
-    colours: (256, 3) uint8, what every value looks like; None is grey.
-    """
+    """A PNG of an image (rows, columns) uint8, row 0 at the top; colours (256, 3) uint8, None is grey."""
     from PIL import Image  # a tenth of a second, which most commands need not wait for
 
     picture = Image.fromarray(image)
@@ -27,7 +22,6 @@ def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None
 
 
 def data_uri(png: bytes) -> str:
-    """The address of a picture that is in the page itself."""
     return f"data:image/png;base64,{base64_of(png)}"
 
 

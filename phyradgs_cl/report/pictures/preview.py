@@ -1,7 +1,5 @@
 """A picture of a volume's three middle slices, for a look at a run that is under way."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -25,17 +23,9 @@ log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
-    """Writes a grey PNG of the middle slices, axial, coronal and sagittal from left to right, whole or not at all.
-
-    Args:
-        volume: (nz, ny, nx) in 1/mm; y (axial) and z (the others) point up, x, x and y to the right.
-        grid: its grid; slices have their true proportions.
-        path: file to write.
-
-    Raises:
-        InputError: a volume that does not fit its grid, NaN or infinity.
-        OutputError: the file cannot be written.
-    """
+    """Writes a grey PNG of a volume's (nz, ny, nx) middle slices in true proportions, whole or not at all: axial (y
+    up), coronal and sagittal (z up) from left to right. InputError: a volume that does not fit its grid, NaN or
+    infinity. OutputError: the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -53,11 +43,8 @@ def check_preview(path: Path, *others: Path) -> None:
 
 
 class Preview:
-    """A report of a running method that keeps a picture of the present volume, at most one every ``every_s`` seconds.
-
-    It lies at ``io.partial_path`` of ``path`` until the run has come to its end. A picture that cannot be written ends no
-    run: it is a warning, once.
-    """
+    """A report of a running method that keeps a picture of the present volume at ``io.partial_path`` of ``path``, at
+    most one every ``every_s`` seconds. One that cannot be written is a warning, once."""
 
     def __init__(self, path: Path, report: ProgressReport, every_s: float = 5.0) -> None:
         self.path, self.partial, self.report, self.every_s = path, partial_path(path), report, every_s
@@ -94,7 +81,10 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
     for axis in range(3):
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
-        slices.append(top_row_first(_resampled(image, [max(1, round(side * per_mm)) for side in size_mm])))
+        shape = [max(1, round(side * per_mm)) for side in size_mm]
+        ends = zip(shape, image.shape, strict=True)  # the nearest pixel everywhere: voxels stay visible as such
+        rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
+        slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] for s in slices) + 2 * _GAP
     picture = np.zeros((height, width), np.uint8)
     left = 0
@@ -111,11 +101,3 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
         return 0.0, high
     low, high = float(volume.min()), float(volume.max())
     return low, high if high > low else low + 1.0
-
-
-def _resampled(image: NDArray[np.uint8], shape: list[int]) -> NDArray[np.uint8]:
-    """The nearest pixel's value at every place: voxels stay visible as such."""
-    rows, columns = (
-        ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(shape, image.shape, strict=True)
-    )
-    return image[rows[:, None], columns]

@@ -1,45 +1,9 @@
-"""Frames of a scan against the same frames computed from the volume, each line at its own times."""
+"""Which frames a page shows beside those of its volume."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
-
-from phyradgs_cl.acquisition import PerRow, Scan
-from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.reconstructors.frame_pairs import FramePair, frame_pairs
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
-
-TIMES_PER_LINE = 16  # a line's exposure is sampled so often; what that leaves is far below noise
-Image = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """One frame: measured and computed (rows, columns) line integrals, 0 where ``valid`` is not."""
-
-    frame: int
-    measured: Image
-    computed: Image
-    valid: NDArray[np.bool_]
-
-    @property
-    def residual(self) -> Image:
-        """Measured less computed."""
-        return self.measured - self.computed
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the residual over the pixels that count."""
-        return _rms(self.residual[self.valid])
-
-    @property
-    def relative(self) -> float:
-        """``rms`` as a share of that of the measurement."""
-        return self.rms / (_rms(self.measured[self.valid]) or 1.0)
 
 
 def chosen_frames(frames: int, count: int) -> list[int]:
@@ -47,35 +11,11 @@ def chosen_frames(frames: int, count: int) -> list[int]:
     return sorted({(k * frames) // count for k in range(min(count, frames))})
 
 
-def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
-    """``count`` frames of the run's scan beside those of its volume, under the scan's true motion.
-
-    The measurement is what the run's method saw: lag undone and filtered if the run did so. A panel that averages
-    intensity is compared with intensities that are averaged.
+def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
+    """``count`` frames of the run's scan beside those of its volume, as the run's method saw them: lag undone and
+    filtered.
     """
     if run.scan is None or count < 1:
         return []
-    scan, chosen = prepared(run.scan, run.before), chosen_frames(run.scan.frames, count)
-    motion = PerRow(sub_intervals=TIMES_PER_LINE)
-    tables = [motion.cells(scan, frame) for frame in chosen]
-    operator = RayOperator(rt, run.stored.grid, scan.geometry.detector_shape, tables)
-    computed = operator.forward(run.stored.volume)
-    if scan.detector_model == "intensity":
-        computed = computed - operator.intensity_gap(run.stored.volume)
-    views = []
-    for frame, image in zip(chosen, computed, strict=True):
-        valid = _valid(scan, frame)
-        measured = np.where(valid, scan.projections[frame], 0).astype(np.float32)
-        views.append(View(frame, measured, np.where(valid, image, 0).astype(np.float32), valid))
-    return views
-
-
-def _valid(scan: Scan, frame: int) -> NDArray[np.bool_]:
-    if scan.pixel_mask is None:
-        return np.ones(scan.geometry.detector_shape, bool)
-    mask = np.asarray(scan.pixel_mask)
-    return (mask if mask.ndim == 2 else mask[frame]) == 0
-
-
-def _rms(values: NDArray[np.floating]) -> float:
-    return float(np.sqrt(np.mean(values.astype(np.float64) ** 2))) if values.size else 0.0
+    scan = prepared(run.scan, run.before)
+    return frame_pairs(rt, scan, run.stored.volume, run.stored.grid, chosen_frames(scan.frames, count))

@@ -1,7 +1,5 @@
 """The slices that a page can show: every one of a small volume, evenly chosen ones of a large one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -22,10 +20,8 @@ Volume = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Window:
-    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps of a page's slices span.
-
-    All in 1/mm. ``beyond``: whether there are smaller, and larger values than those.
-    """
+    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps span, all in 1/mm.
+    ``beyond``: whether there are smaller, and larger values than those."""
 
     low: float
     high: float
@@ -34,7 +30,7 @@ class Window:
     beyond: tuple[bool, bool]
 
     @classmethod
-    def of(cls, low: float, high: float, *volumes: Volume) -> Window:
+    def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
         """Room on both sides for streaks and overshoots, as far as there are any."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
@@ -44,11 +40,8 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation. ``indices``: which of ``count`` slices; ``layers``: PNGs in base64, one per index.
-
-    first_mm, step_mm: centre of slice 0 and the way to the next. size_mm: (width, height) of a slice. still: the result's
-    middle slice as it is seen without a script, a PNG.
-    """
+    """The slices of one orientation: PNGs in base64 (``layers``) of ``indices`` among ``count``. first_mm, step_mm: centre
+    of slice 0 and the way to the next. size_mm: (width, height). still: the middle slice as seen without a script, a PNG."""
 
     name: str
     axis: str
@@ -108,7 +101,6 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
 
 
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
-    """A slice as a grey PNG, black ``low`` and white ``high``."""
     return png_bytes(top_row_first(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
 
 

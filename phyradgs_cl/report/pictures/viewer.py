@@ -1,10 +1,9 @@
 """The part of a page in which one walks through the volume, with keyboard, mouse or finger."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 
+from phyradgs_cl.drawing import round_length
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.markup import Markup, element, joined, json_block
 from phyradgs_cl.report.pictures.png import base64_of, data_uri, diverging
@@ -29,6 +28,9 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     ]
     choice = _choice(list(windows)) if len(windows) > 1 else None
     figures = element("div", *(_figure(plane) for plane in planes), class_="slices")
+    layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
+    colours = base64_of(diverging().tobytes()) if "difference" in windows else None
+    data = {plane.name: _plane_data(plane) for plane in planes}
     first = windows["result"]
     legend = f"Black is {number(first.low, first.high)}, white {number(first.high)} 1/mm."
     return joined(
@@ -36,12 +38,11 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
         figures,
         element("p", element("output", legend, id="reading"), class_="note"),
         element("p", _HELP, class_="note help"),
-        json_block("slice-data", _data(planes, windows)),
+        json_block("slice-data", {"planes": data, "windows": layers, "colours": colours}),
     )
 
 
 def _slider(name: str, words: str, low: float, high: float, value: float, told: str, step: float = 1) -> Markup:
-    """A range with its label and an output of what it says."""
     control = element(
         "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-told"
     )
@@ -50,19 +51,10 @@ def _slider(name: str, words: str, low: float, high: float, value: float, told: 
 
 
 def _figure(plane: Plane) -> Markup:
-    """One orientation: picture, cross lines, where the slice is, slider."""
     middle, name = len(plane.indices) // 2, f"{plane.name.capitalize()} slice"
     slider_id, place_id = f"slider-{plane.name}", f"place-{plane.name}"
-    slider = element(
-        "input",
-        type="range",
-        id=slider_id,
-        min=0,
-        max=len(plane.indices) - 1,
-        step=1,
-        value=middle,
-        aria_describedby=place_id,
-    )
+    places = {"min": 0, "max": len(plane.indices) - 1, "step": 1, "value": middle}
+    slider = element("input", type="range", id=slider_id, **places, aria_describedby=place_id)
     caption = element(
         "figcaption",
         element("label", f"{name} ({plane.axis})", for_=slider_id),
@@ -85,15 +77,9 @@ def _picture(plane: Plane, name: str) -> Markup:
     sheet = element("div", image, element("canvas", aria_hidden="true"), class_="sheet")
     ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
     marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
-    bar_mm = _round_length(_BAR * width_mm)
+    bar_mm = round_length(_BAR * width_mm)
     bar = element("span", f"{number(bar_mm)} mm", class_="bar", style=f"width: {100 * bar_mm / width_mm:.6g}%")
     return element("div", sheet, *lines, *marks, bar, class_="picture")
-
-
-def _round_length(most: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten up to ``most``."""
-    power = 10.0 ** math.floor(math.log10(most))
-    return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))
 
 
 def _place(plane: Plane, k: int) -> str:
@@ -112,13 +98,6 @@ def _choice(layers: list[str]) -> Markup:
     return element("fieldset", element("legend", "Show"), *(one(layer) for layer in layers), class_="choice")
 
 
-def _data(planes: list[Plane], windows: Mapping[str, Window]) -> dict[str, object]:
-    """What the script needs: slices and where they are, windows with the decimals that 256 steps deserve, colours."""
-    layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
-    colours = base64_of(diverging().tobytes()) if "difference" in windows else None
-    return {"planes": {plane.name: _plane_data(plane) for plane in planes}, "windows": layers, "colours": colours}
-
-
 def _plane_data(plane: Plane) -> dict[str, object]:
     places = [_place(plane, k) for k in range(len(plane.indices))]
     kept = ("axis", "right", "up", "count", "indices", "first_mm", "step_mm", "layers")
@@ -127,5 +106,4 @@ def _plane_data(plane: Plane) -> dict[str, object]:
 
 
 def _decimals(step: float) -> int:
-    """As many as show a step, and JavaScript writes."""
     return int(min(20, max(0, math.ceil(-math.log10(step))))) if step > 0 else 0

@@ -1,7 +1,5 @@
 """A volume in napari, where that is installed: a window in which one turns and cuts it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +12,7 @@ _AXES = ("z", "y", "x")
 
 
 def view_volume(path: Path) -> None:
-    """Opens a window with a volume file and returns when it is closed.
-
-    Raises:
-        InputError: napari is not installed; not a volume file of ours.
-    """
+    """Opens a window with a volume file and returns when it is closed. InputError: no napari, or no volume file of ours."""
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")

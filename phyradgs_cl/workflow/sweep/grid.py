@@ -1,7 +1,5 @@
 """What a sweep's file asks for: scans by pattern, settings by product and one by one, seeds; checked whole."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -15,7 +13,7 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
-from phyradgs_cl.reconstructors import METHODS, InputOptions, input_options, method_name, method_options
+from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options, usual_preset
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
@@ -50,9 +48,10 @@ class Setting:
     @property
     def label(self) -> str:
         """The setting in a line: the preset where it is not the method's first, options with dotted names."""
-        usual = next(iter(METHODS[self.method].presets))
+        usual = usual_preset(self.method)
         named = [] if self.preset == usual else [f"preset={self.preset}"]
-        named += [f"{name}={_shown(value)}" for name, value in flat({**self.before, **self.changes})]
+        for name, value in flat({**self.before, **self.changes}):
+            named.append(f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
         return " ".join([self.method, *named])
 
 
@@ -66,11 +65,8 @@ class SweepGrid:
 
 
 def read_grid(document: Table, path: Path) -> SweepGrid:
-    """The content of GRID.toml as scans, settings and seeds; patterns start at the folder of ``path``.
-
-    Raises InputError for whatever a run would stumble over: unknown keys and options, values out of range, patterns
-    that match nothing, files that are no scans.
-    """
+    """GRID.toml as scans, settings and seeds; patterns start at the folder of ``path``. InputError for whatever a run would
+    stumble over: unknown keys, values out of range, patterns that match nothing, files that are no scans."""
     refuse_unknown(f"{path}:", document, _KEYS)
     settings = _settings(document, path)
     seeds = _seeds(document.get("seeds", [0]), path)
@@ -105,12 +101,6 @@ def _nested(pairs: Iterator[tuple[str, Any]]) -> dict[str, Any]:
                 raise InputError(name, f"{group}={checks.shown(inside)} too", f"a value or a table {group}")
         inside[last] = value
     return table
-
-
-def _shown(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
 # --- scans and seeds --------------------------------------------------------------------------------------
 
 
@@ -130,20 +120,14 @@ def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
 
 
 def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
-    fits = _is_list_of(int, seeds) and all(
-        not isinstance(seed, bool) and 0 <= seed <= _LARGEST_SEED for seed in seeds
-    )
-    if not fits:
-        raise InputError(
-            f"{path}: seeds", checks.shown(seeds), f"a list of whole numbers from 0 to {_LARGEST_SEED}"
-        )
+    if not (_is_list_of(int, seeds) and all(type(s) is int and 0 <= s <= _LARGEST_SEED for s in seeds)):
+        expected = f"a list of whole numbers from 0 to {_LARGEST_SEED}"
+        raise InputError(f"{path}: seeds", checks.shown(seeds), expected)
     return tuple(dict.fromkeys(seeds))
 
 
 def _is_list_of(kind: type, values: Any) -> bool:
     return isinstance(values, list) and bool(values) and all(isinstance(value, kind) for value in values)
-
-
 # --- settings ---------------------------------------------------------------------------------------------
 
 
@@ -210,8 +194,4 @@ def _checked(values: dict[str, Any]) -> Setting:
     input_options(before)
     nested = _nested(iter(changes.items()))
     method_options(method, preset, nested)
-    return Setting(method, _preset(method, preset), nested, before)
-
-
-def _preset(method: str, preset: str | None) -> str:
-    return next(iter(METHODS[method].presets)) if preset is None else preset
+    return Setting(method, usual_preset(method) if preset is None else preset, nested, before)

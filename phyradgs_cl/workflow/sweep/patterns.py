@@ -1,7 +1,5 @@
 """Regular files by patterns, within bounds: a pattern such as /**/* would otherwise look at all of a machine."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The runs of a sweep, each with a name that follows from what it is."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
@@ -11,7 +9,7 @@ from typing import Any
 
 from phyradgs_cl.io.hdf5.facts import FINITE, SECONDS, TABLE, TEXT, WHOLE, Schema, damage
 from phyradgs_cl.io.json_lines import Line
-from phyradgs_cl.io.names import shortened
+from phyradgs_cl.io.output import shortened
 from phyradgs_cl.reconstructors import input_options
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import ReconstructionJob
@@ -57,23 +55,16 @@ def plan_sweep(grid: SweepGrid, folder: Path, checkpoint_every_s: float = 600.0)
     return list(_planned(grid, folder.resolve(), checkpoint_every_s))
 
 
-def _planned(grid: SweepGrid, folder: Path, checkpoint_every_s: float) -> Iterator[SweepRun]:
+def _planned(grid: SweepGrid, folder: Path, every_s: float) -> Iterator[SweepRun]:
     for scan in grid.scans:
         stat = scan.stat()
         for setting in grid.settings:
             options = plain(asdict(setting.options()))
             for seed in grid.seeds:
                 name = _name(scan, setting, seed)
-                job = ReconstructionJob(
-                    scan,
-                    folder / VOLUMES / f"{name}.h5",
-                    method=setting.method,
-                    preset=setting.preset,
-                    changes=setting.changes,
-                    seed=seed,
-                    before=input_options(setting.before),
-                    checkpoint_every_s=checkpoint_every_s,
-                )
+                volume, before = folder / VOLUMES / f"{name}.h5", input_options(setting.before)
+                what = (setting.method, setting.preset, setting.changes, seed)
+                job = ReconstructionJob(scan, volume, *what, before=before, checkpoint_every_s=every_s)
                 facts = {
                     "run": name,
                     "scan": plain_text(str(scan)),

@@ -1,7 +1,5 @@
 """Makes the runs that a sweep's results file lacks, at workers or one after the other, and then the tables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +11,13 @@ from phyradgs_cl.cluster import Lost, Pool, PoolState, Workers, runtime_of_proce
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import only_run
 from phyradgs_cl.io.json_lines import Line, append_line, read_lines, refuse_irregular
+from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.workflow.sweep.grid import SweepGrid
 from phyradgs_cl.workflow.sweep.plan import VOLUMES, SweepRun, is_sound, missing_runs, plan_sweep
 from phyradgs_cl.workflow.sweep.tables import write_tables
-from phyradgs_cl.workflow.sweep.task import lost_line, make_run
+from phyradgs_cl.workflow.sweep.task import failed_line, make_run
 
 RESULTS = "results.jsonl"
 
@@ -36,10 +35,8 @@ class SweepJob:
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """Where a sweep is: runs done of all, failed ones among them, those at workers; ``line`` of a run just done.
-
-    ``name`` and ``progress`` are of the run under way in this process, ``dashboard`` is said once.
-    """
+    """Where a sweep is: runs done of all, failed ones among them, those at workers; ``line`` of a run just done;
+    ``name`` and ``progress`` of the run under way in this process; ``dashboard`` is said once."""
 
     done: int
     total: int
@@ -56,15 +53,9 @@ Report = Callable[[SweepProgress], None]
 
 @np.errstate(all="ignore")
 def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[list[Path], int]:
-    """Makes what is missing, then tables; the files written, and how many runs of the grid have failed now.
-
-    A run is in the file once, when it is done; an interruption (KeyboardInterrupt) loses nothing that is done. Runs that
-    failed are made again by the next call.
-
-    Raises:
-        OutputError: the folder cannot be written; BusyError while another sweep is at work on it.
-        InputError: no scheduler, or a package that is not installed.
-    """
+    """Makes what is missing, then tables; the files written, and how many runs of the grid have failed now, which the next
+    call makes again. An interruption (KeyboardInterrupt) loses nothing that is done. OutputError: the folder cannot be
+    written; BusyError while another sweep is at work on it. InputError: no scheduler, or a package that is not installed."""
     results = _results_file(job.folder)
     with only_run(results):
         lines = read_lines(results, is_sound)
@@ -116,7 +107,7 @@ class _Batch:
         with Pool(workers) as pool:
             self._say(dashboard=pool.dashboard)
             for name, found in pool.results(make_run, by_name, look):
-                yield lost_line(by_name[name], found.reason) if isinstance(found, Lost) else found
+                yield failed_line(by_name[name], found.reason) if isinstance(found, Lost) else found
 
     def _say(self, **more: Any) -> None:
         self.report(SweepProgress(self.done, self.total, self.failed, **more))
@@ -124,9 +115,9 @@ class _Batch:
 
 def _results_file(folder: Path) -> Path:
     path = folder / RESULTS
+    make_folder(folder / VOLUMES, folder)
+    refuse_irregular(path)
     try:
-        (folder / VOLUMES).mkdir(parents=True, exist_ok=True)
-        refuse_irregular(path)
         path.open("ab").close()
     except OSError as error:
         found = error.strerror or str(error)

@@ -1,7 +1,5 @@
 """A sweep's results as tables: one line per setting in Markdown, one line per run in CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator, Sequence
@@ -24,13 +22,10 @@ _RESULTS = ("psnr_db", "ssim", "seconds", "gaussians", "device", "host", "versio
 def write_tables(folder: Path, lines: Sequence[Line], plan: Sequence[SweepRun]) -> list[Path]:
     """Writes results.md and results.csv about the planned runs, by their newest lines; the two paths."""
     newest = {line["run"]: line for line in lines}
-    chosen = [
-        newest[run.name] for run in plan if run.name in newest and same_run(newest[run.name], run.facts)
-    ]
-    written = {
-        folder / "results.md": markdown(chosen, len(plan)),
-        folder / "results.csv": comma_separated(chosen),
-    }
+    found = [(newest[run.name], run.facts) for run in plan if run.name in newest]
+    chosen = [line for line, facts in found if same_run(line, facts)]
+    tables = {"results.md": markdown(chosen, len(plan)), "results.csv": comma_separated(chosen)}
+    written = {folder / name: text for name, text in tables.items()}
     for path, text in written.items():
         with written_beside(path) as temporary:
             temporary.write_text(plain_text(text), encoding="utf-8", newline="")
@@ -48,10 +43,8 @@ def markdown(lines: Sequence[Line], planned: int) -> str:
     ]
     for label in dict.fromkeys(line["label"] for line in done):
         same = [line for line in done if line["label"] == label]
-        numbers = [
-            _spread([line["metrics"].get(name) for line in same], form)
-            for name, (_, form) in _METRICS.items()
-        ]
+        found = {name: [line["metrics"].get(name) for line in same] for name in _METRICS}
+        numbers = [_spread(found[name], form) for name, (_, form) in _METRICS.items()]
         seconds = _spread([line["seconds"] for line in same], ".1f")
         rows.append("| " + " | ".join([_cell(label), str(len(same)), *numbers, seconds]) + " |")
     rows += _failures([line for line in lines if "error" in line])

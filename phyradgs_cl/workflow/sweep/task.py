@@ -1,7 +1,5 @@
 """One run of a sweep, wherever it is made: in a worker or in this process."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math
@@ -18,7 +16,7 @@ from phyradgs_cl.io.json_lines import Line, json_text
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.reconstructors import ProgressReport, ignore_progress
 from phyradgs_cl.runtime.environment import environment
-from phyradgs_cl.workflow.resumable import go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import go_on, is_whole
 from phyradgs_cl.workflow.sweep.plan import SweepRun, is_sound, same_run
 
 _BUSY_S, _BUSY_EVERY_S = 600.0, 1.0
@@ -27,13 +25,9 @@ log = logging.getLogger(__name__)
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """The line of a run: made now, or kept beside its volume by a worker whose answer was lost.
-
-    Where the run fails, the line has its error. Raises KeyboardInterrupt for a run that was stopped, and OutputError where
-    nothing can be written: that would fail every other run too.
-    """
-    kept = _kept(run)
-    if kept is not None:
+    """The line of a run, with its error where it fails: made now, or kept beside its volume by a worker whose answer
+    was lost. Raises KeyboardInterrupt for a run that was stopped, OutputError where nothing can be written."""
+    if (kept := _kept(run)) is not None:
         return kept
     try:
         return _made(run, report, device)
@@ -42,11 +36,11 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
             raise
         if isinstance(error, DeviceError):
             forget_runtimes()
-        return _failed(run, str(error) or type(error).__name__)
+        return failed_line(run, str(error) or type(error).__name__)
     except Exception as error:  # a defect that one run meets must not cost a night's other runs
         log.exception("%s", run.name)
         forget_runtimes()
-        return _failed(run, f"{type(error).__name__}: {error}")
+        return failed_line(run, f"{type(error).__name__}: {error}")
 
 
 def _made(run: SweepRun, report: ProgressReport, device: str | None) -> Line:
@@ -59,8 +53,7 @@ def _made(run: SweepRun, report: ProgressReport, device: str | None) -> Line:
             if time.monotonic() > deadline:
                 raise
             time.sleep(_BUSY_EVERY_S)
-        kept = _kept(run)
-        if kept is not None:
+        if (kept := _kept(run)) is not None:
             return kept
 
 
@@ -95,22 +88,14 @@ def _kept(run: SweepRun) -> Line | None:
     return line if isinstance(line, dict) and is_sound(line) and same_run(line, run.facts) else None
 
 
-def _failed(run: SweepRun, error: str) -> Line:
+def failed_line(run: SweepRun, error: str) -> Line:
+    """The line of a run that failed, or whose workers died."""
     finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return {
-        **run.facts,
-        "error": error[:_LONGEST_ERROR],  # a compiler's may have many pages
-        "version": __version__,
-        "host": platform.node(),
-        "finished": finished,
-    }
+    told = error[:_LONGEST_ERROR]  # a compiler's may have many pages
+    here = {"version": __version__, "host": platform.node(), "finished": finished}
+    return {**run.facts, "error": told, **here}
 
 
 def _number(value: Any) -> float | None:
     """JSON has neither NaN nor infinity."""
     return float(value) if math.isfinite(value) else None
-
-
-def lost_line(run: SweepRun, reason: str) -> Line:
-    """The line of a run whose workers died."""
-    return _failed(run, reason)

@@ -1,9 +1,4 @@
-"""Which files of a folder are complete, by looking at it again and again: that works on every file system.
-
-Notices of the kernel would not: a network file system sends none about what other machines write.
-"""
-
-from __future__ import annotations
+"""Which files of a folder are complete, by looking again: network file systems send no notice of others' writes."""
 
 import os
 import stat
@@ -35,12 +30,9 @@ class Arrival:
 
 
 class Arrivals:
-    """Looks at a folder. A file is complete when its size and times have stood still for ``settle_s``.
-
-    It is complete at once where something was done to it after the last byte: it was renamed into place, or copied with its
-    times kept. Then the time of its last change (ctime) is later than that of its last byte (mtime); both are the file
-    server's, so its clock does not matter.
-    """
+    """Looks at a folder. A file is complete when its size and times have stood still for ``settle_s``; at once where it
+    was renamed into place, or copied with its times kept: then its last change (ctime) is later than its last byte
+    (mtime), both by the file server's clock."""
 
     def __init__(self, folder: Path, settle_s: float, now: Callable[[], float] = time.monotonic) -> None:
         self.folder, self.settle_s, self._now = folder, settle_s, now

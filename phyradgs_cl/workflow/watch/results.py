@@ -1,19 +1,16 @@
 """What a watched folder's scans have become: volumes, errors, and work that was interrupted."""
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, partial_path, written_beside
-from phyradgs_cl.io.names import beside
+from phyradgs_cl.io.output import beside
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.watch.arrivals import Arrival
 
-_WORK = ".work"
+WORK = ".work"
 
 
 @dataclass(frozen=True)
@@ -22,17 +19,9 @@ class Results:
 
     folder: Path
 
-    def make_folders(self) -> None:
-        """Raises OutputError where the folder cannot be written."""
-        try:
-            (self.folder / _WORK).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise OutputError(str(self.folder), found, "a folder that can be written") from error
-
     def sweep_up(self) -> None:
         """Removes what a killed run was writing: nobody else is at work here."""
-        for path in (self.folder / _WORK).glob(".*.part"):
+        for path in (self.folder / WORK).glob(".*.part"):
             with suppress(OSError):
                 path.unlink()
 
@@ -40,7 +29,7 @@ class Results:
         return self.folder / f"{scan.stem}.h5"
 
     def work(self, scan: Path) -> Path:
-        return self.folder / _WORK / f"{scan.stem}.h5"
+        return self.folder / WORK / f"{scan.stem}.h5"
 
     def error(self, scan: Path) -> Path:
         return beside(self.folder / scan.stem, ".error.txt")

@@ -1,7 +1,5 @@
 """Reconstructs a folder's scans as they arrive. Its state is the files that it writes: it may be killed at any moment."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable
@@ -11,13 +9,13 @@ from pathlib import Path
 from phyradgs_cl import checks, signals
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError, PhyradgsError
 from phyradgs_cl.io import checkpoint_path, only_run
+from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow.reconstruct import ReconstructionJob
-from phyradgs_cl.workflow.resumable import go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import ReconstructionJob, go_on, is_whole
 from phyradgs_cl.workflow.watch.arrivals import Arrival, Arrivals
-from phyradgs_cl.workflow.watch.results import Results
+from phyradgs_cl.workflow.watch.results import WORK, Results
 
 _LOCK = "watch"
 log = logging.getLogger(__name__)
@@ -26,9 +24,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class WatchJob:
     """Which folder to watch, and how its scans are reconstructed into ``output``: as ``template``, but for its files.
-
-    poll_s: between two looks at the folder. settle_s: how long a file must stand still. once: end when nothing is left.
-    """
+    poll_s: between two looks at the folder. settle_s: how long a file must stand still. once: end when nothing is left."""
 
     folder: Path
     output: Path
@@ -58,19 +54,13 @@ def run_watch(
     tell: Callable[[WatchEvent], None],
     report: Callable[[Path], ProgressReport] = lambda scan: ignore_progress,
 ) -> None:
-    """Looks, reconstructs, looks again; returns only with ``once``.
-
-    A signal during a run ends it after the iteration under way, with a checkpoint that the next start goes on from, as
-    KeyboardInterrupt.
-
-    Raises:
-        InputError: no such folder, or it is also the output.
-        OutputError: nothing can be written; BusyError while another watch has the output.
-        DeviceError: no device, or none any more.
-    """
+    """Looks, reconstructs, looks again; returns only with ``once``. A signal during a run ends it after the iteration under
+    way, as KeyboardInterrupt, with a checkpoint that the next start goes on from. InputError: no such folder, or it is also
+    the output. OutputError: nothing can be written; BusyError while another watch has the output. DeviceError: no device,
+    or none any more."""
     _check_folders(job)
     results = Results(job.output)
-    results.make_folders()
+    make_folder(job.output / WORK, job.output)
     with only_run(job.output / _LOCK):
         results.sweep_up()
         _Watch(job, results, make_runtime, tell, report).run()
@@ -126,10 +116,8 @@ class _Watch:
         return found
 
     def _handle(self, arrival: Arrival) -> bool:
-        """Makes the volume of a scan, or its error; False for a file that somebody has open, which waits.
-
-        A device that fails is opened anew, once; if it is gone, that ends the watch.
-        """
+        """Makes the volume of a scan, or its error; False for a file that somebody has open, which waits. A device that
+        fails is opened anew, once; if it is gone, that ends the watch."""
         try:
             return self._reconstruct(arrival)
         except OutOfMemoryError as error:
@@ -174,15 +162,10 @@ class _Watch:
             return False
 
     def _fail(self, arrival: Arrival, error: BaseException) -> bool:
-        if not arrival.is_unchanged() or _is_open_elsewhere(error):
+        if not arrival.is_unchanged() or "unable to lock file" in str(error):  # HDF5 locks a file that it writes
             return False
         message = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
         with finish_despite_interrupt():
             self.results.set_aside(arrival, message)
         self.tell(WatchEvent(arrival.path, error=message))
         return True
-
-
-def _is_open_elsewhere(error: BaseException) -> bool:
-    """HDF5 locks a file that it writes."""
-    return "unable to lock file" in str(error)

@@ -1,11 +1,8 @@
 """Looks at one HDF5 file within limits: python FOLDER FILE SMALL_BYTES MOST_OBJECTS MEMORY_BYTES CPU_SECONDS SECONDS.
 
-Every object is opened, every attribute read and every dataset of at most SMALL_BYTES. The process ends with status 0, with
-LARGE where that took more memory than headers need, or by the signal of a limit or a crash. Nothing of phyradgs_cl is
-imported, and nothing that takes long to start.
+Opens every object, reads every attribute and every dataset of at most SMALL_BYTES. Ends with status 0, with LARGE where that
+took more memory than headers need, or by the signal of a limit or a crash. Imports nothing of phyradgs_cl, and nothing slow.
 """
-
-from __future__ import annotations
 
 import signal
 import sys

@@ -1,0 +1,110 @@
+"""Geometries of ASTRA and TIGRE to poses, and back. Neither package is needed: both are numbers and names of attributes.
+
+ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, step from row to row, x y z each.
+TIGRE's cone is ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest; its pairs run (v, u),
+its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid, triple
+
+
+def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
+    """Poses (F, 12) of ``cone_vec`` rows (F, 12) in mm, for a panel of (rows, columns)."""
+    table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
+    pose: np.ndarray = table.copy()
+    pose[:, 3:6] -= _to_middle(pose, panel)
+    return pose
+
+
+def astra_of_poses(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
+    """The inverse of ``poses_of_astra``."""
+    vectors = np.array(pose, np.float64)
+    vectors[:, 3:6] += _to_middle(vectors, panel)
+    return vectors
+
+
+def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
+    """From the centre of pixel (0, 0) to that of the panel (F, 3)."""
+    rows, columns = panel
+    middle: np.ndarray = (columns - 1) / 2 * pose[:, 6:9] + (rows - 1) / 2 * pose[:, 9:12]
+    return middle
+
+
+def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
+    """Poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry and its angles (F,), or (F, 3) Euler angles.
+
+    Raises InputError for what has no place in a scan: parallel beams, a turned panel, a second or third Euler angle, a
+    volume that moves from frame to frame, and attributes that are missing or no numbers.
+    """
+    if getattr(geo, "mode", None) not in (None, "cone"):
+        raise InputError(
+            "geo.mode", checks.shown(geo.mode), "'cone'", "parallel beams have no source distance"
+        )
+    angles = np.asarray(angles_rad)
+    angles = checks.numbers("angles", angles_rad, (None, 3) if angles.ndim == 2 else (None,))
+    if angles.ndim == 2:
+        _refuse("angles", angles[:, 1:], "turns about z only: (F,), or (F, 3) with zeros behind the first")
+        angles = angles[:, 0]
+    frames = len(angles)
+    _refuse("geo.rotDetector", _each(geo, "rotDetector", frames, 3, 0.0), "zeros: a panel that is not turned")
+    offset_mm = _each(geo, "offOrigin", frames, 3, 0.0)
+    _refuse("geo.offOrigin", offset_mm - offset_mm[0], "one offset (z, y, x) for all frames")
+    rows, columns = (int(n) for n in _counts(geo, "nDetector", 2))
+    counts, voxel_mm = _counts(geo, "nVoxel", 3), checks.numbers("geo.dVoxel", _of(geo, "dVoxel"), (3,))
+    grid = Grid(triple(int(n) for n in counts), triple(voxel_mm.tolist()), triple(offset_mm[0].tolist()))
+    pitch_v, pitch_u = checks.numbers("geo.dDetector", _of(geo, "dDetector"), (2,)).tolist()
+    to_axis, to_panel, shift = (_each(geo, name, frames, 1, 0.0)[:, 0] for name in ("DSO", "DSD", "COR"))
+    offset_v, offset_u = _each(geo, "offDetector", frames, 2, 0.0).T
+    poses = np.empty((frames, POSE_LENGTH))
+    for i, angle in enumerate(angles):
+        offset = float(offset_v[i]), float(offset_u[i])
+        cone = ConeGeometry(
+            float(to_axis[i]), float(to_panel[i]), (rows, columns), (pitch_v, pitch_u), offset
+        )
+        poses[i] = cone.pose(angle)
+        poses[i, :6] += np.tile(shift[i] * poses[i, 6:9] / pitch_u, 2)
+    return poses, (rows, columns), grid
+
+
+def _of(geo: Any, name: str) -> Any:
+    """An attribute of a TIGRE geometry, or InputError."""
+    if getattr(geo, name, None) is None:
+        raise InputError(f"geo.{name}", "nothing", "TIGRE's attribute of this name", f"set geo.{name}")
+    return getattr(geo, name)
+
+
+def _counts(geo: Any, name: str, length: int) -> np.ndarray:
+    counts = checks.numbers(f"geo.{name}", _of(geo, name), (length,))
+    if (counts < 1).any() or (counts != np.floor(counts)).any():
+        raise InputError(
+            f"geo.{name}", checks.shown(counts.tolist()), f"{length} whole numbers of at least 1"
+        )
+    return counts
+
+
+def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
+    """An attribute for every frame (F, length), from one for all or one each; ``absent`` where it may be missing and is."""
+    needed = name in ("DSO", "DSD")
+    value = _of(geo, name) if needed else getattr(geo, name, None)
+    table = checks.numbers(f"geo.{name}", absent if value is None else value)
+    per_frame = (frames,) if length == 1 else (frames, length)
+    if table.shape in ((), (1,), (length,)):
+        return np.broadcast_to(table, (frames, length))
+    if table.shape not in (per_frame, (frames, length)):
+        raise InputError(
+            f"geo.{name}", f"shape {table.shape}", f"{length} for all frames, or shape {per_frame}"
+        )
+    return table.reshape(frames, length)
+
+
+def _refuse(culprit: str, values: np.ndarray, expected: str) -> None:
+    if np.any(values):
+        raise InputError(culprit, checks.shown(float(values[np.nonzero(values)][0])), expected)

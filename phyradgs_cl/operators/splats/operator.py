@@ -1,0 +1,164 @@
+"""Splats as whole operators in mm and 1/mm: of a scan's frames, and of a grid, each with its derivative's transpose.
+
+A cloud is entered once (``rows.enter``), then rendered and differentiated as often as needed. ``back`` renders nothing: it
+sees the Gaussians again from the poses (``prepare``), and leaves that out where the last call has just done so. Everything
+lies on the device, without padding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.gaussians import ROWS
+from phyradgs_cl.operators.splats.layout import DeviceCells
+from phyradgs_cl.operators.splats.plain import PlainImages, PlainRows, SplatPoint
+from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR, SplatProjector
+from phyradgs_cl.operators.splats.voxelise import Voxeliser
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+
+class SplatOperator:
+    """Parameter rows (11, G) to frames (F, rows, columns) of line integrals, averaged as they are or by ``intensity``.
+
+    ``tables`` has the time cells of each frame in mm, all read out along one axis; ``length_mm`` is the kernels' unit of
+    length, in which their float32 likes the scene to be of order 1. Subsets share all memory: use them one at a time.
+    """
+
+    def __init__(
+        self,
+        rt: Runtime,
+        detector_shape: tuple[int, int],
+        tables: Sequence[TimeCells],
+        length_mm: float,
+        *,
+        intensity: bool = False,
+        affine: bool = False,
+        cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+        time_error: float = DEFAULT_TIME_ERROR,
+        pixel_footprint: bool = False,
+    ) -> None:
+        readout = tables[0].readout
+        self.rt, self.is_layered = rt, intensity
+        self._projector = SplatProjector(
+            rt,
+            *readout.shape(detector_shape),
+            affine=affine,
+            cutoff_sigma=cutoff_sigma,
+            time_error=time_error,
+            pixel_footprint=pixel_footprint,
+            intensity_unit=1.0 if intensity else None,
+        )
+        self.rows = PlainRows(rt, length_mm, line_integrals=True)
+        self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
+        self._cells = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
+        self._ready = _Ready()
+        self.frames_shape = (len(tables), *detector_shape)
+
+    def forward(self, point: SplatPoint) -> DeviceArray:
+        """Frames (F, rows, columns) float32 of a cloud."""
+        frames = self.rt.empty(self.frames_shape)
+        self._ready.forget()
+        for number, cells in enumerate(self._cells):
+            image = self._projector.forward(point.gaussians, cells)
+            self._images.leave(image, frames, number)
+        self._ready.note(point, self._cells[-1])
+        return frames
+
+    def back(self, point: SplatPoint, by_frames: DeviceArray) -> DeviceArray:
+        """dL/drows (11, G) float32 at a cloud from dL/dframes (F, rows, columns)."""
+        rt, gaussians = self.rt, point.gaussians
+        by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
+        for number, cells in enumerate(self._cells):
+            if not self._ready.holds(point, cells):
+                self._ready.forget()
+                see = self._projector.forward if self.is_layered else self._projector.prepare
+                see(gaussians, cells)  # intensities are merged anew: their derivative depends on every layer
+            by_image = self._images.enter(by_frames, number)
+            self._projector.backward(gaussians, cells, by_image, gradients)
+            self.rows.leave(gradients, point, by_rows, add=number > 0)
+        self._ready.note(point, self._cells[-1])
+        return by_rows
+
+    def subset(self, frames: Sequence[int]) -> SplatOperator:
+        """The same operator on some of the frames, in this order; costs nothing."""
+        part = copy(self)
+        part._cells = [self._cells[f] for f in frames]
+        if not part._cells:
+            raise InputError("subset", "no frames", "at least one frame")
+        part.frames_shape = (len(part._cells), *self.frames_shape[1:])
+        return part
+
+
+class DensityOperator:
+    """The linear part of a ``SplatOperator``: densities (G,) in 1/mm of a cloud that stays where it is, to frames."""
+
+    def __init__(self, operator: SplatOperator, point: SplatPoint) -> None:
+        self._operator, self._point = operator, point
+
+    def forward(self, density: DeviceArray) -> DeviceArray:
+        """Densities (G,) float32 to frames (F, rows, columns)."""
+        return self._operator.forward(self._operator.rows.with_densities(self._point, density))
+
+    def adjoint(self, frames: DeviceArray) -> DeviceArray:
+        """Frames (F, rows, columns) float32 to densities (G,)."""
+        return self._operator.rows.densities(self._operator.back(self._point, frames))
+
+    def subset(self, frames: Sequence[int]) -> DensityOperator:
+        """The same operator on some of the frames, in this order."""
+        return DensityOperator(self._operator.subset(frames), self._point)
+
+
+class VoxelOperator:
+    """Parameter rows (11, G) to the field (nz, ny, nx) in 1/mm at the centres of a grid's voxels."""
+
+    def __init__(self, rt: Runtime, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA) -> None:
+        nz, ny, nx = grid.shape
+        length_mm = grid.half_longest_mm
+        self.rt, self.volume_shape = rt, grid.shape
+        self._inside = grid.scaled(1 / length_mm)
+        self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
+        self.rows = PlainRows(rt, length_mm, line_integrals=False)
+        self._images = PlainImages(rt, nz * ny, nx)
+        self._ready = _Ready()
+
+    def forward(self, point: SplatPoint) -> DeviceArray:
+        """The field (nz, ny, nx) float32 of a cloud."""
+        volume = self.rt.empty(self.volume_shape)
+        self._ready.forget()
+        self._images.leave(self._voxeliser.forward(point.gaussians, self._inside), volume)
+        self._ready.note(point, self)
+        return volume
+
+    def back(self, point: SplatPoint, by_volume: DeviceArray) -> DeviceArray:
+        """dL/drows (11, G) float32 at a cloud from dL/dvolume (nz, ny, nx)."""
+        rt, gaussians = self.rt, point.gaussians
+        by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
+        if not self._ready.holds(point, self):
+            self._ready.forget()
+            self._voxeliser.prepare(gaussians, self._inside, (0, 0, 0))
+        self._voxeliser.backward(gaussians, self._inside, self._images.enter(by_volume), gradients, add=False)
+        self.rows.leave(gradients, point, by_rows)
+        self._ready.note(point, self)
+        return by_rows
+
+
+class _Ready:
+    """Of which cloud, seen from where, the kernels' buffers hold what a gradient needs."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Before the buffers change: what fails then must not be taken for done."""
+        self._point: SplatPoint | None = None
+        self._where: object = None
+
+    def note(self, point: SplatPoint, where: object) -> None:
+        self._point, self._where = point, where
+
+    def holds(self, point: SplatPoint, where: object) -> bool:
+        return self._point is point and self._where is where

@@ -1,0 +1,89 @@
+"""Every name of the API says what it takes and gives: parameters by name, shapes, units, errors."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from phyradgs_cl import api
+
+SHAPE = re.compile(r"\((?:[A-Z]\w*|\.\.\.|n?[zvyxu]|n|rows|lines|\d+)(?:,|\))")
+UNIT = re.compile(
+    r"\b(?:mm|1/mm|s|rad|radians|degrees|deg|dB|dimensionless|line integrals?|counts|1/s)\b|_(?:mm|s|rad|deg)\b"
+)
+ERROR = re.compile(r"\b[A-Z]\w*Error\b|\bKeyboardInterrupt\b")
+ARRAYS = ("ndarray", "NDArray", "ArrayLike", "Gaussians", "Scan")
+
+
+def said(name: str) -> str:
+    """The docstring of a name; nothing where dataclasses made it."""
+    doc = inspect.getdoc(getattr(api, name)) or ""
+    return "" if doc.startswith(f"{name}(") else doc
+
+
+def parameters(thing: Any) -> list[inspect.Parameter]:
+    """What a function or a constructor takes, in so far as users give it."""
+    if inspect.isclass(thing) and (
+        issubclass(thing, Exception | BaseException) or getattr(thing, "_is_protocol", False)
+    ):
+        return []
+    found = inspect.signature(thing).parameters.values()
+    return [p for p in found if p.name not in ("self", "culprit") and not p.name.startswith("_")]
+
+
+def members(name: str) -> Iterator[tuple[str, Any]]:
+    """The public methods and properties that a class of ours defines itself."""
+    thing = getattr(api, name)
+    if inspect.isclass(thing) and thing.__module__.startswith("phyradgs_cl"):
+        for member, value in vars(thing).items():
+            if not member.startswith("_") and (
+                inspect.isroutine(value) or isinstance(value, property | classmethod)
+            ):
+                yield member, value.__func__ if isinstance(value, classmethod | staticmethod) else value
+
+
+def missing(name: str) -> list[str]:
+    """What the docstring of a name does not say."""
+    thing, doc = getattr(api, name), said(name)
+    if not doc:
+        return ["a docstring"]
+    taken = parameters(thing)
+    lacks = [f"its parameter {p.name}" for p in taken if not re.search(rf"\b{p.name}\b", doc)]
+    annotations = " ".join(
+        [str(p.annotation) for p in taken] + [str(getattr(thing, "__annotations__", {}).get("return"))]
+    )
+    if any(word in annotations for word in ARRAYS) and not SHAPE.search(doc):
+        lacks.append("the shape of its arrays")
+    is_measure = "float" in annotations or any(word in annotations for word in ARRAYS)
+    if is_measure and not UNIT.search(doc):
+        lacks.append("its units")
+    if taken and not ERROR.search(doc):
+        lacks.append("the error that it raises")
+    lacks += [f"a docstring of {member}" for member, value in members(name) if not inspect.getdoc(value)]
+    return lacks
+
+
+@pytest.mark.parametrize("name", api.__all__)
+def test_a_name_says_what_it_takes_and_gives(name) -> None:
+    assert not missing(name), f"{name} does not say {', '.join(missing(name))}"
+
+
+def test_the_test_sees_what_is_not_said(monkeypatch) -> None:
+    def silent(volume: np.ndarray, side_mm: float) -> None: ...  # noqa: F821
+
+    def brief(volume: np.ndarray, side_mm: float) -> None:  # noqa: F821
+        """The volume."""
+
+    monkeypatch.setattr(api, "silent", silent, raising=False)
+    monkeypatch.setattr(api, "brief", brief, raising=False)
+    assert missing("silent") == ["a docstring"]
+    assert missing("brief") == [
+        "its parameter side_mm",
+        "the shape of its arrays",
+        "its units",
+        "the error that it raises",
+    ]

@@ -1,0 +1,171 @@
+"""Ctrl-C in a script: the script stops, and what there is is not lost."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl import api
+from phyradgs_cl.api import Progress, reconstruct
+
+SCRIPT = """
+import sys
+import phyradgs_cl.api as api
+scan = api.simulate("jaw", size=12, detector=20, views=6)
+
+def tell(progress):
+    print("iteration", progress.iteration, flush=True)
+
+try:
+    api.reconstruct(scan, {method!r}, iterations={iterations}, report=tell)
+except KeyboardInterrupt as error:
+    print("partial", error.partial.facts["interrupted_at"], flush=True)
+    api.save_volume("partial.h5", error.partial)
+    raise
+print("the next line")
+"""
+
+
+def run_script(tmp_path: Path, method: str, iterations: int) -> tuple[int, list[str], str]:
+    """A script that gets one real SIGINT after its first report: its status, lines and errors."""
+    program = SCRIPT.format(method=method, iterations=iterations)
+    child = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    watchdog = threading.Timer(100, child.kill)
+    watchdog.start()
+    first = child.stdout.readline()
+    child.send_signal(signal.SIGINT)
+    rest, errors = child.communicate()
+    watchdog.cancel()
+    return child.returncode, [first.strip(), *rest.split("\n")], errors
+
+
+@pytest.mark.parametrize(("method", "iterations"), [("sirt", 1_000_000), ("phyradgs", 100_000)])
+def test_a_script_stops_with_the_partial_volume(tmp_path, method, iterations) -> None:
+    status, lines, errors = run_script(tmp_path, method, iterations)
+    # by the signal, as shells want it
+    assert status == -signal.SIGINT and "the next line" not in lines
+    (told,) = [line for line in lines if line.startswith("partial")]
+    assert (
+        errors.rstrip().split("\n")[-1].endswith("the volume so far is the error's partial")
+
+    )
+    assert "direct cause" not in errors  # one traceback, from the reconstruction
+    kept = api.load_volume(tmp_path / "partial.h5")
+    assert kept.facts["interrupted_at"] == int(told.split()[1]) > 0
+    assert np.isfinite(kept.volume).all() and kept.volume.max() > 0
+
+
+def pressing_at(iteration: int):
+    """A report that presses Ctrl-C."""
+
+    def tell(progress: Progress) -> None:
+        if progress.iteration == iteration:
+            signal.raise_signal(signal.SIGINT)
+
+    return tell
+
+
+@pytest.mark.parametrize("method", ["sart", "phyradgs"])
+def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, method) -> None:
+    options = {"method": method, "iterations": 8 if method == "sart" else 120, "device": rt}
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        reconstruct(scan, **options, report=pressing_at(2 if method == "sart" else 50))
+    partial = stopped.value.partial
+    assert "interrupted at iteration" in repr(
+        partial
+    ) and f"after iteration {partial.facts['interrupted_at']}" in str(stopped.value)
+    whole = reconstruct(scan, **options, report=False)
+    np.testing.assert_array_equal(
+        reconstruct(scan, **options, resume=partial, report=False).volume, whole.volume
+    )
+    with pytest.raises(api.InputError, match="resume: found another method, or other options"):
+        reconstruct(scan, method, iterations=9, device=rt, resume=partial)
+
+
+def test_who_asks_for_the_result_gets_it(rt, scan) -> None:
+    result = reconstruct(scan, "sirt", iterations=9, report=pressing_at(3), on_interrupt="return", device=rt)
+    assert result.facts["interrupted_at"] == 3 and result.state is not None
+    at_the_end = reconstruct(
+        scan, "sirt", iterations=3, report=pressing_at(3), on_interrupt="return", device=rt
+    )
+    assert at_the_end.facts["interrupted_at"] is None
+
+
+def test_ctrl_c_is_never_lost(rt, scan) -> None:
+    """In the last iteration, where the result is whole, and before the first, where there is none."""
+    with pytest.raises(KeyboardInterrupt) as late:
+        reconstruct(scan, "sirt", iterations=3, report=pressing_at(3), device=rt)
+    assert late.value.partial.state is None and late.value.partial.volume.shape == scan.grid.shape
+
+    def early(scan, options, rt):
+        signal.raise_signal(signal.SIGINT)
+
+    for how in ("raise", "return"):
+        with pytest.raises(KeyboardInterrupt, match="before there was a volume") as nothing:
+            reconstruct(scan, early, device=rt, on_interrupt=how)
+        assert nothing.value.partial is None
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_report_may_stop_the_run(rt, scan) -> None:
+    def enough(progress: Progress) -> None:
+        if progress.loss < 0.7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        reconstruct(scan, "sirt", iterations=50, report=enough, device=rt)
+    assert 0 < stopped.value.partial.facts["interrupted_at"] < 50
+
+
+class Screen:
+    """A stream that says of itself what it is."""
+
+    def __init__(self, is_terminal: bool) -> None:
+        self.text, self.is_terminal = "", is_terminal
+
+    def isatty(self) -> bool:
+        return self.is_terminal
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None: ...
+
+
+class NotebookScreen(Screen):
+    """As a notebook's kernel has it."""
+
+    __module__ = "ipykernel.iostream"
+
+
+@pytest.mark.parametrize(
+    ("screen", "report", "is_told"),
+    [
+        (Screen(True), True, True),
+        (NotebookScreen(False), True, True),
+        (Screen(False), True, False),
+        (Screen(True), False, False),
+        (Screen(True), lambda progress: None, False),
+    ],
+    ids=["terminal", "notebook", "a file", "asked not to", "a report of one's own"],
+)
+def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, screen, report, is_told) -> None:
+    monkeypatch.setattr(sys, "stderr", screen)
+    reconstruct(scan, "sirt", iterations=5, device=rt, report=report)
+    assert ("iteration 5/5  residual" in screen.text) == is_told
+    if is_told:
+        assert screen.text.endswith("\n") and screen.text.count("\n") == 1 and "ETA" in screen.text
+        assert ("\x1b[K" in screen.text) == screen.is_terminal

@@ -1,0 +1,139 @@
+"""Geometries of ASTRA and TIGRE: points fall where those programs' own definitions put them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, PoseTable
+from phyradgs_cl.api import Gaussians, Scan, load_scan, reconstruct, save_scan, splat_operator
+from phyradgs_cl.errors import InputError
+
+RNG = np.random.default_rng(5)
+POINTS = RNG.uniform(-18, 18, (4, 3))  # x y z, mm
+PANEL, ANGLES = (23, 29), np.array([0.3, 1.7, 2.9, 4.4])
+FRAMES = np.zeros((4, *PANEL), np.float32)
+PIXEL = 0.05
+
+
+def tigre(**changes: object) -> SimpleNamespace:
+    """A TIGRE geometry in which no two lengths are alike and nothing is centred."""
+    own = {
+        "mode": "cone", "DSO": 400.0, "DSD": 700.0, "nDetector": np.array(PANEL), "dDetector": np.array([4.0, 3.5]),
+        "offDetector": np.array([5.0, -4.0]), "nVoxel": np.array([8, 10, 12]), "dVoxel": np.array([5.0, 4.5, 4.0]),
+        "offOrigin": np.array([1.0, -2.0, 3.0]),
+    }  # fmt: skip
+    return SimpleNamespace(**{**own, **changes})
+
+
+def tigre_pixels(geo: SimpleNamespace, i: int) -> np.ndarray:
+    """(row, column) of the points in frame i: the object turns by −α in front of a source on the x axis."""
+    at = {name: np.broadcast_to(getattr(geo, name, 0.0), 4)[i] for name in ("DSO", "DSD", "COR")}
+    off_v, off_u = np.broadcast_to(geo.offDetector, (4, 2))[i]
+    x = np.cos(ANGLES[i]) * POINTS[:, 0] + np.sin(ANGLES[i]) * POINTS[:, 1]
+    y = -np.sin(ANGLES[i]) * POINTS[:, 0] + np.cos(ANGLES[i]) * POINTS[:, 1] - at["COR"]
+    larger = at["DSD"] / (at["DSO"] - x)
+    v, u = larger * POINTS[:, 2] - off_v, larger * y - off_u
+    return np.stack([v / 4.0 + (PANEL[0] - 1) / 2, u / 3.5 + (PANEL[1] - 1) / 2], -1)
+
+
+def drawn_pixels(scan: Scan, rt) -> np.ndarray:
+    """(F, points, 2): the centre of each small Gaussian's picture, as our projector draws it."""
+    found = []
+    for point in POINTS:
+        dot = Gaussians(point[None], np.full((1, 3), 2.5), np.array([[1.0, 0, 0, 0]]), np.ones(1))
+        frames = splat_operator(scan, "static", cutoff_sigma=0.0, device=rt)(dot).astype(np.float64)
+        grid = np.indices(frames.shape[1:])
+        found.append(np.einsum("fvu,kvu->fk", frames, grid) / frames.sum(axis=(1, 2))[:, None])
+    return np.stack(found, 1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"COR": 3.0},
+        {
+            "DSO": np.array([400.0, 410.0, 395.0, 402.0]),
+            "offDetector": np.array([[5.0, -4.0], [2, 1], [0, 3], [-1, 6]]),
+        },
+    ],
+    ids=["circular", "centre of rotation", "of every frame its own"],
+)
+def test_points_fall_where_tigre_puts_them(rt, changes) -> None:
+    geo = tigre(**changes)
+    scan = Scan.from_tigre(geo, ANGLES, FRAMES)
+    expected = np.stack([tigre_pixels(geo, i) for i in range(4)])
+    assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
+    assert isinstance(scan.trajectory, CircularOrbit if len(changes) == 0 else (PoseTable, CircularOrbit))
+    assert (
+        scan.grid.shape == (8, 10, 12)
+        and scan.grid.voxel_size_mm == (5.0, 4.5, 4.0)
+        and scan.grid.offset_mm == (1, -2, 3)
+    )
+
+
+def astra_vectors() -> np.ndarray:
+    """Cones that wobble: every frame with its own source, panel, pitch and tilt."""
+    vectors = np.zeros((4, 12))
+    for i, angle in enumerate(ANGLES):
+        out, along = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
+        vectors[i, :3] = (400 + 3 * i) * out + [0, 0, 2.0 * i]
+        vectors[i, 3:6] = -300 * out + 4 * along + [0, 0, -3.0]
+        vectors[i, 6:9] = 3.5 * along + [0, 0, 0.05 * i]
+        vectors[i, 9:12] = [0.1, -0.05 * i, 4.0]
+    return vectors
+
+
+def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_path) -> None:
+    vectors = astra_vectors()
+    scan = Scan.from_astra(FRAMES, vectors)
+    expected = np.zeros((4, 4, 2))
+    for i, v in enumerate(vectors):
+        for k, point in enumerate(POINTS):  # panel + a·u + b·v on the line from the source through the point
+            a, b, _ = np.linalg.solve(np.stack([v[6:9], v[9:12], v[:3] - point], 1), v[:3] - v[3:6])
+            expected[i, k] = b + (PANEL[0] - 1) / 2, a + (PANEL[1] - 1) / 2
+    assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
+    assert isinstance(scan.trajectory, PoseTable)
+    np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
+    save_scan(tmp_path / "s.h5", scan)
+    np.testing.assert_allclose(load_scan(tmp_path / "s.h5").astra_vectors(), vectors, atol=1e-6)
+
+
+def test_rows_may_run_down(rt, scan) -> None:
+    """ASTRA's users often let v point down: the volume does not care."""
+    still = Scan.from_astra(scan.projections, scan.astra_vectors(), scan.grid)
+    vectors = scan.astra_vectors()
+    vectors[:, 9:12] *= -1
+    down = Scan.from_astra(scan.projections[:, ::-1], vectors, scan.grid)
+    for method in ({"method": "fdk"}, {"method": "sirt", "iterations": 3}):
+        up, turned = (reconstruct(s, device=rt, **method).volume for s in (still, down))
+        assert np.abs(up - turned).max() < 1e-4 * up.max(), method
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Scan.from_tigre(tigre(mode="parallel"), ANGLES, FRAMES), "geo.mode: found 'parallel'"),
+        (lambda: Scan.from_tigre(tigre(DSD=None), ANGLES, FRAMES), "geo.DSD: found nothing"),
+        (
+            lambda: Scan.from_tigre(tigre(rotDetector=np.array([0.1, 0, 0])), ANGLES, FRAMES),
+            "geo.rotDetector: found 0.1",
+        ),
+        (
+            lambda: Scan.from_tigre(tigre(), np.ones((4, 3)), FRAMES),
+            "angles: found 1.0; expected turns about z",
+        ),
+        (lambda: Scan.from_tigre(tigre(DSO=np.ones(3)), ANGLES, FRAMES), r"geo.DSO: found shape \(3,\)"),
+        (lambda: Scan.from_tigre(tigre(nVoxel=[8, 8.5, 8]), ANGLES, FRAMES), "geo.nVoxel.*whole numbers"),
+        (lambda: Scan.from_tigre(tigre(), ANGLES, FRAMES[:3]), r"frames: found shape \(3, 23, 29\)"),
+        (lambda: Scan.from_astra(FRAMES.swapaxes(0, 1), astra_vectors()), r"frames.swapaxes\(0, 1\)"),
+        (lambda: Scan.from_astra(FRAMES, astra_vectors()[:, :9]), r"vectors: found shape \(4, 9\)"),
+        (lambda: Scan.from_poses(FRAMES, np.zeros((4, 12))), "poses: found parallel pixel steps"),
+    ],
+)
+def test_what_does_not_fit_is_named(make, words) -> None:
+    with pytest.raises(InputError, match=words):
+        make()
