@@ -119,6 +119,7 @@ def reconstruct(
     seed: int = 0,
     report: ProgressReport | bool = True,
     resume: Reconstruction | None = None,
+    initial: Reconstruction | np.ndarray | None = None,
     on_interrupt: str = "raise",
     device: Device = None,
     **options: Any,
@@ -134,6 +135,8 @@ def reconstruct(
     report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
     notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
     resume: the partial result of an interrupted run of the same scan and options, to go on from.
+    initial: a volume from which an iterative or splatting method starts: a result, resampled where its grid is another, or
+    an array (nz, ny, nx) in 1/mm on the scan's grid.
     on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" a
     KeyboardInterrupt whose attribute ``partial`` is the result so far, or None; "return" that result.
     device: what ``--device`` takes, or a Runtime.
@@ -149,7 +152,9 @@ def reconstruct(
     given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)
-    more = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
+    more: dict[str, Any] = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
+    if initial is not None:
+        more["initial"] = _first_volume(initial, scan.with_grid(before).grid)
     result: Reconstruction | None = None
     try:
         with _reporting(report) as tell, keep_finished_work():
@@ -162,6 +167,15 @@ def reconstruct(
     if on_interrupt == "raise" and result.facts.get("interrupted_at") is not None:
         raise interrupted(result)
     return result
+
+
+def _first_volume(initial: object, grid: Grid) -> tuple[np.ndarray, Grid]:
+    """What ``initial`` says, with its grid; InputError for what is no volume, or has other voxels."""
+    if isinstance(initial, Reconstruction):
+        return initial.volume, initial.grid
+    if not isinstance(initial, np.ndarray):
+        raise InputError("initial", checks.shown(initial), "a Reconstruction, or an array (nz, ny, nx) in 1/mm")
+    return checks.numbers("initial", initial, grid.shape), grid
 
 
 def _checked_path(path: object) -> Path:

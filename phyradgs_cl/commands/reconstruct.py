@@ -35,6 +35,9 @@ def reconstruct_command(
     scan: Scan,
     output: Output,
     request: RunRequest,
+    initial: Annotated[
+        Path | None, file_option("Volume to start from, for iterative and splatting methods.", "--initial")
+    ] = None,
     resume: Annotated[bool, option("Go on from the checkpoint of an interrupted run.", True, "--resume")] = False,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
@@ -42,7 +45,7 @@ def reconstruct_command(
 ) -> None:
     """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
     settings = request.settings()
-    job = request.job(settings, scan, output, resume=resume, checkpoint_every_s=checkpoint_every)
+    job = request.job(settings, scan, output, initial=initial, resume=resume, checkpoint_every_s=checkpoint_every)
     ranks = launched_ranks()
     runtimes: list[Runtime] = []
     ticker = Ticker("iteration")

@@ -65,7 +65,8 @@ def dct_prox(volume: np.ndarray, threshold: float, *, nonnegative: bool) -> np.n
     """Float64 twin of ``DctProx``."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
-        return np.maximum(volume, 0) if nonnegative else volume
+        same: np.ndarray = np.maximum(volume, 0) if nonnegative else volume
+        return same
     blocks = np.lib.stride_tricks.sliding_window_view(volume, (EDGE,) * 3)
     kept = np.clip(scipy.fft.dctn(blocks, axes=(3, 4, 5), norm="ortho"), -threshold, threshold)
     kept[..., 0, 0, 0] = 0
@@ -75,5 +76,5 @@ def dct_prox(volume: np.ndarray, threshold: float, *, nonnegative: bool) -> np.n
         at = tuple(slice(o, o + n) for o, n in zip((k, j, i), blocks.shape[:3], strict=True))
         excess[at] += back[..., k, j, i]
         count[at] += 1
-    shrunk = volume - excess / count
+    shrunk: np.ndarray = volume - excess / count
     return np.maximum(shrunk, 0) if nonnegative else shrunk

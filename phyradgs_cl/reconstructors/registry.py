@@ -8,10 +8,14 @@ from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, Motion, Scan
 from phyradgs_cl.acquisition.motion import MODELS, STILL, check_own_motion
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics import resampled
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
@@ -62,6 +66,7 @@ METHODS = _Methods({
     "fista-tv": "voxels.fista_tv",
     "naf": "neural.naf",
     "sax-nerf": "neural.sax_nerf",
+    "fused": "fused",
     "fdk": "fdk",
 })
 
@@ -126,18 +131,30 @@ def reconstruct(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     before: InputOptions | None = None,
+    initial: tuple[np.ndarray, Grid] | None = None,
     **extra: Any,
 ) -> Reconstruction:
     """Runs a method, by its name or a function of one's own; ``options`` as from ``method_options``, its default when None.
 
-    ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing.
+    ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing. ``initial``: a volume
+    in 1/mm and its grid, from which a method starts that can; it is resampled onto the scan's.
     """
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method_name(method), rt)
     ready = prepared(scan, InputOptions() if before is None else before)
     check_own_motion(getattr(chosen, "motion", None), ready)
+    if initial is not None:
+        extra["initial"] = _initial(method, *initial, ready.grid)
     return method_of(method).run(ready, chosen, rt, seed=seed, report=report, **extra)
+
+
+def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.ndarray:
+    """A first volume on the grid of the scan; InputError for a method that starts from none."""
+    if not method_of(method).takes_initial:
+        taking = ", ".join(name for name, one in METHODS.items() if one.takes_initial)
+        raise InputError("--initial", f"--method {method_name(method)}", f"one of {taking}", "leave --initial out")
+    return volume if grid == onto else resampled(volume, grid, onto)[0]
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__, checks, signals
+from phyradgs_cl import __version__, checks, importers, signals
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
@@ -25,6 +25,7 @@ from phyradgs_cl.io import (
     only_run,
     partial_path,
     read_checkpoint,
+    sha256_of,
     write_checkpoint,
     write_volume,
 )
@@ -65,6 +66,7 @@ class ReconstructionJob:
     config: Path | None = None
     before: InputOptions = InputOptions()
     checkpoint_every_s: float = 600.0
+    initial: Path | None = None
 
     def __post_init__(self) -> None:
         checks.within("--checkpoint-every (seconds)", self.checkpoint_every_s, 0, 1e9)
@@ -129,7 +131,7 @@ def run_reconstruction(
         _refuse_foreign_suffix(job.output)
         check_writable(job.output)
     for path in (job.output, partial_path(job.output)):
-        refuse_overwriting("-o", path, job.scan, *([job.config] if job.config else []))
+        refuse_overwriting("-o", path, job.scan, *(other for other in (job.config, job.initial) if other))
     with only_run(job.output) if leads else nullcontext():
         return _reconstructed(job, options, make_runtime, report)
 
@@ -145,6 +147,8 @@ def _reconstructed(
     fingerprint = _fingerprint(scan_hash, job, options)
     extra: dict[str, Any] = {"before": job.before}
     leads = rt.ranks.rank == 0
+    if job.initial is not None:
+        extra["initial"] = importers.load_volume(job.initial)
     if job.resume:
         extra["resume"] = rt.ranks.bcast(_resumed(job, fingerprint) if leads else None)
     elif leads:
@@ -235,14 +239,20 @@ def _provenance(
         "input": job.before.facts(),
         "scan": str(job.scan),
         "scan_sha256": scan_hash,
+        **_start_facts(job),
         "record": result.record,
     }
 
 
 def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
     """What a run that goes on must have in common with the one that it continues, as JSON."""
-    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **option_facts(options)}
+    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **option_facts(options), **_start_facts(job)}
     return json.dumps({"scan": scan_hash[:16], **run}, sort_keys=True, default=repr)
+
+
+def _start_facts(job: ReconstructionJob) -> dict[str, str]:
+    """Which volume the run starts from, if any."""
+    return {} if job.initial is None else {"initial": str(job.initial), "initial_sha256": sha256_of(job.initial)}
 
 
 def _resumed(job: ReconstructionJob, fingerprint: str) -> State:

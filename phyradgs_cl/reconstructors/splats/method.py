@@ -40,14 +40,16 @@ def reconstruct_splats(
     report: ProgressReport,
     method: str,
     resume: State | None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``.
 
-    ``resume`` continues an interrupted run of the same scan and options from its state.
+    ``resume`` continues an interrupted run of the same scan and options from its state; ``initial`` (nz, ny, nx) in 1/mm
+    is what the cloud is drawn from in place of an FDK volume.
     """
     started = time.perf_counter()
     # a volume that one rank alone has on its host
-    scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed) if rt.ranks.rank == 0 else None)
+    scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed, initial) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
     loop = Loop(run, rt.ranks, report, started, record_interval(options.iterations), REPORT_EVERY)
@@ -80,14 +82,14 @@ def reconstruct_splats(
 
 
 def first_cloud(
-    rt: Runtime, scan: Scan, options: SplatOptions, seed: int
+    rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Internal units, the first cloud, and the generator from which it was drawn, all from an FDK volume."""
-    fdk = static_fdk(rt, scan)
-    scale = internal_scale(fdk, scan.grid)
+    """Internal units, the first cloud, and the generator that drew it, all from an ``initial`` volume, or FDK's."""
+    first = static_fdk(rt, scan) if initial is None else initial
+    scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)
     grid = scan.grid.scaled(1 / scale.length_mm)
-    return scale, first_population(fdk / scale.density_per_mm, grid, options, rng), rng
+    return scale, first_population(first / scale.density_per_mm, grid, options, rng), rng
 
 
 def time_facts(run: SplatRun) -> dict[str, object]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
@@ -18,9 +20,10 @@ def phyradgs(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """Reconstructs a scan with M×N micro-views per frame; ``options.motion`` static is the paper's "w/o ST"."""
-    return reconstruct_splats(scan, options, rt, seed, report, "phyradgs", resume)
+    return reconstruct_splats(scan, options, rt, seed, report, "phyradgs", resume, initial)
 
 
-METHOD = Method(phyradgs, PRESETS, is_shared=True)
+METHOD = Method(phyradgs, PRESETS, is_shared=True, takes_initial=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
@@ -20,9 +22,10 @@ def r2(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """Reconstructs a scan with R2-Gaussian's splat; micro-views as motion are the paper's "R2 w/ ST"."""
-    return reconstruct_splats(scan, replace(options, affine=True), rt, seed, report, "r2", resume)
+    return reconstruct_splats(scan, replace(options, affine=True), rt, seed, report, "r2", resume, initial)
 
 
-METHOD = Method(r2, {"published": R2_PUBLISHED}, is_shared=True)
+METHOD = Method(r2, {"published": R2_PUBLISHED}, is_shared=True, takes_initial=True)

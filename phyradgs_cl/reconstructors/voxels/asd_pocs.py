@@ -6,6 +6,7 @@ Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,7 @@ def asd_pocs(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The ASD-POCS volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
 
@@ -69,10 +71,10 @@ def asd_pocs(
         return AsdPocs(system, options, seed, TvDescent(rt, scan.grid.shape), epsilon)
 
     volumes = 8 + kept_columns(scan, options)
-    return run_iterations("asd-pocs", make, scan, options, rt, report, resume, volumes=volumes, frames=2)
+    return run_iterations("asd-pocs", make, scan, options, rt, report, resume, initial, volumes=volumes, frames=2)
 
 
-METHOD = Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True)
+METHOD = Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True, takes_initial=True)
 
 
 class AsdPocs:
@@ -86,6 +88,9 @@ class AsdPocs:
         self.volume = self.sart.volume
         self.finished: str | None = None
         self.tv_step = 0.0
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = volume
 
     def step(self) -> float:
         options, space = self.options, self.system.space

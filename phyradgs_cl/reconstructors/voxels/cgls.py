@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -50,13 +51,14 @@ def cgls(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The least-squares volume of a scan in 1/mm, as far as the iterations get. CGLS draws nothing from ``seed``."""
 
     def make(system: System) -> Cgls:
         return Cgls(system, options.noise_stop * _noise(system))
 
-    return run_iterations("cgls", make, scan, options, rt, report, resume, volumes=7, frames=3)
+    return run_iterations("cgls", make, scan, options, rt, report, resume, initial, volumes=7, frames=3)
 
 
 def _noise(system: System) -> float:
@@ -68,7 +70,7 @@ def _noise(system: System) -> float:
 
 
 METHOD = Method(
-    cgls, {"default": CglsOptions()}, is_shared=True, stops_itself=lambda options: options.noise_stop > 0
+    cgls, {"default": CglsOptions()}, is_shared=True, takes_initial=True, stops_itself=lambda options: options.noise_stop > 0
 )
 
 
@@ -87,6 +89,12 @@ class Cgls:
         self.gradient = system.adjoint(self.residual)
         self.direction = self.gradient
         self.gamma = system.space.inner(self.gradient, self.gradient)
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = volume
+        self.residual = self.system.residual(volume)
+        self.gradient = self.direction = self.system.back(self.residual)
+        self.gamma = self.system.space.inner(self.gradient, self.gradient)
 
     def step(self) -> float:
         space = self.system.space

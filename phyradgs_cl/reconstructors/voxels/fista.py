@@ -7,6 +7,7 @@ subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 3
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +40,9 @@ class FistaOptions(IterativeOptions):
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
-    iterations: int = 16
+    iterations: int = 30
     prior: str = "dct"
-    prior_weight: float = 1.0
+    prior_weight: float = 0.45
     frames_per_subset: int = 5
     tv_iterations: int = 5
     transmission_weights: bool = False  # type: ignore[misc]
@@ -62,6 +63,7 @@ def fista(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
     valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
@@ -71,10 +73,10 @@ def fista(
         prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations)
         return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
 
-    return run_iterations("fista", make, scan, options, rt, report, resume, volumes=16, frames=3)
+    return run_iterations("fista", make, scan, options, rt, report, resume, initial, volumes=16, frames=3)
 
 
-METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True)
+METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
 
 
 class Fista:
@@ -103,6 +105,9 @@ class Fista:
 
     def _subsets(self, count: int) -> list[System]:
         return [self.system.subset(range(first, self.system.frames, count)) for first in spread_order(count)]
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = self.previous = volume
 
     def step(self) -> float:
         squares = sum(self._step_of(subset) ** 2 for subset in self.subsets)

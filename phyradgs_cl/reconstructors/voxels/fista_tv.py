@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -57,16 +58,17 @@ def fista_tv(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The TV-regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
 
     def make(system: System) -> FistaTv:
         return FistaTv(system, options, TvProx(rt, scan.grid.shape, axis_weights(scan.grid)))
 
-    return run_iterations("fista-tv", make, scan, options, rt, report, resume, volumes=12, frames=3)
+    return run_iterations("fista-tv", make, scan, options, rt, report, resume, initial, volumes=12, frames=3)
 
 
-METHOD = Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True)
+METHOD = Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True, takes_initial=True)
 
 
 class FistaTv:
@@ -89,6 +91,10 @@ class FistaTv:
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         gradient = system.adjoint(system.weighed(system.measured))
         self.tv_weight = options.tv_weight * space.largest(gradient, absolute=True)
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = self.previous = volume
+        self.projected = self.projected_previous = self.system.expected(volume)
 
     def step(self) -> float:
         system, space, options = self.system, self.system.space, self.options

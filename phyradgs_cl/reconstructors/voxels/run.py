@@ -65,6 +65,10 @@ class Algorithm(Interface):
     finished: str | None
     """Why the method stops by itself, else None."""
 
+    def start_from(self, volume: Any) -> None:
+        """Takes a volume of the system's space as the first estimate, before the first step."""
+        ...
+
     def step(self) -> float:
         """One iteration; the norm of p − A x as far as the method knows it (see its own docstring)."""
         ...
@@ -84,11 +88,12 @@ def run_iterations(
     rt: Runtime,
     report: ProgressReport,
     resume: State | None,
+    initial: np.ndarray | None = None,
     *,
     volumes: int,
     frames: int,
 ) -> Reconstruction:
-    """Builds the scan's system, runs the method on it, and returns volume, record and facts.
+    """Builds the scan's system, runs the method on it, and returns volume, record and facts. ``initial``: where it starts.
 
     ``volumes`` and ``frames`` (stacks of all of them) are what the method holds at one time, its tables included: where the
     device has room for them they stay on it.
@@ -99,7 +104,10 @@ def run_iterations(
     if options.transmission_weights:
         system = system.transmission_weighted()
     system = system.resident(rt, volumes + 2, frames + _SYSTEM_FRAMES)
-    run = _Iterations(make(system), options, scan.grid, system.space.norm(system.measured) or 1.0)
+    algorithm = make(system)
+    if initial is not None and resume is None:
+        algorithm.start_from(system.space.array(np.ascontiguousarray(initial, np.float32)))
+    run = _Iterations(algorithm, options, scan.grid, system.space.norm(system.measured) or 1.0)
     loop = Loop(run, rt.ranks, report, started)
     loop.run(resume)
     facts: dict[str, object] = {

@@ -64,9 +64,10 @@ def sart(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The SART volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
-    return _run("sart", scan, options, rt, seed, report, resume)
+    return _run("sart", scan, options, rt, seed, report, resume, initial)
 
 
 def os_sart(
@@ -77,9 +78,10 @@ def os_sart(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The same with several frames per correction."""
-    return _run("os-sart", scan, options, rt, seed, report, resume)
+    return _run("os-sart", scan, options, rt, seed, report, resume, initial)
 
 
 def _run(
@@ -90,12 +92,13 @@ def _run(
     seed: int,
     report: ProgressReport,
     resume: State | None,
+    initial: np.ndarray | None,
 ) -> Reconstruction:
     def make(system: System) -> Sart:
         return Sart(system, options, seed)
 
     volumes = 4 + kept_columns(scan, options)
-    return run_iterations(method, make, scan, options, rt, report, resume, volumes=volumes, frames=2)
+    return run_iterations(method, make, scan, options, rt, report, resume, initial, volumes=volumes, frames=2)
 
 
 def kept_columns(scan: Scan, options: SartOptions) -> int:
@@ -108,8 +111,8 @@ def _most_kept(volume_shape: Sequence[int]) -> int:
     return max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1)
 
 
-METHOD = Method(sart, {"default": SartOptions()}, is_shared=True)
-OS_METHOD = Method(os_sart, {"default": OS_SART}, is_shared=True)
+METHOD = Method(sart, {"default": SartOptions()}, is_shared=True, takes_initial=True)
+OS_METHOD = Method(os_sart, {"default": OS_SART}, is_shared=True, takes_initial=True)
 
 
 class Sart:
@@ -131,6 +134,9 @@ class Sart:
         self._row_weights = [row_weights(subset) for subset in self.subsets]
         kept = _most_kept(system.volume_shape)
         self._column_weights = [column_weights(subset) for subset in self.subsets[:kept]]
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = volume
 
     def step(self) -> float:
         squares = self.system.space.sum_squares(self._corrections())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -42,14 +43,15 @@ def sirt(
     seed: int = 0,
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
+    initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The SIRT volume of a scan in 1/mm. ``seed`` is accepted for the common signature; SIRT draws nothing."""
     return run_iterations(
-        "sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume, volumes=4, frames=1
+        "sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume, initial, volumes=4, frames=1
     )
 
 
-METHOD = Method(sirt, {"default": SirtOptions()}, is_shared=True)
+METHOD = Method(sirt, {"default": SirtOptions()}, is_shared=True, takes_initial=True)
 
 
 class Sirt:
@@ -63,6 +65,9 @@ class Sirt:
         self.volume = system.space.full(system.volume_shape, 0.0)
         self.finished: str | None = None
         self._rows, self._columns = row_weights(system), column_weights(system)
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = volume
 
     def step(self) -> float:
         space, options = self.system.space, self.options

@@ -1,0 +1,119 @@
+"""FISTA with priors over subsets, voxels and splats together, and first volumes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics import psnr
+from phyradgs_cl.reconstructors import METHODS, Progress, method_options, reconstruct
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
+from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
+from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+
+
+@pytest.fixture(scope="module")
+def scan(rt) -> Scan:
+    geometry = ConeGeometry(5.0, 7.0, (32, 32), (4 / 32, 4 / 32))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
+    protocol = make_protocol("rapid", views=20, exposure_deg=18.0)
+    options = SimulationOptions(protocol=protocol, noise="tigre")
+    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
+
+
+def run(rt, scan: Scan, method: str, **changes: object):
+    return reconstruct(scan, method, rt, method_options(method, None, {"iterations": 12, **changes}))
+
+
+def quality(scan: Scan, volume: np.ndarray) -> float:
+    return psnr(volume, scan.reference, float(scan.reference.max()))
+
+
+def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
+    found = {
+        prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=40, prior=prior).volume)
+        for prior in ("none", "tv", "dct")
+    }
+    assert min(found["tv"], found["dct"]) > found["none"] + 0.5, found
+    few, whole = (
+        run(rt, scan, "fista", iterations=3, frames_per_subset=size).record[-1]["residual"] for size in (5, 0)
+    )
+    assert few < 0.8 * whole
+
+
+def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
+    """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
+    options = FistaOptions(frames_per_subset=1)
+    prior = prior_of("tv", rt, scan.grid, 5)
+    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, 0.01, 0.1)
+    assert len(algorithm.subsets) == scan.frames
+    residuals = [algorithm.step() for _ in range(30)]
+    assert 1 <= len(algorithm.subsets) <= scan.frames // 2
+    assert residuals[-1] < residuals[0]
+
+
+def test_the_weight_follows_the_noise(rt, scan) -> None:
+    weights = []
+    for noise in (0.01, 0.03):
+        options = FistaOptions()
+        system = System.of_scan(rt, scan, options.motion)
+        prior = prior_of("tv", rt, scan.grid, 5)
+        weights.append(Fista(system, options, prior, noise, 0.1).weight)
+    assert weights[1] == pytest.approx(3 * weights[0], rel=1e-6)
+
+
+def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
+    seen: list[float] = []
+
+    def half(volume: np.ndarray, noise: float) -> np.ndarray:
+        seen.append(noise)
+        return volume / 2
+
+    options = FistaOptions(frames_per_subset=0)
+    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), 0.01, 0.1)
+    algorithm.step()
+    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5), 0.01, 0.1)
+    plain.step()
+    np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
+    assert seen == [algorithm.weight / algorithm.curvature]
+
+
+@pytest.mark.parametrize("method", [name for name, one in METHODS.items() if one.takes_initial])
+def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
+    """From the truth a few iterations are nearer to it than from nothing, on another grid too; FDK starts from none."""
+    few = {"iterations": 40} if method in ("phyradgs", "r2") else {"iterations": 2}
+    if method == "fused":
+        few["voxel_iterations"] = 1
+    options = method_options(method, None, few)
+    begun = quality(scan, reconstruct(scan, method, rt, options).volume)
+    from_truth = reconstruct(scan, method, rt, options, initial=(scan.reference, scan.grid)).volume
+    assert quality(scan, from_truth) > begun + (0.1 if method in ("phyradgs", "r2") else 1)
+    with pytest.raises(InputError, match="--initial"):
+        reconstruct(scan, "fdk", rt, initial=(scan.reference, scan.grid))
+
+
+@pytest.mark.parametrize("at", [2, 30])
+def test_fused_goes_on_with_the_same_bits_from_either_half(rt, scan, at) -> None:
+    options = method_options("fused", None, {"iterations": 100, "voxel_iterations": 4})
+
+    def stop(progress: Progress) -> None:
+        assert progress.iterations == 104
+        if progress.iteration >= at:
+            raise KeyboardInterrupt
+
+    whole = reconstruct(scan, "fused", rt, options)
+    part = reconstruct(scan, "fused", rt, options, report=stop)
+    assert part.facts["interrupted_at"] >= at
+    rest = reconstruct(scan, "fused", rt, options, resume=part.state)
+    np.testing.assert_array_equal(rest.volume, whole.volume)
+    assert rest.gaussians is not None and whole.facts["disagreement_per_mm"] > 0
+
+
+def test_fused_is_the_mean_of_both(rt, scan) -> None:
+    changes = {"iterations": 60, "voxel_iterations": 6}
+    voxels, mean, splats = (run(rt, scan, "fused", splat_weight=w, **changes).volume for w in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(mean, (voxels + splats) / 2, atol=1e-6)
