@@ -108,6 +108,12 @@ _SPLATTING = (
     _micro_views("PhyRadGS", "phyradgs", 8, 5, "PhyRadGS w/o ST"),
     Row("PhyRadGS exact in time", "phyradgs", "exact", still="PhyRadGS w/o ST"),
 )
+_FUSED = (
+    Row("FISTA with DCT", "fista"),
+    Row("FISTA with DCT per-row", "fista", "per-row", still="FISTA with DCT"),
+    Row("Fused", "fused"),
+    Row("Fused exact in time", "fused", "exact", still="Fused"),
+)
 
 
 def _our_settings() -> dict[str, Any]:
@@ -135,7 +141,7 @@ def _extras() -> tuple[Row, ...]:
         Row(tuned, "r2", **same),
         Row("R2-Gaussian w/ ST (settings of PhyRadGS)", "r2", "micro-views", 8, 5, tuned, **same),
     )
-    rows = (*strips, *both)
+    rows = (*strips, *both, *_FUSED)
     return (*rows, *_others({row.method for row in (*_table1(), *rows)}))
 
 
