@@ -31,7 +31,7 @@ RUNS = [
     ("r2", {**SPLATS, "motion": "static"}), ("fdk", {"motion": "static"}), ("fdk", {"motion": "per-row"}),
     ("sirt", {"iterations": 2, "motion": "per-row"}), ("asd-pocs", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 2, "motion": "static"}),
-    ("fista-tv", {"iterations": 1, "motion": "per-row"}),
+    ("fista-tv", {"iterations": 1, "motion": "per-row"}), ("fista", {"iterations": 1, "motion": "per-row"}),
 ]
 @pytest.fixture(scope="module")
 def gpu_shaped(scan) -> tuple[list[np.ndarray], set[str]]:
