@@ -86,6 +86,11 @@ class Runtime:
             kernel.built = cl.Kernel(self._programs[key], kernel.function_name)
         return kernel.built
 
+    @property
+    def built_kernels(self) -> set[str]:
+        """Names of the kernels that were launched so far."""
+        return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
+
     def _options(self, defines: dict[str, int | float | bool]) -> tuple[str, ...]:
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
