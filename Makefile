@@ -11,6 +11,7 @@
 # make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
 # make test-mpi       one reconstruction on 1 to 4 ranks, killed and resumed: the tests of MPI, in an environment of its own
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
+# make gpu     what a GPU says: tests on it, trust, speed; results in results/gpu.json (ten minutes; DEVICE=..., QUICK=--quick)
 # make test-gpu-build every kernel compiled for NVIDIA, AMD and Intel: registers, spills (Debian, x86-64 Linux; another 500 MB)
 # make clean   remove what the two have made
 #
@@ -25,7 +26,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build test-intel test-mpi test-neural test-oclgrind clean
+.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -144,6 +145,13 @@ $(VENV)-gpu/debian/.unpacked: $(VENV)-gpu/.installed
 test-gpu-build: export GPU_COMPILERS = $(abspath $(VENV)-gpu/debian)
 test-gpu-build: $(VENV)-gpu/debian/.unpacked
 	$(VENV)-gpu/bin/python tests/gpu_build/every_program.py --table $(VENV)-gpu/table.md
+
+DEVICE ?= gpu
+QUICK  ?=
+
+gpu: $(VENV)/.installed-test
+	@mkdir -p results
+	$(BIN)/python benchmarks/gpu.py --device $(DEVICE) $(QUICK) --json results/gpu.json --table results/gpu.md
 
 test-neural: $(VENV)-neural/.installed
 	$(call tested,$(VENV)-neural,tests/neural)
