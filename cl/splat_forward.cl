@@ -55,7 +55,7 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
     const int time_pitch,                                                                                               \
     const float4 path_limits,         /* MOVING: the longest paths, in widths, that 1, 2 and 3 times serve */           \
     __global const int *starts,       /* (tiles + 1,) */                                                                \
-    __global const int *entries,                                                                                        \
+    __global const int *entries, const int capacity, const int count,                                                  \
     const int cell_count, const int lines, const int width, const int pitch,                                            \
     const int tile_w, const int tile_h, const int tiles_u, const float cutoff2,                                         \
     const int layer_count,            /* LAYERED: images, each of guard and (lines, pitch); else one of all cells */    \
@@ -76,7 +76,7 @@ __kernel void splat_forward_pixels(ARGUMENTS)
     const int tile = (v / tile_h) * tiles_u + u / tile_w;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     float sum = 0.0f;
-    FOR_SPLATS(splat, c, starts, entries, tile, cell_count, line_cells[2 * v], line_cells[2 * v + 1], seen) {
+    FOR_SPLATS(splat, c, starts, entries, tile, capacity, count, cell_count, line_cells[2 * v], line_cells[2 * v + 1], seen) {
         __global const float *rec = records + splat * RECORD, *cell = cells + c * CELL;
         __global const int *whole = (__global const int *)rec;
         if (v < whole[REC_V_LO] || v > whole[REC_V_HI] || u < whole[REC_U_LO] || u > whole[REC_U_HI])
@@ -119,7 +119,7 @@ __kernel void splat_forward_rows(ARGUMENTS)
             for (int u = 0; u < pitch; u += LANES)
                 V_STORE((vf)(0.0f), row + u);
         }
-    FOR_SPLATS(splat, c, starts, entries, tile, cell_count, line_cells[2 * top], line_cells[2 * bottom + 1], seen) {
+    FOR_SPLATS(splat, c, starts, entries, tile, capacity, count, cell_count, line_cells[2 * top], line_cells[2 * bottom + 1], seen) {
         __global const float *rec = records + splat * RECORD, *cell = cells + c * CELL;
         __global const int *whole = (__global const int *)rec;
         painter own = {image + LAYER_AT(cell, lines, pitch), pitch, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT};

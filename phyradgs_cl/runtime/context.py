@@ -15,7 +15,7 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
-from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, Traffic, memory_limit
+from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
 from phyradgs_cl.runtime.opencl import cl
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 from phyradgs_cl.runtime.source import Kernel, kernel_source
@@ -185,6 +185,16 @@ class Runtime:
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
         self.traffic.count(down=value.nbytes)
         return value[0]
+
+    @naming_failures("a copy from it")
+    def read_item_later(self, array: DeviceArray, index: int) -> LaterItem:
+        """One element of a flat array as it is after the work so far; nobody waits for it."""
+        value = np.empty(1, array.dtype)
+        offset = index * array.dtype.itemsize
+        event = cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=False)
+        self.queue.flush()
+        self.traffic.bytes_down += value.nbytes
+        return LaterItem(value, event)
 
     @naming_failures("a copy")
     def copy(

@@ -130,6 +130,8 @@ class SplatProjector:
             self.path_limits,
             self.lists.starts,
             self.lists.entries,
+            np.int32(self.lists.entries.size),
+            np.int32(gaussians.count),
             np.int32(cells.count),
             np.int32(self.lines),
             np.int32(self.width),
