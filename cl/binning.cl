@@ -44,7 +44,7 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
     starts[t + 1] = sum;
 }
 
-/* stays at the largest int where there are more entries than it counts: the host looks */
+/* stays at the largest int where there are more entries than it counts: the host looks, later */
 __kernel void bin_starts(const int total, __global int *starts)
 {
     if (get_global_id(0) > 0)

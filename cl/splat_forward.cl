@@ -1,7 +1,11 @@
 /* Micro-view accumulation and strip concatenation (paper, Eq. 3) in one gather: every tile of the merged
    frame sums its list of splats over all time cells that serve its lines.
    splat_forward_rows: a work-item owns a band of whole lines, where it walks vectors of pixels (CPUs).
-   splat_forward_pixels: a work-item owns a pixel (GPUs). Nobody else writes those pixels: no atomics. */
+   splat_forward_pixels: a work-item owns a pixel and a work-group a tile, whose records it reads once (GPUs).
+   Nobody else writes those pixels: no atomics. */
+#if BLOCK_PIXEL
+#define SPLAT_SPACE __local
+#endif
 #include "common/footprint.h"
 #include "common/tile.h"
 
@@ -55,43 +59,80 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
     const int time_pitch,                                                                                               \
     const float4 path_limits,         /* MOVING: the longest paths, in widths, that 1, 2 and 3 times serve */           \
     __global const int *starts,       /* (tiles + 1,) */                                                                \
-    __global const int *entries,                                                                                        \
+    __global const int *entries, const int capacity, const int count,                                                  \
     const int cell_count, const int lines, const int width, const int pitch,                                            \
     const int tile_w, const int tile_h, const int tiles_u, const float cutoff2,                                         \
     const int layer_count,            /* LAYERED: images, each of guard and (lines, pitch); else one of all cells */    \
     __global float *image             /* guard, then (lines, pitch) */
 
 #if BLOCK_PIXEL
+#define STAGED 32 /* splats in cells that a group reads at a time */
+
+/* Groups of tile_w by tile_h items. A line's cells lie between those of the tile's first and last line. */
 __kernel void splat_forward_pixels(ARGUMENTS)
 {
+    __local float records_here[STAGED * RECORD], cells_here[STAGED * CELL];
+    __local int place[STAGED], cell_of[STAGED]; /* in records, -1 where the splat is not seen in this tile; its cell */
     const int u = (int)get_global_id(0), v = (int)get_global_id(1);
-    if (u >= pitch || v >= lines)
-        return;
-    const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
-    const size_t layer_size = IMAGE_GUARD + (size_t)lines * pitch;
-    for (int layer = 0; layer < LAYERS(layer_count); ++layer)
-        image[layer * layer_size + at] = 0.0f;
-    if (u >= width)
-        return;
-    const int tile = (v / tile_h) * tiles_u + u / tile_w;
+    const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
+    const int items = (int)(get_local_size(0) * get_local_size(1));
+    const int left = (int)get_group_id(0) * tile_w, top = (int)get_group_id(1) * tile_h;
+    const int right = min(left + tile_w, width) - 1, bottom = min(top + tile_h, lines) - 1;
+    const int tile = (int)get_group_id(1) * tiles_u + (int)get_group_id(0);
+    const int fits = starts[tile + 1] <= capacity;
+    const int first = fits ? starts[tile] : 0, listed = fits ? starts[tile + 1] - first : count;
+    const int c_first = line_cells[2 * top], c_count = line_cells[2 * bottom + 1] - c_first;
+    const int inside = u < width && v < lines;
+    const int own_first = line_cells[2 * min(v, bottom)], own_stop = inside ? line_cells[2 * v + 1] : own_first;
+    const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
+    if (inside)
+        for (int layer = 0; layer < LAYERS(layer_count); ++layer)
+            image[layer * layer_size + at] = 0.0f;
     float sum = 0.0f;
-    FOR_SPLATS(splat, c, starts, entries, tile, cell_count, line_cells[2 * v], line_cells[2 * v + 1], seen) {
-        __global const float *rec = records + splat * RECORD, *cell = cells + c * CELL;
-        __global const int *whole = (__global const int *)rec;
-        if (v < whole[REC_V_LO] || v > whole[REC_V_HI] || u < whole[REC_U_LO] || u > whole[REC_U_HI])
-            continue;
-        const footprint_line line = footprint_alone(rec, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, v,
-                                                    path_limits);
-        const float value = value_at(line, u, limit);
+    for (int done = 0; done < listed * c_count; done += STAGED) {
+        const int here = min(STAGED, listed * c_count - done);
+        barrier(CLK_LOCAL_MEM_FENCE); /* all have read what was there */
+        for (int k = item; k < here; k += items) {
+            const int e = (done + k) / c_count, c = c_first + (done + k) % c_count;
+            const int splat = (fits ? entries[first + e] : e) * cell_count + c;
+            int is_here = seen[splat];
+            if (is_here) {
+                __global const int *whole = (__global const int *)(records + (size_t)splat * RECORD);
+                is_here = whole[REC_U_LO] <= right && whole[REC_U_HI] >= left &&
+                          whole[REC_V_LO] <= bottom && whole[REC_V_HI] >= top;
+            }
+            place[k] = is_here ? splat : -1;
+            cell_of[k] = c;
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int f = item; f < here * RECORD; f += items)
+            if (place[f / RECORD] >= 0)
+                records_here[f] = records[(size_t)place[f / RECORD] * RECORD + f % RECORD];
+        for (int f = item; f < here * CELL; f += items)
+            cells_here[f] = cells[cell_of[f / CELL] * CELL + f % CELL];
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int k = 0; k < here; ++k) {
+            const int c = cell_of[k];
+            if (place[k] < 0 || c < own_first || c >= own_stop)
+                continue;
+            __local const float *rec = records_here + k * RECORD, *cell = cells_here + k * CELL;
+            __local const int *whole = (__local const int *)rec;
+            if (v < whole[REC_V_LO] || v > whole[REC_V_HI] || u < whole[REC_U_LO] || u > whole[REC_U_HI])
+                continue;
+            const footprint_line line = footprint_alone(rec, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, v,
+                                                        path_limits);
+            const float value = value_at(line, u, limit);
 #if LAYERED
-        image[LAYER_AT(cell, lines, pitch) + at] += value; /* nobody else's pixel */
+            image[LAYER_AT(cell, lines, pitch) + at] += value;
 #else
-        sum += value;
+            sum += value;
 #endif
+        }
     }
 #if !LAYERED
-    image[at] = sum;
+    if (inside)
+        image[at] = sum;
 #endif
 }
 #else
@@ -119,7 +160,7 @@ __kernel void splat_forward_rows(ARGUMENTS)
             for (int u = 0; u < pitch; u += LANES)
                 V_STORE((vf)(0.0f), row + u);
         }
-    FOR_SPLATS(splat, c, starts, entries, tile, cell_count, line_cells[2 * top], line_cells[2 * bottom + 1], seen) {
+    FOR_SPLATS(splat, c, starts, entries, tile, capacity, count, cell_count, line_cells[2 * top], line_cells[2 * bottom + 1], seen) {
         __global const float *rec = records + splat * RECORD, *cell = cells + c * CELL;
         __global const int *whole = (__global const int *)rec;
         painter own = {image + LAYER_AT(cell, lines, pitch), pitch, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT};

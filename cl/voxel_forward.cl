@@ -5,6 +5,7 @@
 
 __kernel void voxel_forward(
     __global const float *records, __global const int *starts, __global const int *entries,
+    const int capacity, const int count,
     const int4 shape, const int pitch, const int4 tile, const int4 tiles, const float cutoff2,
     __global float *volume)          /* guard, then (z, y, pitch) */
 {
@@ -20,8 +21,13 @@ __kernel void voxel_forward(
     }
     const int t = ((z / tile.z) * tiles.y + y / tile.y) * tiles.x + x / tile.x;
     float sum = 0.0f;
-    FOR_ENTRIES(e, starts, t) {
-        const voxel_row r = voxel_row_at(records + (size_t)entries[e] * VOXEL_RECORD, y, z);
+    FOR_LISTED(g, starts, entries, t, capacity, count) {
+        __global const float *rec = records + (size_t)g * VOXEL_RECORD;
+        __global const int *whole = (__global const int *)rec;
+        if (x < whole[VOX_LO] || x > whole[VOX_HI] || y < whole[VOX_LO + 1] || y > whole[VOX_HI + 1] ||
+            z < whole[VOX_LO + 2] || z > whole[VOX_HI + 2])
+            continue;
+        const voxel_row r = voxel_row_at(rec, y, z);
         sum += voxel_value(r, voxel_dx(r, x), 1.0f, limit);
     }
     volume[at] = sum;
@@ -35,8 +41,8 @@ __kernel void voxel_forward(
         for (int y = y_first; y <= y_last; ++y)
             for (int x = 0; x < pitch; x += LANES)
                 V_STORE((vf)(0.0f), volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch + x);
-    FOR_ENTRIES(e, starts, t) {
-        __global const float *rec = records + (size_t)entries[e] * VOXEL_RECORD;
+    FOR_LISTED(g, starts, entries, t, capacity, count) {
+        __global const float *rec = records + (size_t)g * VOXEL_RECORD;
         __global const int *whole = (__global const int *)rec;
         const int z_lo = max(z_first, whole[VOX_LO + 2]), z_hi = min(z_last, whole[VOX_HI + 2]);
         const int y_lo = max(y_first, whole[VOX_LO + 1]), y_hi = min(y_last, whole[VOX_HI + 1]);

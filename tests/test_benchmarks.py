@@ -48,6 +48,13 @@ def test_iteration(tmp_path) -> None:
         assert found["other kernels"] < 0.05 * found["iteration"]
 
 
+def test_what_a_gpu_would_say(tmp_path) -> None:
+    facts = facts_of(tmp_path, "gpu.py", "--table", str(tmp_path / "table.md"))
+    assert facts["trusted"] and facts["same_bits"] and "passed" in facts["tests"] and not facts["errors"]
+    assert min(facts[name] for name in ("iteration_ms", "run_s", "fista_tv_s", "fdk_gups")) > 0
+    assert facts["device"] in (tmp_path / "table.md").read_text(encoding="utf-8")
+
+
 def test_bricks_of_large_problems(tmp_path) -> None:
     runs = facts_of(tmp_path, "large.py")["runs"]
     assert len(runs) == 4

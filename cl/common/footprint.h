@@ -14,14 +14,14 @@ typedef struct {
 } footprint_line;
 
 #if MOVING
-ALWAYS_INLINE footprint_line footprint_at(__global const float *rec, __global const float *cell, const int v, const float dv,
+ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, const int v, const float dv,
                                           const float middle, const float half_time, const float weight,
                                           const float4 path_limits)
 #else
-ALWAYS_INLINE footprint_line footprint_at(__global const float *rec, __global const float *cell, const int v, const float dv)
+ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, const int v, const float dv)
 #endif
 {
-    __global const int *whole = (__global const int *)rec;
+    SPLAT_SPACE const int *whole = (SPLAT_SPACE const int *)rec;
     footprint_line line;
 #if MOVING
     line.s = moving_on_line(rec, cell, (float)v, dv, middle, half_time, weight, path_limits);
@@ -42,11 +42,11 @@ ALWAYS_INLINE footprint_line footprint_at(__global const float *rec, __global co
 }
 
 /* the same for whoever looks at one line alone; `times`: the cell's (TIME_ROWS, time_pitch), if splats move */
-ALWAYS_INLINE footprint_line footprint_alone(__global const float *rec, __global const float *cell,
+ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell,
                                              __global const float *times, const int time_pitch, const int v,
                                              const float4 path_limits)
 {
-    const float dv = (float)(v - ((__global const int *)rec)[REC_V_WHOLE]) - rec[REC_V_REST];
+    const float dv = (float)(v - ((SPLAT_SPACE const int *)rec)[REC_V_WHOLE]) - rec[REC_V_REST];
 #if MOVING
     return footprint_at(rec, cell, v, dv, times[v], times[TIME_HALF * time_pitch + v],
                         times[TIME_WEIGHT * time_pitch + v], path_limits);

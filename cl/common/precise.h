@@ -43,8 +43,10 @@ static inline vf wide_split(vwide a, vf *rest)
 typedef struct { vf high, low; } vwide;
 typedef float2 coefficient;
 
+/* error-free sums and products: nothing in these may become a multiply-add, which -cl-mad-enable would allow */
 static inline vwide wide_sum(vwide a, vf b)
 {
+#pragma OPENCL FP_CONTRACT OFF
     vf s = a.high + b;
     vf t = s - a.high;
     vwide r;
@@ -55,6 +57,7 @@ static inline vwide wide_sum(vwide a, vf b)
 }
 static inline vwide wide_product_sum(vwide acc, coefficient c, vf x)
 {
+#pragma OPENCL FP_CONTRACT OFF
     vf product = c.x * x;
     vf error = fma((vf)(c.x), x, -product);
     acc = wide_sum(acc, product);
@@ -74,6 +77,7 @@ static inline vf wide_value(vwide a) { return a.high + a.low; }
 
 static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 {
+#pragma OPENCL FP_CONTRACT OFF
     vf whole = clamp(rint(wide_value(a) / wide_value(b)), -1e6f, 1e6f);
     vf product = whole * b.high;
     vf error = fma(whole, b.high, -product);

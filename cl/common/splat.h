@@ -9,6 +9,10 @@
    The affine (R2-Gaussian) splat is Q = 1 and |d| of the central ray. */
 #include "common/falling_exp2.h"
 
+#ifndef SPLAT_SPACE
+#define SPLAT_SPACE __global /* where records and constants of cells are read from */
+#endif
+
 #if MOVING
 #define RECORD 20
 #else
@@ -71,7 +75,7 @@ typedef struct {
     float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
 } splat_line;
 
-static inline splat_line splat_on_line(__global const float *rec, __global const float *cell, float v, float dv)
+static inline splat_line splat_on_line(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, float v, float dv)
 {
     splat_line s;
     s.l11 = rec[REC_L11];

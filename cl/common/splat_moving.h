@@ -35,7 +35,7 @@ ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
     return path <= limits.x ? 1 : (path <= limits.y ? 2 : (path <= limits.z ? 3 : CLOSED));
 }
 
-ALWAYS_INLINE moving_line moving_on_line(__global const float *rec, __global const float *cell, const float v,
+ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, const float v,
                                          const float dv, const float middle, const float half_time, const float weight,
                                          const float4 limits)
 {
@@ -192,10 +192,10 @@ ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pi
 
 /* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in
    whitened coordinates) and the flat sides between them. Lines that see nothing of the segment come out empty. */
-ALWAYS_INLINE void moving_span(__global const float *rec, const vf dv, const vf middle, const vf half_time,
+ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *rec, const vf dv, const vf middle, const vf half_time,
                                const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {
-    __global const int *whole = (__global const int *)rec;
+    SPLAT_SPACE const int *whole = (SPLAT_SPACE const int *)rec;
     *u_lo = (vi)(whole[REC_U_LO]);
     *u_hi = VI_PICK(whole[REC_U_LO] - 1, whole[REC_U_HI], weight > 0.0f);
     if (!cuts)

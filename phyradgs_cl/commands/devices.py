@@ -1,17 +1,30 @@
-"""devices: what OpenCL offers, and what would be taken."""
+"""devices: what OpenCL offers, what would be taken, and whether that computes what it should."""
+
+from typing import Annotated
 
 from phyradgs_cl.commands.console import say
+from phyradgs_cl.commands.files import option
 from phyradgs_cl.commands.options import Device
+from phyradgs_cl.device_check import check_device
+from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime import choose_device, list_devices
 from phyradgs_cl.runtime.context import default_lanes
 from phyradgs_cl.settings import device_wish
 
+_CHECK = "Run every kernel on the device against float64, and say whether it can be trusted."
 EXAMPLE = "Example: phyradgs devices --device cpu"
 
 
-def devices_command(device: Device = None) -> None:
-    """List OpenCL devices and say which one is taken, and why."""
+def devices_command(
+    check: Annotated[bool, option(_CHECK)] = False,
+    device: Device = None,
+) -> int:
+    """List OpenCL devices and say which one is taken, and why; or, with --check, whether it computes what it should."""
     chosen, reason = choose_device(device_wish(device))
+    if check:
+        verdict = check_device(device_wish(device))
+        say(str(verdict))
+        return DeviceError.exit_code if verdict.failures else 0
     for d in list_devices():
         mark = "*" if d.index == chosen.index else " "
         never = "" if d.by_default else ", only when asked for"
@@ -22,3 +35,4 @@ def devices_command(device: Device = None) -> None:
         )
         say(f"     {d.version}")
     say(f"takes {chosen.index}: {reason}")
+    return 0

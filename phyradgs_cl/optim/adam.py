@@ -35,7 +35,6 @@ class DeviceAdam:
 
     def __init__(self, rt: Runtime, activation: Activation) -> None:
         self.rt, self.activation = rt, activation
-        self._rates = rt.zeros(11)
         self._activate = rt.kernel("adam", "activate")
         self._chain = rt.kernel("adam", "chain_activations")
         self._step = rt.kernel("adam", "adam_step")
@@ -98,7 +97,8 @@ class DeviceAdam:
         step: int,
     ) -> None:
         """One step of Adam; ``rates`` (11,), ``step`` counts from 1."""
-        self.rt.write(self._rates, folded_rates(rates, step))
+        rates16 = np.zeros(16, np.float32)
+        rates16[:11] = folded_rates(rates, step)
         self.rt.launch(
             self._step,
             (stride // self.rt.lanes, 11),
@@ -106,7 +106,7 @@ class DeviceAdam:
             gradients,
             moments,
             np.int32(stride),
-            self._rates,
+            rates16,
             np.float32(BETA1),
             np.float32(BETA2),
             np.float32(EPSILON),

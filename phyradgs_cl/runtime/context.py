@@ -15,7 +15,7 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
-from phyradgs_cl.runtime.memory import DeviceArray, MemoryLedger, Room, Traffic, memory_limit
+from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
 from phyradgs_cl.runtime.opencl import cl
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 from phyradgs_cl.runtime.source import Kernel, kernel_source
@@ -23,6 +23,7 @@ from phyradgs_cl.runtime.source import Kernel, kernel_source
 log = logging.getLogger(__name__)
 
 LANE_CHOICES = (1, 4, 8, 16)
+_TILE_ITEMS = 256  # of a work-group that shares local memory
 
 
 class Runtime:
@@ -66,6 +67,7 @@ class Runtime:
         if self.pixel_items and self.lanes != 1:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
         self.profile = profile
+        self._tile: tuple[int, int] | None = None
         self._profile = Profile()
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
@@ -85,6 +87,11 @@ class Runtime:
                 self._programs[key] = self._build(*key)
             kernel.built = cl.Kernel(self._programs[key], kernel.function_name)
         return kernel.built
+
+    @property
+    def built_kernels(self) -> set[str]:
+        """Names of the kernels that were launched so far."""
+        return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
     def _options(self, defines: dict[str, int | float | bool]) -> tuple[str, ...]:
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
@@ -181,6 +188,16 @@ class Runtime:
         self.traffic.count(down=value.nbytes)
         return value[0]
 
+    @naming_failures("a copy from it")
+    def read_item_later(self, array: DeviceArray, index: int) -> LaterItem:
+        """One element of a flat array as it is after the work so far; nobody waits for it."""
+        value = np.empty(1, array.dtype)
+        offset = index * array.dtype.itemsize
+        event = cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=False)
+        self.queue.flush()
+        self.traffic.bytes_down += value.nbytes
+        return LaterItem(value, event)
+
     @naming_failures("a copy")
     def copy(
         self,
@@ -211,13 +228,16 @@ class Runtime:
     # --- launches -----------------------------------------------------------------------------------
 
     @naming_failures()
-    def launch(self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int = 1) -> None:
-        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``."""
+    def launch(
+        self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
+    ) -> None:
+        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, 1 where that has no more."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
-        rounded = (-(-int(shape[0]) // group) * group, *(int(n) for n in shape[1:]))
-        local = (group, *([1] * (len(rounded) - 1)))
+        given = (group,) if isinstance(group, (int, np.integer)) else group
+        local = (*given, *([1] * (len(shape) - len(given))))
+        rounded = tuple(-(-int(n) // size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         built = self.compile(kernel)
         built.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
@@ -227,6 +247,17 @@ class Runtime:
     def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
         """The work-group size for this class of device."""
         return on_gpu if self.pixel_items else on_cpu
+
+    def tile(self) -> tuple[int, int]:
+        """Sides of a tile that one work-group of a GPU takes: a line as wide as items run together, and some lines of it."""
+        if self._tile is None:
+            handle = self.device.handle
+            asked = self.compile(self.kernel("rates", "multiply_add")).get_work_group_info(
+                cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, handle
+            )
+            width = min(max(int(asked), 16), 64)
+            self._tile = width, max(min(_TILE_ITEMS, handle.max_work_group_size) // width, 1)
+        return self._tile
 
     @naming_failures("the work before")
     def finish(self) -> None:

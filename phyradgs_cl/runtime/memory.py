@@ -48,6 +48,23 @@ class DeviceArray:
         return self.size * self.dtype.itemsize
 
 
+@dataclass(eq=False)
+class LaterItem:
+    """A number that is on its way from the device."""
+
+    _values: np.ndarray
+    _event: cl.Event
+
+    @property
+    def is_here(self) -> bool:
+        return bool(self._event.command_execution_status == cl.command_execution_status.COMPLETE)
+
+    @property
+    def value(self) -> np.generic:
+        """Once it is here."""
+        return self._values[0]
+
+
 Array = np.ndarray | DeviceArray
 """Plain C-contiguous values where they are: operators give their results where their arguments lie."""
 SameArray = TypeVar("SameArray", bound=Array)

@@ -13,6 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime, Traffic
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
@@ -129,3 +130,20 @@ def test_frames_of_fdk_go_up_once_and_its_volume_comes_down_once(scan) -> None:
 
 def test_all_iterative_methods_are_looked_at() -> None:
     assert set(ITERATIVE) == {name for name in METHODS if hasattr(method_options(name), "tolerance")}
+
+
+@pytest.mark.parametrize("method", ["phyradgs", "r2"])
+def test_a_step_of_splats_waits_for_nothing(scan, method, monkeypatch) -> None:
+    """Between the first step, which learns how long lists are, and density control or a report."""
+    waits: list[int] = []
+    step = SplatRun.step
+
+    def counted(self: SplatRun) -> None:
+        before = self.rt.traffic.blocking
+        step(self)
+        waits.append(self.rt.traffic.blocking - before)
+
+    monkeypatch.setattr(SplatRun, "step", counted)
+    changes = {"gaussians": 200, "iterations": 8, "tv_edge": 8, "shape_weight": 0.1, "control": {"every": 0}}
+    reconstruct(scan, method, Runtime(), method_options(method, None, changes))
+    assert len(waits) == 8 and waits[0] == 3 and max(waits[1:]) == 0, "lists of frames and of the sub-volume, its axes"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
+from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
 _CHUNK = 512
-_SLACK = 1.25
+_SLACK = 1.5  # entries that there is memory for, over those of a build that was looked at
+_NEAR = 1.25  # grow before they outgrow it
 _MOST_ENTRIES = 2**31 - 1  # indices of entries are ints
 
 
@@ -15,7 +16,9 @@ class TileLists:
     """Builds, for tiles of a 2D or 3D domain, the list of splats whose extent touches each tile.
 
     ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats,
-    so everything summed over them repeats bit for bit.
+    so everything summed over them repeats bit for bit. Memory for entries follows what builds have needed. The host waits
+    for that number where the count of splats is new, or always where ``waits`` is set; else it comes while others work,
+    and kernels pass over lists that did not fit (cl/common/tile.h).
     """
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
@@ -23,9 +26,12 @@ class TileLists:
         self.total = int(np.prod(tiles))
         self.tile = np.array([*tile, 0], np.int32)
         self.tiles = np.array([*tiles, 0], np.int32)
+        self.waits = False
         self.starts = rt.zeros(self.total + 1, np.int32)
         self.entries = rt.empty(1, np.int32)
         self._counts: DeviceArray = rt.empty(1, np.int32)
+        self._count_seen = -1
+        self._needed: LaterItem | None = None
         self._count = rt.kernel("binning", "bin_count")
         self._within = rt.kernel("binning", "bin_within")
         self._starts = rt.kernel("binning", "bin_starts")
@@ -61,14 +67,12 @@ class TileLists:
             group=group,
         )
         rt.launch(self._starts, 1, np.int32(self.total), self.starts)
-        needed = self._total_entries()
-        if needed >= _MOST_ENTRIES:
-            found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
-            remedy = "use fewer or smaller Gaussians"
-            raise MemoryShortage("lists of splats per tile", found, expected, remedy)
-        if needed > self.entries.size:
-            self.entries = rt.empty(1, np.int32)
-            self.entries = rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
+        if self.waits or count != self._count_seen:
+            self._make_room(int(rt.read_item(self.starts, self.total)), 1.0)
+            self._count_seen, self._needed = count, None
+        elif self._needed is not None and self._needed.is_here:
+            self._make_room(int(self._needed.value), _NEAR)
+            self._needed = None
         rt.launch(
             self._fill,
             chunks,
@@ -80,14 +84,23 @@ class TileLists:
             np.int32(self.entries.size),
             group=group,
         )
+        if not self.waits and self._needed is None:
+            self._needed = rt.read_item_later(self.starts, self.total)
 
     @staticmethod
     def bytes(tiles: int, count: int) -> int:
         """What lists of ``count`` splats take beside their entries."""
         return 4 * (tiles + 1 + tiles * chunks_of(count))
 
-    def _total_entries(self) -> int:
-        return int(self.rt.read_item(self.starts, self.total))
+    def _make_room(self, needed: int, share: float) -> None:
+        """Memory for ``needed`` entries and more, unless there is enough for ``share`` times as many."""
+        if needed >= _MOST_ENTRIES:
+            found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
+            remedy = "use fewer or smaller Gaussians"
+            raise MemoryShortage("lists of splats per tile", found, expected, remedy)
+        if share * needed > self.entries.size:
+            self.entries = self.rt.empty(1, np.int32)
+            self.entries = self.rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
 
 
 def chunks_of(count: int) -> int:

@@ -26,7 +26,6 @@ DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
 DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
 PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
 _BAND_LINES = 8
-_TILE = 16
 _BACKWARD_GROUP = 32
 
 
@@ -92,7 +91,7 @@ class SplatProjector:
         self.cutoff2 = np.float32(cutoff_sigma**2)
         self.path_limits = np.array([*path_limits(time_error), 0], np.float32)
         self.by_pixel = rt.pixel_items
-        self.tile_w, self.tile_h = (_TILE, _TILE) if self.by_pixel else (self.pitch, _BAND_LINES)
+        self.tile_w, self.tile_h = rt.tile() if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
         self.image = padded_zeros(rt, lines, width)
@@ -117,7 +116,7 @@ class SplatProjector:
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         rt = self.rt
         drawn = self.image if self._layers is None else self._layers.images(cells)
-        items = (self.pitch, self.lines) if self.by_pixel else self.lists.total
+        items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
             self._kernels[cells.moving].forward,
             items,
@@ -130,6 +129,8 @@ class SplatProjector:
             self.path_limits,
             self.lists.starts,
             self.lists.entries,
+            np.int32(self.lists.entries.size),
+            np.int32(gaussians.count),
             np.int32(cells.count),
             np.int32(self.lines),
             np.int32(self.width),
@@ -140,7 +141,7 @@ class SplatProjector:
             self.cutoff2,
             np.int32(cells.layers),
             drawn,
-            group=16 if self.by_pixel else 1,
+            group=(self.tile_w, self.tile_h) if self.by_pixel else 1,
         )
         return drawn
 

@@ -59,6 +59,8 @@ class Voxeliser:
             self._records,
             self.lists.starts,
             self.lists.entries,
+            np.int32(self.lists.entries.size),
+            np.int32(gaussians.count),
             self._shape4,
             np.int32(self.pitch),
             self.tile,
@@ -190,6 +192,7 @@ def _in_bricks(
         if made is None or made.shape != brick.shape:
             made = None  # before the next one takes its memory
             made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
+            made.lists.waits = True  # bricks differ, and each is waited for anyway
         part = made.forward(gaussians, grid, brick.start)
         volume[brick.box] = unpad_rows(rt.download(part), brick.shape)
     return volume

@@ -1,0 +1,317 @@
+"""Whether a device computes what it should: every kernel once, on problems of a moment, against float64 on the host.
+
+Gradients are held against central differences of the twins. Limits are several times what float32 leaves on a device
+that rounds as OpenCL asks, and far below what a wrong kernel does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.errors import DeviceError, OutOfMemoryError
+from phyradgs_cl.fields import Activation, Grid
+from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
+from phyradgs_cl.objective import (
+    ImageLoss,
+    ParameterTerms,
+    TotalVariation,
+    image_loss,
+    parameter_loss,
+    total_variation,
+)
+from phyradgs_cl.objective.tv_descent import TvDescent, tv_descent
+from phyradgs_cl.objective.tv_prox import TvProx, tv_prox
+from phyradgs_cl.operators import (
+    DensityOperator,
+    DeviceCells,
+    IntensityOperator,
+    RayOperator,
+    SplatOperator,
+    SplatProjector,
+    Voxeliser,
+    backproject,
+    backproject_lines,
+)
+from phyradgs_cl.operators.splats.binning import TileLists
+from phyradgs_cl.operators.twins.backproject import backprojection, lines_backprojection
+from phyradgs_cl.operators.twins.rays import intensity_volume, ray_frame, ray_volume
+from phyradgs_cl.operators.twins.splat import splat_frame, splat_image, voxel_field
+from phyradgs_cl.operators.twins.splat_moving import moving_frame
+from phyradgs_cl.optim import DeviceAdam, adam_step
+from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
+from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
+
+VALUE, GRADIENT = 1e-4, 1e-3  # of the largest number expected; in tests float32 leaves a tenth of them
+SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
+GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
+ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
+UNIT = 2.0  # line integral that is 1 in images of the intensity model
+STEP = 1e-6  # of central differences
+Comparison = tuple[np.ndarray, np.ndarray, float]
+"""Found, expected, and the largest difference allowed as a share of the largest number expected."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``agreeing``: kernels that gave what their twins give; ``failures``: what did not, in words."""
+
+    device: str
+    agreeing: frozenset[str]
+    failures: tuple[str, ...]
+
+    def __str__(self) -> str:
+        if not self.failures:
+            return f"{self.device} can be trusted: all {len(self.agreeing)} kernels agree with float64"
+        return f"{self.device} cannot be trusted: {'; '.join(self.failures)}"
+
+
+def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdict:
+    """Builds and runs every kernel that a device would be asked for; ``launch_shape`` as Runtime has it."""
+    agreeing: set[str] = set()
+    failures = []
+    for check in CHECKS:
+        rt = Runtime(device, **launch_shape)  # type: ignore[arg-type]  # its own: what it has built is what has run
+        if problem := _problem(check, rt, agreeing):
+            suspects = sorted(rt.built_kernels - agreeing) or sorted(rt.built_kernels)
+            failures.append(f"{', '.join(suspects)} ({problem})" if suspects else problem)
+    return Verdict(rt.device.name, frozenset(agreeing), tuple(failures))
+
+
+def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
+    """What is wrong, in words; nothing where all comparisons hold. Adds to ``agreeing`` what has run for one that does."""
+    try:
+        for found, expected, limit in check(rt):
+            off = float(np.abs(np.asarray(found, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
+            if not off <= limit:
+                return f"off by {off:.1e}, at most {limit:.0e}"
+            agreeing |= rt.built_kernels
+    except (DeviceError, OutOfMemoryError) as error:
+        return str(error)
+    return ""
+
+
+# --- what is run -------------------------------------------------------------------------------------------------
+
+
+def _algebra(rt: Runtime) -> Iterator[Comparison]:
+    """Also the kernel that measures rates."""
+    host, there = HostSpace(), DeviceSpace(rt)
+    a, b, c = (_noise((3, 1999), seed) - np.float32(0.3) for seed in range(3))
+    x, y, z = there.array(a), there.array(b), there.array(c)
+    yield there.numpy(there.add(x, y, 0.7, nonnegative=True)), host.add(a, b, 0.7, nonnegative=True), VALUE
+    yield there.numpy(there.add_product(x, y, z, 0.7)), host.add_product(a, b, c, 0.7), VALUE
+    yield there.numpy(there.multiply(x, y)), host.multiply(a, b), VALUE
+    yield there.numpy(there.reciprocal(x, 0.01)), host.reciprocal(a, 0.01), VALUE
+    yield np.array(there.inner(x, y)), np.array(host.inner(a, b)), VALUE
+    yield np.array(there.largest(x, absolute=True)), np.array(host.largest(a, absolute=True)), VALUE
+    yield there.numpy(there.descend(x, y, 0.7)), a - 0.7 * b / host.norm(b), VALUE
+    out = rt.zeros(64)
+    rt.launch(rt.kernel("rates", "multiply_add"), 64, np.int32(3), np.float32(0.5), out, group=rt.group())
+    chains = 0.5**3 * (np.arange(64)[:, None] % 7 + np.arange(8)) + 1 - 0.5**3
+    yield rt.download(out), rt.lanes * chains.sum(1), VALUE
+
+
+def _binning(rt: Runtime) -> Iterator[Comparison]:
+    rng, tile, tiles, count = np.random.default_rng(1), (4, 3, 2), (3, 4, 2), 700
+    extents = np.zeros((6, 704), np.int32)
+    for axis, size in enumerate(np.multiply(tile, tiles)):
+        extents[2 * axis : 2 * axis + 2] = np.sort(rng.integers(0, size, (2, 704)), axis=0)
+    extents[1, ::5] = extents[0, ::5] - 1  # nowhere
+    lists = TileLists(rt, tile, tiles)
+    lists.build(rt.upload(extents), count, 704)
+    first, last = (extents[k::2, :count] // np.array(tile)[:, None] for k in (0, 1))
+    seen = extents[1, :count] >= extents[0, :count]
+    expected = [
+        np.flatnonzero(seen & np.all((at >= first.T) & (at <= last.T), axis=1))
+        for at in ((i, j, k) for k in range(tiles[2]) for j in range(tiles[1]) for i in range(tiles[0]))
+    ]
+    starts = np.cumsum([0, *map(len, expected)])
+    yield rt.download(lists.starts), starts, 0.0
+    yield rt.download(lists.entries)[: starts[-1]], np.concatenate(expected), 0.0
+
+
+def _splats(rt: Runtime) -> Iterator[Comparison]:
+    for table in _tables():
+        frame = splat_frame if table.end_poses is None else moving_frame
+        for affine in (False, True):
+            twin = partial(frame, table=table, detector_shape=SHAPE, affine=affine)
+            yield from _frame_and_gradients(rt, table, twin, affine=affine)
+
+
+def _layered_splats(rt: Runtime) -> Iterator[Comparison]:
+    table = _tables()[1]
+
+    def twin(rows: np.ndarray) -> np.ndarray:
+        light = np.zeros(SHAPE)
+        for pose, weight, start, stop in zip(table.pose, table.weight, table.line_start, table.line_stop, strict=True):
+            light[:, start:stop] += weight * np.exp(-UNIT * splat_image(rows, pose, SHAPE)[:, start:stop])
+        return -np.log(light) / UNIT
+
+    yield from _frame_and_gradients(rt, table, twin, intensity_unit=UNIT)
+
+
+def _frame_and_gradients(
+    rt: Runtime, table: TimeCells, twin: Callable[[np.ndarray], np.ndarray], **options: float | bool
+) -> Iterator[Comparison]:
+    rows, h, cells = _cloud(), _noise(SHAPE, 2), DeviceCells.upload(rt, table)
+    shape = table.readout.shape(SHAPE)
+    projector = SplatProjector(rt, *shape, cutoff_sigma=0.0, time_error=1e-6, **options)  # type: ignore[arg-type]
+    yield table.readout.frames(projector.project(rows, cells)), twin(rows), VALUE
+    found = projector.project_adjoint(rows, cells, table.readout.frames(h))
+    yield from _by_class(found, _differences(twin, rows, h))
+
+
+def _plain_splats(rt: Runtime) -> Iterator[Comparison]:
+    rows, h = _cloud(), _noise((1, *SHAPE), 3)
+    rows[QUATERNION] *= 1.7
+    for axis in ("rows", "columns"):
+        table = static_cells(ORBIT, Shutter(0.8, 0.6, axis), 0, 0.2, SHAPE[axis == "columns"])
+        operator = SplatOperator(rt, SHAPE, [table], 0.7, cutoff_sigma=0.0)
+        point = operator.rows.enter(rt.upload(rows, np.float32))
+        yield rt.download(operator.forward(point))[0], splat_frame(rows, table, SHAPE), VALUE
+        found = rt.download(operator.back(point, rt.upload(h)))
+        yield from _by_class(found, _differences(partial(splat_frame, table=table, detector_shape=SHAPE), rows, h))
+    ones = rows.copy()
+    ones[DENSITY] = 1
+    found = rt.download(DensityOperator(operator, point).forward(rt.upload(ones[DENSITY], np.float32)))
+    yield found[0], splat_frame(ones, table, SHAPE), VALUE
+
+
+def _voxels(rt: Runtime) -> Iterator[Comparison]:
+    rows, h = _cloud(), _noise(GRID.shape, 4)
+    voxeliser = Voxeliser(rt, GRID.shape, cutoff_sigma=0.0)
+    yield voxeliser.voxelise(rows, GRID), voxel_field(rows, *GRID.axes_mm()), VALUE
+    found = voxeliser.voxelise_adjoint(rows, GRID, h)
+    yield from _by_class(found, _differences(lambda r: voxel_field(r, *GRID.axes_mm()), rows, h))
+
+
+def _rays(rt: Runtime) -> Iterator[Comparison]:
+    volume, frames = _noise(GRID.shape, 5), _noise((1, *SHAPE), 13)
+    still, table, _ = _tables()
+    tall = (32, 5)  # lines enough for the vectors of any CPU
+    orbit = CircularOrbit(ConeGeometry(5.0, 7.5, tall, (3.9 / 32, 4.1 / 5)), ConstantSpeed(0.3, 0.5))
+    upright = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, tall[0])
+    for cells, shape in ((still, SHAPE), (table, SHAPE), (upright, tall)):
+        y = _noise((1, *shape), 6)
+        operator = RayOperator(rt, GRID, shape, [cells])
+        yield operator.forward(volume)[0], ray_frame(volume, GRID, cells, shape), VALUE
+        yield operator.adjoint(y), ray_volume(y[0], GRID, cells), VALUE
+    intensity = IntensityOperator(rt, GRID, SHAPE, [table])
+    on_device = rt.upload(volume)
+    yield rt.download(intensity.forward(on_device))[0], ray_frame(volume, GRID, table, SHAPE), VALUE  # at 0: the mean
+    yield rt.download(intensity.expected(on_device))[0], ray_frame(volume, GRID, table, SHAPE, "intensity"), VALUE
+    found = rt.download(intensity.adjoint(rt.upload(frames)))
+    yield found, intensity_volume(frames[0], volume, GRID, table), VALUE
+
+
+def _backprojections(rt: Runtime) -> Iterator[Comparison]:
+    frames, weight, angles = _noise((3, *SHAPE), 7), np.array([0.5, 0.8, 1.0]), np.array([0.0, 1.3, 2.9])
+    for tilt in (0.0, 0.05):
+        pose = GEOMETRY.pose(angles)
+        pose[:, 9:12] += tilt * pose[:, 6:9]
+        yield backproject(rt, frames, pose, weight, GRID), backprojection(frames, pose, weight, GRID), VALUE
+    lines = np.stack([GEOMETRY.pose(a + np.linspace(-0.1, 0.1, SHAPE[0])) for a in angles])
+    yield backproject_lines(rt, frames, lines, weight, GRID), lines_backprojection(frames, lines, weight, GRID), VALUE
+
+
+def _image_terms(rt: Runtime) -> Iterator[Comparison]:
+    rendered, measured, transmission = (_noise(SHAPE, seed) for seed in (8, 9, 10))
+    mask = (_noise(SHAPE, 11) > 0.2).astype(np.float32)
+    weights = 0.25, 1.0, 0.3
+    loss = ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
+    x, y, m, t = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask, transmission))
+    found = rt.download(loss.evaluate(x, y, m, float(mask.sum()), t))
+    wide = rendered.astype(np.float64), measured.astype(np.float64), mask.astype(np.float64)
+    value, gradient = image_loss(*wide, *weights, transmission)
+    yield unpad_rows(found, SHAPE), gradient, VALUE
+    yield np.array(loss.value()), np.array(value), VALUE
+
+
+def _variation(rt: Runtime) -> Iterator[Comparison]:
+    volume = _noise(GRID.shape, 12)
+    term = TotalVariation(rt, GRID.shape, pitch_of(GRID.shape[2]))
+    gradient = rt.download(term.evaluate(rt.upload(pad_rows(volume))))
+    value, expected = total_variation(volume)
+    yield unpad_rows(gradient, GRID.shape), expected, VALUE
+    yield np.array(term.value()), np.array(value), VALUE
+    yield TvDescent(rt, GRID.shape)(volume, 0.1, 2), tv_descent(volume, 0.1, 2), VALUE
+    found = TvProx(rt, GRID.shape)(volume, 0.2, 4, nonnegative=True)
+    yield found, tv_prox(volume, 0.2, 4, nonnegative=True), VALUE
+
+
+def _optimiser(rt: Runtime) -> Iterator[Comparison]:
+    activation, stride, count = Activation(0.01, 0.6), 16, 16
+    terms = ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
+    raw = activation.invert(_cloud(count)).astype(np.float32).astype(np.float64)
+    raw[QUATERNION] *= 1.7
+    adam, on_device = DeviceAdam(rt, activation), rt.upload(raw, np.float32)
+    parameters, gradients, statistics = (rt.zeros((n, stride)) for n in (11, 13, 2))
+    adam.activate(on_device, parameters, count, stride)
+    yield rt.download(parameters), activation.apply(raw), VALUE
+    adam.chain(on_device, parameters, gradients, statistics, count, stride, **asdict(terms))
+    found = rt.download(gradients)[:11]
+    yield found, _differences(lambda r: np.array(parameter_loss(activation.apply(r), terms)[0]), raw), GRADIENT
+    rates, moments = np.linspace(0.01, 0.03, 11), rt.zeros((2, 11, stride))
+    adam.step(on_device, gradients, moments, stride, rates, 1)
+    expected = adam_step(raw, found.astype(np.float64), np.zeros((2, 11, stride)), rates, 1)
+    yield rt.download(on_device) - raw, expected[0] - raw, GRADIENT
+    yield rt.download(moments), expected[1], VALUE
+
+
+CHECKS = (
+    _algebra, _binning, _splats, _layered_splats, _plain_splats, _voxels, _rays, _backprojections,
+    _image_terms, _variation, _optimiser,
+)  # fmt: skip
+"""From what others need to what needs others: a kernel that has agreed is no suspect later."""
+
+
+# --- what it is run on -------------------------------------------------------------------------------------------
+
+
+def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
+
+
+def _cloud(count: int = 3) -> np.ndarray:
+    """Parameter rows (11, G) in float32's numbers."""
+    rng = np.random.default_rng(count)
+    turn = rng.normal(size=(4, count))
+    parts = [
+        rng.uniform(-0.5, 0.5, (3, count)), rng.uniform(0.1, 0.4, (3, count)),
+        turn / np.linalg.norm(turn, axis=0), rng.uniform(0.5, 1.5, (1, count)),
+    ]  # fmt: skip
+    return np.concatenate(parts).astype(np.float32).astype(np.float64)
+
+
+def _tables() -> tuple[TimeCells, TimeCells, TimeCells]:
+    """One pose, micro-views, and lines that integrate while the gantry moves."""
+    rolling = ORBIT, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
+    still = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
+    return still, micro_view_cells(*rolling, 3, 2), exact_cells(*rolling, 3)
+
+
+def _differences(
+    function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, h: np.ndarray | float = 1.0
+) -> np.ndarray:
+    """Central differences (11, G) of Σ ``h`` · ``function``(rows)."""
+    result = np.zeros_like(rows)
+    for index in np.ndindex(*rows.shape):
+        ends = []
+        for sign in (1, -1):
+            moved = rows.copy()
+            moved[index] += sign * STEP
+            ends.append((h * function(moved)).sum())
+        result[index] = (ends[0] - ends[1]) / (2 * STEP)
+    return result
+
+
+def _by_class(found: np.ndarray, expected: np.ndarray) -> Iterator[Comparison]:
+    """Gradients (11, G), a class of parameters at a time: their sizes differ."""
+    for part in (MEAN, SCALE, QUATERNION, DENSITY):
+        yield found[part], expected[part], GRADIENT

@@ -1,0 +1,47 @@
+"""Lists of splats per tile that outgrow their memory: nobody waits, nothing is lost, and the next ones fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernel_kit import frame_cells
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser
+
+GRID = Grid.cube(18, 2.0)
+
+
+@pytest.mark.parametrize("what", ["static", "exact", "intensity", "voxels"])
+def test_lists_that_do_not_fit_give_the_same_bits(any_rt, make_cloud, make_geometry, what) -> None:
+    rt, rows = any_rt, make_cloud(40, 7)
+    gaussians = DeviceGaussians.upload(rt, rows)
+    if what == "voxels":
+        operator = Voxeliser(rt, GRID.shape)
+        run = lambda: rt.download(operator.forward(gaussians, GRID))  # noqa: E731
+    else:
+        table = frame_cells("static" if what == "static" else "exact", make_geometry(40, 37))
+        operator, cells = SplatProjector(rt, 40, 37, intensity_unit=2.0 if what == "intensity" else None), None
+        cells = DeviceCells.upload(rt, table)
+        run = lambda: rt.download(operator.forward(gaussians, cells))  # noqa: E731
+    expected = run()
+    needed = int(rt.download(operator.lists.starts)[-1])
+    assert expected.any() and operator.lists.entries.size > needed
+    rt.finish()
+    operator.lists.entries = rt.empty(needed // 2, np.int32)
+    operator.lists._needed = None  # the last number is of lists that fitted
+    np.testing.assert_array_equal(run(), expected)
+    np.testing.assert_array_equal(run(), expected)
+    assert operator.lists.entries.size > needed, "the number has come meanwhile"
+
+
+def test_only_another_cloud_is_waited_for(rt, make_cloud, make_geometry) -> None:
+    projector, cells = SplatProjector(rt, 13, 18), DeviceCells.upload(rt, frame_cells("static", make_geometry(13, 18)))
+
+    def waits(count: int) -> int:
+        gaussians = DeviceGaussians.upload(rt, make_cloud(count, count))
+        before = rt.traffic.blocking
+        projector.forward(gaussians, cells)
+        return rt.traffic.blocking - before
+
+    assert [waits(count) for count in (30, 30, 30, 31, 31)] == [1, 0, 0, 1, 0]
