@@ -1,10 +1,11 @@
 """What a calibration found: a line per parameter, the combinations that nothing tells apart, and the scan set right."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.calibrate.moved import Views
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
 
@@ -31,7 +32,8 @@ class Found:
 class Calibration:
     """``scan``: with what was corrected, all else as it was. parameters: a line each. alike: combinations that leave no
     trace of their own, in words. residual_rms: of the frames before and after, dimensionless, at the finest level, whose
-    residuals ``before`` and ``after`` (F, rows, columns) are kept for a picture. wobble: of views, where asked for."""
+    residuals ``before`` and ``after`` (F, rows, columns) are kept for a picture. views: their own turns and shifts, where
+    some were found; the table has the root mean square of each kind, with the deviation of a single one."""
 
     scan: Scan
     parameters: list[Found]
@@ -39,7 +41,7 @@ class Calibration:
     residual_rms: tuple[float, float]
     before: np.ndarray
     after: np.ndarray
-    wobble: dict[str, float] = field(default_factory=dict)
+    views: Views | None = None
 
     @property
     def corrected(self) -> list[Found]:
@@ -53,5 +55,4 @@ class Calibration:
             "alike": self.alike,
             "residual_rms_before": before,
             "residual_rms_after": after,
-            **({"wobble": self.wobble} if self.wobble else {}),
         }

@@ -13,8 +13,9 @@ from phyradgs_cl.acquisition.trajectory import Trajectory
 class Change:
     """What is different, in the order of docs/calibrate.md; all 0 is the scan as stated.
 
-    Shifts of the panel in its own columns and rows, its turns about its middle (roll in its plane, tilts about its rows'
-    and its columns' direction), source and panel further from the axis, and what is longer or later in time.
+    Shifts of the panel in its own columns and rows, its turns about its middle (roll in its plane, tilts about v and u),
+    source and panel further from the axis, what is longer or later in time, and a turn of all views about the axis, which
+    no frame can tell from an object that is turned.
     """
 
     offset_u_mm: float = 0.0
@@ -27,6 +28,7 @@ class Change:
     readout_s: float = 0.0
     exposure_s: float = 0.0
     start_s: float = 0.0
+    turn_rad: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +68,9 @@ class Moved:
         frame_of = np.stack([u_hat, v_hat, normal], -1)
         column, row = (frame_of @ turn[:, k] * pitch for k, pitch in enumerate((pitch_u_mm, pitch_v_mm)))
         vectors = [source + change.source_distance_mm * normal, middle - half_u * column - half_v * row, column, row]
-        if self.views is not None:
-            about_z = Rotation.from_rotvec([0.0, 0.0, self.views.turn_rad[frame]]).as_matrix()
-            vectors = [vector @ about_z.T for vector in vectors]
-        return np.concatenate(vectors, -1)
+        turn_rad = change.turn_rad + (0.0 if self.views is None else float(self.views.turn_rad[frame]))
+        about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+        return np.concatenate([vector @ about_z.T for vector in vectors], -1)
 
 
 def moved(scan: Scan, change: Change, views: Views | None = None) -> Scan:
@@ -86,8 +87,8 @@ def moved(scan: Scan, change: Change, views: Views | None = None) -> Scan:
         source_to_detector_mm=geometry.source_to_detector_mm + change.source_distance_mm + change.detector_distance_mm,
         detector_offset_mm=(offset_v_mm + change.offset_v_mm, offset_u_mm + change.offset_u_mm),
     )
-    tilts = (change.roll_rad, change.tilt_v_rad, change.tilt_u_rad)
-    if isinstance(path, CircularOrbit) and not any(tilts) and views is None:
+    turns = (change.roll_rad, change.tilt_v_rad, change.tilt_u_rad, change.turn_rad)
+    if isinstance(path, CircularOrbit) and not any(turns) and views is None:
         path = CircularOrbit(geometry, path.kinematics)
     elif change != _timing(change) or views is not None:
         path = Moved(path, geometry.detector_shape, change, views)

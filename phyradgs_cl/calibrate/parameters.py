@@ -13,6 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import near_miss
 
 _STEP_PX = 0.25  # how far a derivative's differences move the image at its edge
+_TIMING_STEP, _LEAST_TIME = 0.1, 0.7  # of the time that is stated: of a difference, and what may be taken off
 _MOST_TILT_RAD = math.radians(2.0)
 
 
@@ -33,7 +34,14 @@ class Parameter:
     def step(self, scan: Scan) -> float:
         """Half the distance of a central difference, in the field's unit."""
         step = _STEP_PX / self.pixels(scan)
-        return min(step, _MOST_TILT_RAD) if self.unit == "deg" else step
+        if self.unit == "deg":
+            return min(step, _MOST_TILT_RAD)
+        return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
+
+    def lowest(self, scan: Scan) -> float:
+        """The lowest value of the field that is tried: times stay above 0."""
+        stated = self.stated(scan) if self.is_timing else 0.0
+        return -_LEAST_TIME * stated if stated > 0 else -math.inf
 
 
 def _half_mm(scan: Scan, axis: int) -> float:
@@ -101,6 +109,8 @@ PARAMETERS = {
         Parameter("start", "start_s", "s", _TURN, lambda s: 0.0, _timing_pixels, is_timing=True),
     )
 }  # fmt: skip
+GAUGE = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, lambda s: _roll_pixels(s), _DEGREES)
+"""What no frame can tell: what is left of its signal is what this discretisation leaves of anything."""
 GROUPS = {
     "offset": ("offset-u", "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
@@ -138,7 +148,8 @@ def _usual(scan: Scan) -> str:
 
 def change_of(values: Mapping[str, float]) -> Change:
     """A change by the parameters' names, in the units of the fields."""
-    return Change(**{PARAMETERS[name].field: float(value) for name, value in values.items()})
+    fields = {**PARAMETERS, GAUGE.name: GAUGE}
+    return Change(**{fields[name].field: float(value) for name, value in values.items()})
 
 
 def in_words(weights: Mapping[str, float]) -> str:

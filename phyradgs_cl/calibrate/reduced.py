@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.parameters import Parameter, change_of
+from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
 from phyradgs_cl.detector import noise_level
 
-LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over; gauges keep 0.1
+LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
+_OVER_GAUGE = 2.0  # and of what is left of a gauge's
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,7 @@ def reduced(
 
 def _signal(level: Level, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
     """Change of the frames (F, rows, columns) by a unit of a parameter."""
-    step = one.step(level.scans[0]) * level.block
+    step = one.step(level.scans[0]) * (1 if one.is_timing else level.block)
     ends = []
     for sign in (1, -1):
         there = {**at, one.name: at.get(one.name, 0.0) + sign * step}
@@ -104,21 +105,31 @@ def _signal(level: Level, one: Parameter, at: Mapping[str, float], volume: np.nd
     return level.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
-def identifiable(problem: Reduced) -> tuple[str, ...]:
-    """The parameters that the frames tell, together: the one of which least is left goes, until enough is left of each."""
+def gauge_share(level: Level, at: Mapping[str, float], volume: np.ndarray, iterations: int) -> float:
+    """What is left of a signal that no frame can tell from another object: what the volume's voxels cannot follow."""
+    problem = reduced(level, [GAUGE], at, volume, iterations)
+    return float(problem.shares[0])
+
+
+def least_share(gauge: float) -> float:
+    """What has to be left of a parameter's signal, where ``gauge`` is left of one that says nothing."""
+    return max(LEAST_SHARE, _OVER_GAUGE * gauge)
+
+
+def identifiable(problem: Reduced, least: float) -> tuple[str, ...]:
+    """The parameters that the frames tell, together: the one of which least is left goes, till ``least`` is left of each."""
     names = problem.names
     while names:
         shares = problem.only(names).shares
         worst = int(np.argmin(shares))
-        if shares[worst] >= LEAST_SHARE:
+        if shares[worst] >= least:
             break
         names = names[:worst] + names[worst + 1 :]
     return names
 
 
-def alike(problem: Reduced) -> list[dict[str, float]]:
-    """Combinations of parameters that leave less than LEAST_SHARE of their signals: weights by name, a dict each."""
+def alike(problem: Reduced, least: float) -> list[dict[str, float]]:
+    """Combinations of parameters that leave less than ``least`` of their signals: weights by name, a dict each."""
     values, vectors = np.linalg.eigh(problem.gram)
-    found = vectors[:, values < LEAST_SHARE**2].T
+    found = vectors[:, values < least**2].T
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in found]
-

@@ -9,9 +9,10 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.moved import moved
+from phyradgs_cl.calibrate.moved import Change, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, Parameter, change_of, chosen, in_words
-from phyradgs_cl.calibrate.reduced import Reduced, alike, identifiable, reduced
+from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
+from phyradgs_cl.calibrate.views import find_wobble
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
@@ -59,23 +60,29 @@ def calibrate(
     usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong.
 
     InputError for parameters that there are not, a scan too small, or others that do not fit the first."""
-    parameters, _ = chosen(what, scan)
+    parameters, has_wobble = chosen(what, scan)
     ready = [prepared(one, InputOptions()) for one in (scan, *others)]
-    _check(ready)
+    _check(ready, has_wobble)
     search = _Search()
     levels = [stage for k, stage in enumerate(STAGES) if k == 0 or _blocks(scan, stage) < _blocks(scan, STAGES[k - 1])]
-    for number, stage in enumerate(levels):
+    for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
         level = Level.of(rt, ready, stage.columns)
         _descend(level, stage, parameters, search)
         if not search.known:
             break
     kept = _corrections(search)
+    change, views = change_of(kept), None
+    table = _table(scan, parameters, search, kept)
+    if has_wobble:
+        report(len(levels), len(levels), "views")
+        wobble = find_wobble(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
+        table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
-    ends = [_residual(level, stage, values) for values in ({}, kept)]
-    facts = _table(scan, parameters, search, kept)
-    corrected = moved(scan, change_of(kept)) if kept else scan
-    calibration = Calibration(corrected, facts, search.alike, (_rms(ends[0]), _rms(ends[1])), *ends)
+    level = Level.of(rt, ready, levels[-1].columns, scan.frames)
+    ends = [_residual(level, levels[-1], *how) for how in ((Change(), None), (change, views))]
+    corrected = moved(scan, change, views) if kept or views is not None else scan
+    calibration = Calibration(corrected, table, search.alike, (_rms(ends[0]), _rms(ends[1])), *ends, views)
     told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
     return replace(calibration, scan=replace(corrected, provenance=told))
 
@@ -84,8 +91,10 @@ def _blocks(scan: Scan, stage: Stage) -> int:
     return -(-max(scan.geometry.detector_shape) // stage.columns)
 
 
-def _check(scans: Sequence[Scan]) -> None:
+def _check(scans: Sequence[Scan], has_wobble: bool) -> None:
     first = scans[0]
+    if has_wobble and len(scans) > 1:
+        raise InputError("--what wobble", "a second scan", "one scan: views are each scan's own", "leave --with out")
     if first.frames < _FEWEST_FRAMES or first.geometry.detector_shape[1] < _FEWEST_COLUMNS:
         found = f"{first.frames} frames of {first.geometry.detector_shape[1]} columns"
         raise InputError("scan", found, f"at least {_FEWEST_FRAMES} frames of {_FEWEST_COLUMNS} columns")
@@ -99,31 +108,39 @@ def _check(scans: Sequence[Scan]) -> None:
 
 
 def _descend(level: Level, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:
-    """Steps on one level until they are small; which parameters the frames tell is asked on the first one."""
+    """Steps on one level until they are small; which parameters the frames tell is asked at each step of the first one."""
     volume: np.ndarray | None = None
+    asks = search.problem is None
     for number in range(stage.steps):
-        is_first = search.problem is None
-        asked = [one for one in parameters if is_first or one.name in search.known]
-        operator = level.operator(change_of(search.at))
-        volume = level.reconstruct(operator, volume, stage.again if number else stage.first)
+        asked = parameters if asks else [PARAMETERS[name] for name in search.known]
+        volume = level.reconstruct(level.operator(change_of(search.at)), volume, stage.again if number else stage.first)
         problem = reduced(level, asked, search.at, volume, stage.project)
-        if is_first:
-            _ask(problem, search)
-        search.problem = problem.only(search.known).about(search.at)
+        if asks:
+            _ask(problem, gauge_share(level, search.at, volume, stage.project), search)
+        search.problem = problem.about(search.at).only(search.known)
         if not search.known:
             return
         values, deviations = search.problem.step(), search.problem.deviations()
-        moves = values - np.array([search.at.get(name, 0.0) for name in search.known])
-        for name, move in zip(search.known, moves, strict=True):
-            most = _MOST_PX * level.block / PARAMETERS[name].pixels(level.scans[0])
-            search.at[name] = search.at.get(name, 0.0) + float(np.clip(move, -most, most))
-        if np.all(np.abs(moves) < _SETTLED * deviations):
+        there = np.array([search.at.get(name, 0.0) for name in search.known])
+        search.at = {
+            name: _limited(PARAMETERS[name], level, old, new)
+            for name, old, new in zip(search.known, there, values, strict=True)
+        }
+        if np.all(np.abs(values - there) < _SETTLED * deviations):
             return
 
 
-def _ask(problem: Reduced, search: _Search) -> None:
+def _limited(one: Parameter, level: Level, old: float, new: float) -> float:
+    """``new`` as far as a step from ``old`` may go."""
+    most = _MOST_PX * level.block / one.pixels(level.scans[0])
+    return max(old + float(np.clip(new - old, -most, most)), one.lowest(level.scans[0]))
+
+
+def _ask(problem: Reduced, gauge: float, search: _Search) -> None:
     """Which parameters the frames tell, and what they cannot tell apart."""
-    search.known, search.alike = identifiable(problem), [in_words(weights) for weights in alike(problem)]
+    least = least_share(gauge)
+    search.known = identifiable(problem, least)
+    search.alike = [in_words(weights) for weights in alike(problem, least)]
     for name in problem.names:
         beside = tuple(one for one in search.known if one != name)
         search.shares[name] = float(problem.only((*beside, name)).shares[-1])
@@ -157,9 +174,9 @@ def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: M
     return table
 
 
-def _residual(level: Level, stage: Stage, values: Mapping[str, float]) -> np.ndarray:
-    """What a volume leaves of the frames (F, rows, columns) under these values."""
-    operator = level.operator(change_of(values))
+def _residual(level: Level, stage: Stage, change: Change, views: Views | None) -> np.ndarray:
+    """What a volume leaves of the frames (F, rows, columns) after a change."""
+    operator = level.operator(change, views)
     volume = level.reconstruct(operator, None, stage.first)
     return level.line_integrals(operator, volume) - level.masked(operator.forward(volume))
 

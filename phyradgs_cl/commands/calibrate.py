@@ -4,12 +4,16 @@ import json
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, calibrate
 from phyradgs_cl.calibrate.parameters import GROUPS, PARAMETERS, WOBBLE
 from phyradgs_cl.calibrate.picture import residual_picture
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Device, Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, written_beside
 from phyradgs_cl.io.scan.copy import copy_with_motion
 from phyradgs_cl.progress import Ticker
@@ -46,6 +50,8 @@ def calibrate_command(
     with Ticker("stage") as ticker:
         ticker.stage(f"reading {scan}")
         loaded, others = load_scan(scan), [] if other is None else [load_scan(other)]
+        if output is not None and WOBBLE in (what or ""):
+            _check_storable(loaded)
         found = calibrate(loaded, Runtime(wish), what, others, lambda done, total, at: ticker.show(done, total, f"  {at}"))
     if output is not None:
         with only_run(output), finish_despite_interrupt():
@@ -57,6 +63,15 @@ def calibrate_command(
     if output is not None and not as_json:
         said = ", ".join(one.name for one in found.corrected) or "nothing"
         say(f"{output}: {said} corrected")
+
+
+def _check_storable(scan: Loaded) -> None:
+    """InputError where a table of poses over time has no place for views of their own."""
+    closest_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))
+    if scan.is_fly and closest_s <= scan.shutter.span_s:
+        found = f"frames of {scan.shutter.span_s:.4g} s that begin every {closest_s:.4g} s"
+        remedy = "use api.calibrate, whose scan need not be a file, or leave -o out"
+        raise InputError("--what wobble", found, "frames that do not overlap in time: a file has one pose at a time", remedy)
 
 
 def _as_text(found: Calibration) -> str:
