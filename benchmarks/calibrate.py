@@ -153,8 +153,8 @@ def run_one(rt: Runtime, case: Case) -> dict[str, object]:
 
 
 def line(found, planted: dict[str, float]) -> dict[str, object]:  # type: ignore[no-untyped-def]
-    truth = planted.get(found.name, 0.0) * PARAMETERS[found.name].scale
-    if found.found is None:
+    truth = planted[found.name] * PARAMETERS[found.name].scale if found.name in planted else 0.0
+    if found.found is None or found.name not in PARAMETERS:  # of views the table has sizes
         return {**found.facts(), "truth": truth + found.stated, "error": None, "z": None}
     error = found.found - found.stated - truth
     return {**found.facts(), "truth": truth + found.stated, "error": error, "z": error / found.deviation}

@@ -7,12 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
 from phyradgs_cl.detector import noise_level
 
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
+_MISMATCH = 2.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
+_TINY = 1e-9
 _OVER_GAUGE = 2.0  # and of what is left of a gauge's
 
 
@@ -25,13 +28,15 @@ class Reduced:
     names: tuple[str, ...]
     jacobian: np.ndarray
     sizes: np.ndarray
+    whole: np.ndarray
     residual: np.ndarray
     frames: int
     noise: float
 
     def only(self, names: Sequence[str]) -> "Reduced":
         at = [self.names.index(name) for name in names]
-        return replace(self, names=tuple(names), jacobian=self.jacobian[at], sizes=self.sizes[at])
+        whole = self.whole[np.ix_(at, at)]
+        return replace(self, names=tuple(names), jacobian=self.jacobian[at], sizes=self.sizes[at], whole=whole)
 
     @property
     def gram(self) -> np.ndarray:
@@ -41,9 +46,11 @@ class Reduced:
 
     @property
     def shares(self) -> np.ndarray:
-        """What of each signal's norm (K,) is left once the object and all other parameters have adapted."""
-        inverse = np.linalg.pinv(self.gram, rcond=1e-8, hermitian=True)
-        return 1 / np.sqrt(np.maximum(np.diag(inverse), 1.0))
+        """What of each parameter's signal (K,) no object takes over, 0 to 1: of its norm, or if that is less, of how surely
+        it would be known beside the others if the object were."""
+        known, unknown = (np.diag(np.linalg.inv(g + _TINY * np.eye(len(g)))) for g in (self.whole, self.gram))
+        found: np.ndarray = np.sqrt(np.minimum(np.minimum(known / unknown, np.diag(self.gram)), 1.0))
+        return found
 
     def about(self, at: Mapping[str, float]) -> "Reduced":
         """The same problem with its parameters, now at these values, back at what is stated: they are then its step."""
@@ -67,7 +74,7 @@ class Reduced:
         variance = np.diag(inverse @ spread @ inverse)
         white = np.diag(inverse) * self.noise**2
         eaten = max(1.0, self.noise**2 / max(float(np.mean(left**2)), 1e-30))
-        found: np.ndarray = np.sqrt(np.maximum(variance * eaten, white)) / self.sizes
+        found: np.ndarray = _MISMATCH * np.sqrt(np.maximum(variance * eaten, white)) / self.sizes
         return found
 
 
@@ -83,12 +90,15 @@ def reduced(
     expected = operator.forward(volume)
     signals = [_signal(level, one, at, volume) for one in parameters]
     left = [level.off_range(operator, signal, iterations).ravel() for signal in signals]
+    sizes = np.array([max(float(np.linalg.norm(signal)), 1e-30) for signal in signals])
+    unit = np.array([signal.ravel() / size for signal, size in zip(signals, sizes, strict=True)], np.float64)
     residual = level.line_integrals(operator, volume) - level.masked(expected)
     beyond = level.off_range(operator, residual, iterations)
     return Reduced(
         names=tuple(one.name for one in parameters),
         jacobian=np.array(left, np.float64),
-        sizes=np.array([max(float(np.linalg.norm(signal)), 1e-30) for signal in signals]),
+        sizes=sizes,
+        whole=unit @ unit.T,
         residual=beyond.ravel().astype(np.float64),
         frames=len(beyond),
         noise=noise_level(level.measured, level.valid),
@@ -117,19 +127,13 @@ def least_share(gauge: float) -> float:
 
 
 def identifiable(problem: Reduced, least: float) -> tuple[str, ...]:
-    """The parameters that the frames tell, together: the one of which least is left goes, till ``least`` is left of each."""
-    names = problem.names
-    while names:
-        shares = problem.only(names).shares
-        worst = int(np.argmin(shares))
-        if shares[worst] >= least:
-            break
-        names = names[:worst] + names[worst + 1 :]
-    return names
+    """The parameters of which ``least`` is left, all others being free: one that is left as stated, and wrong, would
+    else pass its error on."""
+    return tuple(name for name, share in zip(problem.names, problem.shares, strict=True) if share >= least)
 
 
 def alike(problem: Reduced, least: float) -> list[dict[str, float]]:
-    """Combinations of parameters that leave less than ``least`` of their signals: weights by name, a dict each."""
-    values, vectors = np.linalg.eigh(problem.gram)
+    """Combinations of parameters of whose signals an object leaves less than ``least``: weights by name, a dict each."""
+    values, vectors = scipy.linalg.eigh(problem.gram, problem.whole + _TINY * np.eye(len(problem.names)))
     found = vectors[:, values < least**2].T
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in found]

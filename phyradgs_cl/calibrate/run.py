@@ -80,9 +80,10 @@ def calibrate(
         table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
     level = Level.of(rt, ready, levels[-1].columns, scan.frames)
-    ends = [_residual(level, levels[-1], *how) for how in ((Change(), None), (change, views))]
+    before = _residual(level, levels[-1], Change(), None)
+    after = _residual(level, levels[-1], change, views)
     corrected = moved(scan, change, views) if kept or views is not None else scan
-    calibration = Calibration(corrected, table, search.alike, (_rms(ends[0]), _rms(ends[1])), *ends, views)
+    calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
     told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
     return replace(calibration, scan=replace(corrected, provenance=told))
 
@@ -141,9 +142,7 @@ def _ask(problem: Reduced, gauge: float, search: _Search) -> None:
     least = least_share(gauge)
     search.known = identifiable(problem, least)
     search.alike = [in_words(weights) for weights in alike(problem, least)]
-    for name in problem.names:
-        beside = tuple(one for one in search.known if one != name)
-        search.shares[name] = float(problem.only((*beside, name)).shares[-1])
+    search.shares = dict(zip(problem.names, problem.shares.tolist(), strict=True))
 
 
 def _corrections(search: _Search) -> dict[str, float]:
