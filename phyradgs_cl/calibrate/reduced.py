@@ -16,7 +16,7 @@ from phyradgs_cl.detector import noise_level
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
 _MISMATCH = 2.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
 _TINY = 1e-9
-_OVER_GAUGE = 2.0  # and of what is left of a gauge's
+_OVER_GAUGE, _MOST_GAUGE = 2.0, 0.2  # and of what is left of a gauge's, which is much where the geometry is wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def gauge_share(level: Level, at: Mapping[str, float], volume: np.ndarray, itera
 
 def least_share(gauge: float) -> float:
     """What has to be left of a parameter's signal, where ``gauge`` is left of one that says nothing."""
-    return max(LEAST_SHARE, _OVER_GAUGE * gauge)
+    return max(LEAST_SHARE, _OVER_GAUGE * min(gauge, _MOST_GAUGE))
 
 
 def identifiable(problem: Reduced, least: float) -> tuple[str, ...]:

@@ -13,6 +13,8 @@ from phyradgs_cl.calibrate.moved import Change, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, Parameter, change_of, chosen, in_words
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_wobble
+from phyradgs_cl.check.coarse import QUICK, coarse
+from phyradgs_cl.check.questions.offset import best_offset, rough_offset
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
@@ -63,7 +65,7 @@ def calibrate(
     parameters, has_wobble = chosen(what, scan)
     ready = [prepared(one, InputOptions()) for one in (scan, *others)]
     _check(ready, has_wobble)
-    search = _Search()
+    search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     levels = [stage for k, stage in enumerate(STAGES) if k == 0 or _blocks(scan, stage) < _blocks(scan, STAGES[k - 1])]
     for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
@@ -86,6 +88,14 @@ def calibrate(
     calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
     told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
     return replace(calibration, scan=replace(corrected, provenance=told))
+
+
+def _start(rt: Runtime, scan: Scan) -> dict[str, float]:
+    """Where the axis is on the panel, as ``check`` sees it: steps lead there from a few pixels away only."""
+    quick = coarse(scan, QUICK)
+    offset = best_offset(rt, quick, rough_offset(rt, quick))
+    pitch_mm = scan.geometry.pixel_size_mm[1]
+    return {"offset-u": offset.pixels * pitch_mm} if np.isfinite(offset.pixels) else {}
 
 
 def _blocks(scan: Scan, stage: Stage) -> int:
