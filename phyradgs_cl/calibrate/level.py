@@ -79,8 +79,9 @@ class Level:
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
-        method.volume = method.previous = volume
-        method.projected = method.projected_previous = system.expected(volume)
+        projected = system.expected(volume)
+        there = {"volume": volume, "previous": volume, "projected": projected, "projected_previous": projected}
+        method.restore({**method.state(), **there})
         for _ in range(iterations):
             method.step()
         return method.volume

@@ -1,13 +1,14 @@
 """calibrate: a scan's true geometry and timing from its own frames."""
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan as Loaded
-from phyradgs_cl.calibrate import Calibration, calibrate
+from phyradgs_cl.calibrate import Calibration, Found, calibrate
 from phyradgs_cl.calibrate.parameters import GROUPS, PARAMETERS, WOBBLE
 from phyradgs_cl.calibrate.picture import residual_picture
 from phyradgs_cl.commands.console import AsJson, say
@@ -78,9 +79,16 @@ def _as_text(found: Calibration) -> str:
     """A line per parameter, the combinations that leave no trace, and what is left of the frames."""
     lines = [f"{'parameter':18s} {'stated':>12s} {'found':>25s}      verdict"]
     for one in found.parameters:
-        value = "-" if one.found is None else f"{one.found:.6g} ± {one.deviation:.2g}"
-        lines.append(f"{one.name:18s} {one.stated:12.6g} {value:>25s} {one.unit:4s} {one.verdict}")
+        lines.append(f"{one.name:18s} {one.stated:12.6g} {_value(one):>25s} {one.unit:4s} {one.verdict}")
     lines += [f"cannot be told apart: {words}" for words in found.alike]
     before, after = found.residual_rms
     lines.append(f"residual of the frames: {before:.4g} before, {after:.4g} after (RMS of line integrals)")
     return "\n".join(lines)
+
+
+def _value(one: Found) -> str:
+    """What was found to two digits of its deviation; a dash where nothing was."""
+    if one.found is None or one.deviation is None:
+        return "-"
+    digits = max(0, 1 - math.floor(math.log10(max(one.deviation, 1e-12))))
+    return f"{one.found:.{digits}f} ± {one.deviation:.{digits}f}"

@@ -61,6 +61,28 @@ def test_a_right_scan_stays_as_it_is(rt, right) -> None:
     assert found.residual_rms[0] == found.residual_rms[1]
 
 
+def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turned, tmp_path, capsys) -> None:
+    """Which one scan does not, and two that turn alike do not."""
+    longer = Change(readout_s=0.08, exposure_s=0.15)
+    for name, scan in (("on", right), ("back", turned(back=True))):
+        write_scan(tmp_path / name, moved(scan, Change(readout_s=-0.08, exposure_s=-0.15)))
+    words = ["calibrate", str(tmp_path / "on"), "--what", "readout,exposure", "--with"]
+    assert cli.run([*words, str(tmp_path / "back"), "--json"]) == 0
+    for one in json.loads(capsys.readouterr().out)["parameters"]:
+        truth = one["stated"] + getattr(longer, one["name"] + "_s")
+        assert one["verdict"] == CORRECTED and abs(one["found"] - truth) < 3 * one["deviation"], one
+        assert one["deviation"] < 0.05, one
+    assert cli.run([*words, str(tmp_path / "on")]) == 0
+    said = capsys.readouterr().out
+    assert said.count(CANNOT_TELL) == 2 and "±" not in said
+
+
+def test_a_detector_that_adds_photons(rt, turned) -> None:
+    scan = turned(model="intensity")
+    (found,) = calibrate(moved(scan, Change(offset_u_mm=-OFFSET_MM)), rt, "offset-u").parameters
+    assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED
+
+
 def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt, right) -> None:
     rng = np.random.default_rng(1)
     planted = without_gauges(right, np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
