@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -194,7 +195,7 @@ def table(path: Path) -> str:
             groups.setdefault((run["case"], run["size"], run["views"], one["name"]), []).append(one)
     for (case, size, views, name), found in groups.items():
         known = [one for one in found if one["error"] is not None]
-        verdicts = ", ".join(f"{v} {n}" for v, n in _counts(one["verdict"] for one in found).items())
+        verdicts = ", ".join(f"{v} {n}" for v, n in Counter(one["verdict"] for one in found).items())
         cells = ["-"] * 3
         if known:
             errors = [abs(one["error"]) for one in known]
@@ -214,14 +215,15 @@ def table(path: Path) -> str:
         values = " | ".join(f"{value:.2f}" for value in mean.values())
         seconds = np.mean([run["cpu_seconds"] for run in some])
         text.append(f"| {case} | {size}, {views} | {values} | {worst:+.3f} | {seconds:.0f} |")
+    shaken = [run for run in lines if run["case"] == "wobble"]
+    if shaken:
+        text += ["", "| views of | turn planted, left (RMS, deg) | shift planted, left (RMS, pixels) |"]
+        text.append("| --- | --- | --- |")
+    for run in shaken:
+        kinds = ("turn", "deg"), ("shift", "px")
+        turn, shift = (f"{run[f'{k}_planted_{u}']:.2f}, {run[f'{k}_left_{u}']:.3f}" for k, u in kinds)
+        text.append(f"| {run['volume']} {run['size']}³, {run['views']} views, seed {run['seed']} | {turn} | {shift} |")
     return "\n".join(text)
-
-
-def _counts(words) -> dict[str, int]:  # type: ignore[no-untyped-def]
-    counts: dict[str, int] = {}
-    for word in words:
-        counts[word] = counts.get(word, 0) + 1
-    return counts
 
 
 def main() -> None:
@@ -249,6 +251,7 @@ def main() -> None:
                 if what not in done:
                     result = run_one(rt, CASES[case](maker(rt, path, arguments.size, arguments.views), seed))
                     append(arguments.results, dict(zip(key, what, strict=True)) | result)
+    print(table(arguments.results))
 
 
 if __name__ == "__main__":

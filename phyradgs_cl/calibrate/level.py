@@ -18,7 +18,7 @@ from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions, 
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_MOST_FRAMES = 60
+MOST_FRAMES = 60
 _MOST_SAMPLES = 8
 _VOXELS_PER_SAMPLE = 2.0  # that the object's edge moves in an exposure
 _SMOOTH = 0.8  # of a block
@@ -38,7 +38,7 @@ class Level:
     valid: np.ndarray | None
 
     @classmethod
-    def of(cls, rt: Runtime, scans: Sequence[Scan], columns: int, most_frames: int = _MOST_FRAMES) -> "Level":
+    def of(cls, rt: Runtime, scans: Sequence[Scan], columns: int, most_frames: int = MOST_FRAMES) -> "Level":
         """Blocks such that the longer side has at most ``columns`` of them."""
         block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
         fewer = [fewer_frames(scan, most_frames) for scan in scans]

@@ -8,7 +8,7 @@ import numpy as np
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
-from phyradgs_cl.calibrate.level import Level
+from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
 from phyradgs_cl.calibrate.moved import Change, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, Parameter, change_of, chosen, in_words
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
@@ -81,7 +81,7 @@ def calibrate(
         wobble = find_wobble(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
         table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
-    level = Level.of(rt, ready, levels[-1].columns, scan.frames)
+    level = Level.of(rt, ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
     corrected = moved(scan, change, views) if kept or views is not None else scan

@@ -85,13 +85,16 @@ def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, 
     assert differ - ends == {"entry/phyradgs/provenance"} and len(ends) == len(touched)
 
 
-def test_encoder_and_standing_gantry_are_copied_too(right, tmp_path) -> None:
+def test_encoder_standing_gantry_and_views_are_copied_too(right, tmp_path) -> None:
     path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
     table = EncoderTable(np.array([-1.0, 50.0]), np.array([0.0, 7.0]))
     encoded = replace(right, trajectory=CircularOrbit(right.geometry, table))
-    for scan, change in ((encoded, TIMES), (replace(right, is_fly=False), TURNS)):
+    views = Views(0.01 * np.arange(15), 0.1 * np.arange(30).reshape(15, 2))
+    for scan, change, off in (
+        (encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)
+    ):  # fmt: skip
         write_scan(path, scan)
-        changed = moved(load_scan(path), change)
+        changed = moved(load_scan(path), change, off)
         copy_with_motion(path, copy, changed)
         read = load_scan(copy)
         np.testing.assert_allclose(poses(read), poses(changed), atol=1e-5)
