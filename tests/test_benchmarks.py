@@ -72,12 +72,13 @@ def test_a_device_agrees_with_itself_to_the_bit(tmp_path) -> None:
     assert len(found["differences"]) > 30 and not any(found["differences"].values())
 
 
-def test_time_to_a_psnr_and_bias_of_balls_are_resumed(tmp_path) -> None:
+def test_benchmarks_that_append_lines_are_resumed(tmp_path) -> None:
     x = np.linspace(-1, 1, 32)
     with h5py.File(tmp_path / "ball_32.h5", "w") as file:
         file["volume"] = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < 0.5).astype(np.float32)
     for name, words, row, count in (
         ("time_to_psnr.py", "{tmp} {lines} --quick --names ball", "| ball | 16 | exact |", 2),
+        ("calibrate.py", "{tmp} {lines} --cases wobble --size 16 --views 8 --seeds 1", "| wobble | 16, 8 | shift-u", 1),
         ("bead_bias.py", "{lines} --size XS --trials stop-and-shoot", "| stop-and-shoot | fista-tv |", 1),
     ):
         lines = tmp_path / f"{name}.jsonl"

@@ -27,6 +27,7 @@ from phyradgs_cl.acquisition import (
     Trajectory,
 )
 from phyradgs_cl.api.bridges import as_torch
+from phyradgs_cl.api.calibration import calibrate
 from phyradgs_cl.api.operators import LinearOperator, Operator
 from phyradgs_cl.api.projectors import (
     initial_gaussians,
@@ -37,12 +38,14 @@ from phyradgs_cl.api.projectors import (
 )
 from phyradgs_cl.api.runs import load_scan, load_volume, reconstruct, save_scan, save_volume, simulate
 from phyradgs_cl.api.scans import fly_scan, static_scan
+from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 
 __all__ = [
+    "Calibration",
     "CircularOrbit",
     "ConeGeometry",
     "ConstantSpeed",
@@ -70,6 +73,7 @@ __all__ = [
     "TimeCells",
     "Trajectory",
     "as_torch",
+    "calibrate",
     "compare",
     "fly_scan",
     "initial_gaussians",

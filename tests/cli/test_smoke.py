@@ -20,6 +20,8 @@ COMMANDS = (
     (f"simulate {SCAN} -o scan.h5", "scan.h5"),
     ("info scan.h5", ""),
     ("check scan.h5", ""),
+    (f"simulate {SCAN} --views 8 -o eight.h5", "eight.h5"),
+    ("calibrate eight.h5 --what offset -o calibrated.h5", "calibrated.png"),
     ("estimate scan.h5 --method sirt", ""),
     ("reconstruct scan.h5 --iterations 2 -o volume.h5", "volume.h5"),
     ("evaluate volume.h5 --reference scan.h5 --json", "volume.png"),

@@ -77,5 +77,8 @@ def check_offset(offset: Offset, block: int, pitch_mm: float) -> Finding:
     if abs(offset.pixels) <= threshold:
         verdict = OK if threshold <= block else CANNOT_TELL
         return Finding(CENTRE, verdict, *value, uncertainty=offset.spread)
-    advice = f"add {shift_mm:.4g} mm to detector_offset along u: --fix-offset writes a copy of the scan"
+    advice = (
+        f"add {shift_mm:.4g} mm to detector_offset along u: --fix-offset writes a copy of the scan; "
+        "'phyradgs calibrate' looks for roll and tilt as well"
+    )
     return Finding(CENTRE, SUSPICIOUS, *value, advice, offset.spread)

@@ -93,13 +93,20 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
         write_number(sample, "rotation_angle_end", np.rad2deg(last_rad)[frame_of], "degree", rotates="gantry")
     path = scan.trajectory
     if isinstance(path, PoseTable):
-        # a stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts
-        time_s = path.time_s - (0.0 if scan.is_fly else scan.shutter.middle_s)
-        write_number(_table_group(entry, "poses", time_s), "pose", path.table, "mm")
+        write_poses(entry, scan)
     elif scan.is_fly and isinstance(path, CircularOrbit) and isinstance(path.kinematics, EncoderTable | SpeedRamp):
         time_s, angle_rad = _angle_table(scan, path.kinematics)
         group = _table_group(entry, "kinematics", time_s)
         write_number(group, "angle_deg", np.rad2deg(angle_rad), "degree", rotates="gantry")
+
+
+def write_poses(entry: h5py.Group, scan: Scan) -> None:
+    """Write the table of a scan whose trajectory is one."""
+    path = scan.trajectory
+    assert isinstance(path, PoseTable)
+    # a stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts
+    time_s = path.time_s - (0.0 if scan.is_fly else scan.shutter.middle_s)
+    write_number(_table_group(entry, "poses", time_s), "pose", path.table, "mm")
 
 
 def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group:

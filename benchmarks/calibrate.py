@@ -1,0 +1,258 @@
+"""What `phyradgs calibrate` finds of planted errors, and what that does for the volume: one line of JSON per run, resumable.
+
+    python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
+    python benchmarks/calibrate.py --table RESULTS.jsonl
+
+FOLDER holds volumes as `phyradgs bench` takes them. Scans are R2-Gaussian's scanner with TIGRE's noise, detectors twice as
+wide as the volume; the volume is fista-tv's, every line at its own times. Cases:
+
+    panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once
+    right      nothing wrong; everything that may be asked for by itself is
+    columns    readout 20 % longer than stated, columns read
+    rows       the same, rows read: not to be known from such a scan
+    turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way
+    wobble     0.3° and 1 pixel (RMS) per view
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scans import append, files_of, read_lines
+from tables.case import FLY, SyntheticCase
+
+from phyradgs_cl import __version__
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PerRow, Protocol, Scan
+from phyradgs_cl.calibrate import Calibration, calibrate
+from phyradgs_cl.calibrate.moved import Change, Moved, Views, moved
+from phyradgs_cl.calibrate.parameters import PARAMETERS, change_of
+from phyradgs_cl.calibrate.wobble import views_of, without_gauges
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import load_attenuation
+from phyradgs_cl.metrics import psnr
+from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import volume_scene
+
+ITERATIONS = 60
+Maker = Callable[..., Scan]
+
+
+@dataclass(frozen=True)
+class Planned(Protocol):
+    """A protocol whose gantry turns the other way, or wobbles."""
+
+    is_backwards: bool = False
+    views_off: Views | None = None
+
+    def orbit(self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None):  # type: ignore[no-untyped-def]
+        path = super().orbit(geometry, jitter_deg, rng)
+        if self.is_backwards:
+            sweeps = path.kinematics
+            first, last = -sweeps.angle_start_rad, -sweeps.angle_end_rad
+            path = CircularOrbit(geometry, replace(sweeps, angle_start_rad=first, angle_end_rad=last))
+        return path if self.views_off is None else Moved(path, geometry.detector_shape, Change(), self.views_off)
+
+
+@dataclass(frozen=True)
+class Case:
+    """The scan as stated, the right one, others, what to ask for, and what is planted by parameter."""
+
+    stated: Scan
+    right: Scan
+    what: str | None
+    planted: dict[str, float]
+    others: tuple[Scan, ...] = ()
+    views: Views | None = None
+
+
+def panel(make: Maker, seed: int) -> Case:
+    right = make(seed)
+    offset_mm = 2.5 * right.geometry.pixel_size_mm[1]
+    planted = {"offset-u": offset_mm, "roll": np.deg2rad(0.5), "tilt-v": np.deg2rad(1.0)}
+    return Case(_without(right, planted), right, "offset,roll,tilt", planted)
+
+
+def right(make: Maker, seed: int) -> Case:
+    scan = make(seed)
+    return Case(scan, scan, None, {})
+
+
+def columns(make: Maker, seed: int) -> Case:
+    return _readout(make(seed, axis="columns"))
+
+
+def rows(make: Maker, seed: int) -> Case:
+    return _readout(make(seed))
+
+
+def _readout(scan: Scan) -> Case:
+    planted = {"readout": scan.shutter.readout_s * (1 - 1 / 1.2)}
+    return Case(_without(scan, planted), scan, "readout,exposure", planted)
+
+
+def turned(make: Maker, seed: int) -> Case:
+    scan, back = make(seed), make(seed + 1000, is_backwards=True)
+    shutter = scan.shutter
+    planted = {"readout": shutter.readout_s * (1 - 1 / 1.2), "exposure": shutter.exposure_s * (1 - 1 / 1.2)}
+    return Case(_without(scan, planted), scan, "readout,exposure", planted, (_without(back, planted),))
+
+
+def wobble(make: Maker, seed: int) -> Case:
+    """But for what an object turned or elsewhere looks like: its volume could not be compared with the truth."""
+    scan, rng = make(seed), np.random.default_rng(seed)
+    sizes = np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm])
+    views = views_of(without_gauges(scan, sizes * rng.normal(size=(scan.frames, 3))))
+    shaken = make(seed, views_off=views)
+    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views)
+
+
+def _without(scan: Scan, planted: dict[str, float]) -> Scan:
+    return moved(scan, change_of({name: -value for name, value in planted.items()}))
+
+
+CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble)}
+
+
+def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
+    detector = 2 * size
+    geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
+
+    def make(seed: int, axis: str = "rows", **plan: object) -> Scan:
+        source = f"volume {path}", geometry, Grid.cube(size, 2.0), size, axis
+        scene = volume_scene(rt, load_attenuation(path), *source)
+        protocol = Planned(views=views, exposure_deg=360.0 / views, **plan)  # type: ignore[arg-type]
+        return SyntheticCase(rt, scene, geometry, protocol, axis, seed).scan(FLY)
+
+    return make
+
+
+def run_one(rt: Runtime, case: Case) -> dict[str, object]:
+    started, cpu_started = time.perf_counter(), time.process_time()
+    found = calibrate(case.stated, rt, case.what, case.others)
+    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
+    scans = {"stated": case.stated, "calibrated": found.scan, "right": case.right}
+    if not found.corrected and case.stated is case.right:
+        scans = {"right": case.right}
+    scores = {name: score(rt, scan) for name, scan in scans.items()}
+    return {
+        "parameters": [line(one, case.planted) for one in found.parameters],
+        "psnr_db": {"stated": scores["right"], "calibrated": scores["right"], **scores},
+        **{key: value for key, value in found.facts().items() if key != "parameters"},
+        **wobble_left(found, case),
+        "seconds": round(seconds, 1),
+        "cpu_seconds": round(cpu_seconds, 1),
+        "device": rt.device.name,
+        "version": __version__,
+    }
+
+
+def line(found, planted: dict[str, float]) -> dict[str, object]:  # type: ignore[no-untyped-def]
+    truth = planted[found.name] * PARAMETERS[found.name].scale if found.name in planted else 0.0
+    if found.found is None or found.name not in PARAMETERS:  # of views the table has sizes
+        return {**found.facts(), "truth": truth + found.stated, "error": None, "z": None}
+    error = found.found - found.stated - truth
+    return {**found.facts(), "truth": truth + found.stated, "error": error, "z": error / found.deviation}
+
+
+def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
+    """What is left (RMS) of turns (deg) and shifts (pixels) of views, and what was planted."""
+    if case.views is None:
+        return {}
+    pitch_mm = case.right.geometry.pixel_size_mm[1]
+    none = Views.none(case.right.frames)
+    facts: dict[str, object] = {}
+    for name, views in (("planted", none), ("left", found.views or none)):
+        facts[f"turn_{name}_deg"] = round(float(np.rad2deg(np.std(case.views.turn_rad - views.turn_rad))), 4)
+        facts[f"shift_{name}_px"] = round(float(np.std(case.views.shift_mm - views.shift_mm)) / pitch_mm, 4)
+    return facts
+
+
+def score(rt: Runtime, scan: Scan) -> float:
+    """PSNR in dB of fista-tv's volume."""
+    options = method_options("fista-tv", None, {"motion": PerRow(3), "iterations": ITERATIONS})
+    volume = reconstruct(scan, "fista-tv", rt, options).volume
+    assert scan.reference is not None
+    return round(psnr(volume, scan.reference), 3)
+
+
+def table(path: Path) -> str:
+    """Markdown: a row per case, size, views and parameter."""
+    lines = read_lines(path)
+    text = [
+        "| case | volume³, views | parameter | truth | error: mean, worst | σ stated | largest error/σ | verdicts | runs |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    groups: dict[tuple[object, ...], list[dict]] = {}
+    for run in lines:
+        for one in run["parameters"]:
+            groups.setdefault((run["case"], run["size"], run["views"], one["name"]), []).append(one)
+    for (case, size, views, name), found in groups.items():
+        known = [one for one in found if one["error"] is not None]
+        verdicts = ", ".join(f"{v} {n}" for v, n in Counter(one["verdict"] for one in found).items())
+        cells = ["-"] * 3
+        if known:
+            errors = [abs(one["error"]) for one in known]
+            cells[0] = f"{np.mean([one['error'] for one in known]):+.2g}, {max(errors):.2g} {known[0]['unit']}"
+            cells[1] = f"{np.mean([one['deviation'] for one in known]):.2g}"
+            cells[2] = f"{max(abs(one['z']) for one in known):.1f}"
+        shown = f"{found[0]['truth']:.4g} {found[0]['unit']}"
+        text.append(f"| {case} | {size}, {views} | {name} | {shown} | {' | '.join(cells)} | {verdicts} | {len(found)} |")
+    text += ["", "| case | volume³, views | PSNR stated | calibrated | right | worst calibrated - right | seconds |"]
+    text.append("| --- | --- | --- | --- | --- | --- | --- |")
+    runs: dict[tuple[object, ...], list[dict]] = {}
+    for run in lines:
+        runs.setdefault((run["case"], run["size"], run["views"]), []).append(run)
+    for (case, size, views), some in runs.items():
+        mean = {key: np.mean([run["psnr_db"][key] for run in some]) for key in ("stated", "calibrated", "right")}
+        worst = min(run["psnr_db"]["calibrated"] - run["psnr_db"]["right"] for run in some)
+        values = " | ".join(f"{value:.2f}" for value in mean.values())
+        seconds = np.mean([run["cpu_seconds"] for run in some])
+        text.append(f"| {case} | {size}, {views} | {values} | {worst:+.3f} | {seconds:.0f} |")
+    shaken = [run for run in lines if run["case"] == "wobble"]
+    if shaken:
+        text += ["", "| views of | turn planted, left (RMS, deg) | shift planted, left (RMS, pixels) |"]
+        text.append("| --- | --- | --- |")
+    for run in shaken:
+        kinds = ("turn", "deg"), ("shift", "px")
+        turn, shift = (f"{run[f'{k}_planted_{u}']:.2f}, {run[f'{k}_left_{u}']:.3f}" for k, u in kinds)
+        text.append(f"| {run['volume']} {run['size']}³, {run['views']} views, seed {run['seed']} | {turn} | {shift} |")
+    return "\n".join(text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder of volumes")
+    parser.add_argument("results", type=Path, nargs="?", help="JSON lines, appended to")
+    parser.add_argument("--cases", default=",".join(CASES), help="with commas")
+    parser.add_argument("--only", default=None, help="volumes' names, with commas")
+    parser.add_argument("--size", type=int, default=32)
+    parser.add_argument("--views", type=int, default=25)
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--table", action="store_true", help="print the tables of the results file given as FOLDER")
+    arguments = parser.parse_args()
+    if arguments.table:
+        print(table(arguments.folder))
+        return
+    rt = Runtime(arguments.device)
+    key = ("case", "volume", "size", "views", "seed")
+    done = {tuple(run[k] for k in key) for run in read_lines(arguments.results)}
+    for seed in range(arguments.seeds):
+        for case in arguments.cases.split(","):
+            for name, path in files_of(arguments.folder, arguments.only, arguments.size).items():
+                what = (case, name, arguments.size, arguments.views, seed)
+                if what not in done:
+                    result = run_one(rt, CASES[case](maker(rt, path, arguments.size, arguments.views), seed))
+                    append(arguments.results, dict(zip(key, what, strict=True)) | result)
+    print(table(arguments.results))
+
+
+if __name__ == "__main__":
+    main()

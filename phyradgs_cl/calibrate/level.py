@@ -1,0 +1,96 @@
+"""The frames of one or two scans at one coarseness, their operator under any change, and the volume that fits them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.calibrate.moved import Change, Views, moved
+from phyradgs_cl.check.coarse import binned, coarse_grid, fewer_frames, smooth
+from phyradgs_cl.check.questions.timing import exposure_arc_rad
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.objective import TvProx
+from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions, axis_weights
+from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.runtime import Runtime
+
+MOST_FRAMES = 60
+_MOST_SAMPLES = 8
+_VOXELS_PER_SAMPLE = 2.0  # that the object's edge moves in an exposure
+_SMOOTH = 0.8  # of a block
+_TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """``scans`` as they are stated, with at most 60 frames each; measured (F, rows, columns): the frames of all of them in
+    blocks of ``block`` pixels, 0 where ``valid`` is not; ``grid``: the volume's."""
+
+    rt: Runtime
+    scans: Sequence[Scan]
+    block: int
+    grid: Grid
+    measured: np.ndarray
+    valid: np.ndarray | None
+
+    @classmethod
+    def of(cls, rt: Runtime, scans: Sequence[Scan], columns: int, most_frames: int = MOST_FRAMES) -> "Level":
+        """Blocks such that the longer side has at most ``columns`` of them."""
+        block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
+        fewer = [fewer_frames(scan, most_frames) for scan in scans]
+        small = [binned(smooth(scan, _SMOOTH * block if block > 1 else 0.0), block) for scan in fewer]
+        grid = coarse_grid(scans[0].grid, small[0].geometry, 1.0)
+        measured = np.concatenate([np.asarray(scan.projections, np.float32) for scan in small])
+        valid = np.concatenate([scan.valid for scan in small])
+        bare = [replace(s, projections=np.broadcast_to(np.float32(0), s.projections.shape)) for s in fewer]
+        if valid.all():
+            return cls(rt, bare, block, grid, measured, None)
+        return cls(rt, bare, block, grid, np.where(valid, measured, np.float32(0)), valid)
+
+    @property
+    def is_intensity(self) -> bool:
+        return self.scans[0].detector_model == "intensity"
+
+    def operator(self, change: Change, views: Views | None = None) -> RayOperator:
+        """A of all frames after a change."""
+        tables = []
+        for scan in self.scans:
+            small = binned(moved(scan, change, views), self.block)
+            voxels = exposure_arc_rad(scan) * max(self.grid.shape[1:]) / 2
+            motion = PerRow(sub_intervals=int(np.clip(math.ceil(voxels / _VOXELS_PER_SAMPLE), 1, _MOST_SAMPLES)))
+            tables += [motion.cells(small, frame) for frame in range(small.frames)]
+        return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables)
+
+    def masked(self, frames: np.ndarray) -> np.ndarray:
+        return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
+
+    def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """The measurement as A x would explain it: what averaging intensity hides in edges is added, as of ``volume``."""
+        if not self.is_intensity:
+            return self.measured
+        return self.measured + self.masked(operator.intensity_gap(volume))
+
+    def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
+        """A volume with little total variation, none of it negative, from ``start`` on."""
+        volume = np.zeros(self.grid.shape, np.float32) if start is None else start
+        system = System(operator, self.line_integrals(operator, volume), self.valid)
+        method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
+        projected = system.expected(volume)
+        there = {"volume": volume, "previous": volume, "projected": projected, "projected_previous": projected}
+        method.restore({**method.state(), **there})
+        for _ in range(iterations):
+            method.step()
+        return method.volume
+
+    def off_range(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
+        """What of ``frames`` no volume explains, as far as CGLS gets in ``iterations``."""
+        method = Cgls(System(operator, self.masked(frames), self.valid))
+        for _ in range(iterations):
+            if method.finished:
+                break
+            method.step()
+        return method.residual

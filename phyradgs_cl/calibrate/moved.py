@@ -1,0 +1,100 @@
+"""A scan whose panel, distances, timing and single views differ from what it says of itself."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is different, in the order of docs/calibrate.md; all 0 is the scan as stated.
+
+    Shifts of the panel in its own columns and rows, its turns about its middle (roll in its plane, tilts about v and u),
+    source and panel further from the axis, what is longer or later in time, and a turn of all views about the axis, which
+    no frame can tell from an object that is turned.
+    """
+
+    offset_u_mm: float = 0.0
+    offset_v_mm: float = 0.0
+    roll_rad: float = 0.0
+    tilt_v_rad: float = 0.0
+    tilt_u_rad: float = 0.0
+    source_distance_mm: float = 0.0
+    detector_distance_mm: float = 0.0
+    readout_s: float = 0.0
+    exposure_s: float = 0.0
+    start_s: float = 0.0
+    turn_rad: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Per view of the file: turns about the axis (F,) in rad, shifts of the panel along v and u (F, 2) in mm."""
+
+    turn_rad: np.ndarray
+    shift_mm: np.ndarray
+
+    @classmethod
+    def none(cls, frames: int) -> "Views":
+        return cls(np.zeros(frames), np.zeros((frames, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """Poses of ``base`` for a panel of ``shape`` (rows, columns) after a change of all views, then of each."""
+
+    base: Trajectory
+    shape: tuple[int, int]
+    change: Change
+    views: Views | None = None
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Poses (..., 12) at times (...)."""
+        pose, change = np.array(self.base.pose(frame, time_s)), self.change
+        source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
+        pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
+        u_hat, v_hat = column / pitch_u_mm, row / pitch_v_mm
+        normal = np.cross(u_hat, v_hat)  # towards the source
+        half_v, half_u = ((n - 1) / 2 for n in self.shape)
+        shift_v_mm, shift_u_mm = (0.0, 0.0) if self.views is None else self.views.shift_mm[frame]
+        middle = first + half_u * column + half_v * row - change.detector_distance_mm * normal
+        middle = middle + (change.offset_u_mm + shift_u_mm) * u_hat + (change.offset_v_mm + shift_v_mm) * v_hat
+        # columns of the turn: where the panel's u, v and normal go, in those three themselves
+        turn = Rotation.from_rotvec([change.tilt_u_rad, change.tilt_v_rad, change.roll_rad]).as_matrix()
+        frame_of = np.stack([u_hat, v_hat, normal], -1)
+        column, row = (frame_of @ turn[:, k] * pitch for k, pitch in enumerate((pitch_u_mm, pitch_v_mm)))
+        vectors = [source + change.source_distance_mm * normal, middle - half_u * column - half_v * row, column, row]
+        turn_rad = change.turn_rad + (0.0 if self.views is None else float(self.views.turn_rad[frame]))
+        about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+        return np.concatenate([vector @ about_z.T for vector in vectors], -1)
+
+
+def moved(scan: Scan, change: Change, views: Views | None = None) -> Scan:
+    """The scan after a change. Offsets and distances of a circular orbit stay numbers of its geometry; what they cannot say
+    makes the trajectory one of its own."""
+    shutter, geometry, path = scan.shutter, scan.geometry, scan.trajectory
+    shutter = replace(
+        shutter, readout_s=shutter.readout_s + change.readout_s, exposure_s=shutter.exposure_s + change.exposure_s
+    )
+    offset_v_mm, offset_u_mm = geometry.detector_offset_mm
+    geometry = replace(
+        geometry,
+        source_to_axis_mm=geometry.source_to_axis_mm + change.source_distance_mm,
+        source_to_detector_mm=geometry.source_to_detector_mm + change.source_distance_mm + change.detector_distance_mm,
+        detector_offset_mm=(offset_v_mm + change.offset_v_mm, offset_u_mm + change.offset_u_mm),
+    )
+    turns = (change.roll_rad, change.tilt_v_rad, change.tilt_u_rad, change.turn_rad)
+    if isinstance(path, CircularOrbit) and not any(turns) and views is None:
+        path = CircularOrbit(geometry, path.kinematics)
+    elif change != _timing(change) or views is not None:
+        path = Moved(path, geometry.detector_shape, change, views)
+    start_s = np.asarray(scan.frame_start_s, np.float64) + change.start_s
+    return replace(scan, geometry=geometry, trajectory=path, shutter=shutter, frame_start_s=start_s)
+
+
+def _timing(change: Change) -> Change:
+    return Change(readout_s=change.readout_s, exposure_s=change.exposure_s, start_s=change.start_s)

@@ -1,0 +1,94 @@
+"""calibrate: a scan's true geometry and timing from its own frames."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan as Loaded
+from phyradgs_cl.calibrate import Calibration, Found, calibrate
+from phyradgs_cl.calibrate.parameters import GROUPS, PARAMETERS, WOBBLE
+from phyradgs_cl.calibrate.picture import residual_picture
+from phyradgs_cl.commands.console import AsJson, say
+from phyradgs_cl.commands.files import file_option, option
+from phyradgs_cl.commands.options import Device, Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import check_writable, only_run, written_beside
+from phyradgs_cl.io.scan.copy import copy_with_motion
+from phyradgs_cl.progress import Ticker
+from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import device_wish
+from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
+
+EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
+_WHAT = f"What to look for, with commas: {', '.join([*GROUPS, *(n for n in PARAMETERS if n not in GROUPS), WOBBLE])}."
+_OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."
+_WITH = "Another scan of the same object, which lies as it did: turned the other way, it tells readout and exposure."
+
+
+def calibrate_command(
+    scan: Scan,
+    output: Annotated[Path | None, file_option(_OUTPUT, "--output", "-o", default="none is written")] = None,
+    what: Annotated[str | None, option(_WHAT, "offset,roll,tilt; of a fly-scan also readout,exposure")] = None,
+    other: Annotated[Path | None, file_option(_WITH, "--with", default=False)] = None,
+    picture: Annotated[
+        Path | None, file_option("PNG of residuals before and after.", "--picture", default="OUTPUT with .png")
+    ] = None,
+    as_json: AsJson = False,
+    device: Device = None,
+) -> None:
+    """Find a scan's true geometry and timing from its own frames, say how sure that is, and leave as stated what they
+    cannot tell."""
+    wish = device_wish(device)
+    picture = picture or (output and output.with_suffix(".png"))
+    for flag, target in (("-o", output), ("--picture", picture)):
+        if target is not None:
+            refuse_overwriting(flag, target, scan, *([] if other is None else [other]))
+            check_writable(target)
+    with Ticker("stage") as ticker:
+        ticker.stage(f"reading {scan}")
+        loaded, others = load_scan(scan), [] if other is None else [load_scan(other)]
+        if output is not None and WOBBLE in (what or ""):
+            _check_storable(loaded)
+        found = calibrate(loaded, Runtime(wish), what, others, lambda done, total, at: ticker.show(done, total, f"  {at}"))
+    if output is not None:
+        with only_run(output), finish_despite_interrupt():
+            copy_with_motion(scan, output, found.scan)
+    if picture is not None:
+        with finish_despite_interrupt(), written_beside(picture) as temporary:
+            temporary.write_bytes(residual_picture(found))
+    say(json.dumps({"scan": str(scan), **found.facts()}) if as_json else _as_text(found))
+    if output is not None and not as_json:
+        said = ", ".join(one.name for one in found.corrected) or "nothing"
+        say(f"{output}: {said} corrected")
+
+
+def _check_storable(scan: Loaded) -> None:
+    """InputError where a table of poses over time has no place for views of their own."""
+    closest_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))
+    if scan.is_fly and closest_s <= scan.shutter.span_s:
+        found = f"frames of {scan.shutter.span_s:.4g} s that begin every {closest_s:.4g} s"
+        remedy = "use api.calibrate, whose scan need not be a file, or leave -o out"
+        raise InputError("--what wobble", found, "frames that do not overlap in time: a file has one pose at a time", remedy)
+
+
+def _as_text(found: Calibration) -> str:
+    """A line per parameter, the combinations that leave no trace, and what is left of the frames."""
+    lines = [f"{'parameter':18s} {'stated':>12s} {'found':>25s}      verdict"]
+    for one in found.parameters:
+        lines.append(f"{one.name:18s} {one.stated:12.6g} {_value(one):>25s} {one.unit:4s} {one.verdict}")
+    lines += [f"cannot be told apart: {words}" for words in found.alike]
+    before, after = found.residual_rms
+    lines.append(f"residual of the frames: {before:.4g} before, {after:.4g} after (RMS of line integrals)")
+    return "\n".join(lines)
+
+
+def _value(one: Found) -> str:
+    """What was found to two digits of its deviation; a dash where nothing was."""
+    if one.found is None or one.deviation is None:
+        return "-"
+    digits = max(0, 1 - math.floor(math.log10(max(one.deviation, 1e-12))))
+    return f"{one.found:.{digits}f} ± {one.deviation:.{digits}f}"

@@ -1,0 +1,141 @@
+"""Planted errors are found, with deviations that cover them; what frames cannot tell is left; a right scan stays."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit
+from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
+from phyradgs_cl.calibrate.moved import Change, Views, moved
+from phyradgs_cl.calibrate.parameters import in_words
+from phyradgs_cl.calibrate.views import find_wobble
+from phyradgs_cl.calibrate.wobble import views_of, without_gauges
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import write_scan
+from phyradgs_cl.workflow import load_scan
+
+OFFSET_MM, ROLL_DEG = 0.3, 0.8
+
+
+@pytest.fixture(scope="module")
+def wrong(right):
+    return moved(right, Change(offset_u_mm=-OFFSET_MM, roll_rad=-np.deg2rad(ROLL_DEG)))
+
+
+def by_name(found):
+    return {one.name: one for one in found.parameters}
+
+
+def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right, wrong, tmp_path, capsys) -> None:
+    path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
+    write_scan(path, wrong)
+    words = ["calibrate", str(path), "--what", "offset,roll,readout,exposure", "-o", str(out), "--json"]
+    assert cli.run(words) == 0
+    facts = json.loads(capsys.readouterr().out)
+    lines = {one["name"]: one for one in facts["parameters"]}
+    for name, truth, most in (("offset-u", 0.0, 0.01), ("roll", ROLL_DEG, 0.1)):
+        one = lines[name]
+        assert one["verdict"] == CORRECTED and 0 < one["deviation"] < most, one
+        assert abs(one["found"] - truth) < 3 * one["deviation"], one
+    for name in ("offset-v", "readout", "exposure"):
+        assert lines[name]["verdict"] == CANNOT_TELL and lines[name]["found"] is None, name
+    assert any("readout" in words for words in facts["alike"])
+    assert facts["residual_rms_after"] < 0.5 * facts["residual_rms_before"]
+    read = load_scan(out)
+    assert read.provenance["calibration"]["parameters"] == facts["parameters"]
+    assert read.shutter == right.shutter and np.array_equal(read.projections, wrong.projections)
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    time_s = right.frame_start_s[4:5]
+    np.testing.assert_allclose(read.trajectory.pose(4, time_s), right.trajectory.pose(4, time_s), atol=0.02)
+
+
+def test_a_right_scan_stays_as_it_is(rt, right) -> None:
+    found = calibrate(right, rt)
+    assert {one.verdict for one in found.parameters} == {AGREES, CANNOT_TELL} and found.corrected == []
+    assert found.scan.trajectory is right.trajectory and found.scan.geometry is right.geometry
+    assert by_name(found)["offset-u"].share > 0.5 > by_name(found)["readout"].share
+    assert found.residual_rms[0] == found.residual_rms[1]
+
+
+def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turned, tmp_path, capsys) -> None:
+    """Which one scan does not, and two that turn alike do not."""
+    longer = Change(readout_s=0.08, exposure_s=0.15)
+    for name, scan in (("on", right), ("back", turned(back=True))):
+        write_scan(tmp_path / name, moved(scan, Change(readout_s=-0.08, exposure_s=-0.15)))
+    words = ["calibrate", str(tmp_path / "on"), "--what", "readout,exposure", "--with"]
+    assert cli.run([*words, str(tmp_path / "back"), "--json"]) == 0
+    for one in json.loads(capsys.readouterr().out)["parameters"]:
+        truth = one["stated"] + getattr(longer, one["name"] + "_s")
+        assert one["verdict"] == CORRECTED and abs(one["found"] - truth) < 3 * one["deviation"], one
+        assert one["deviation"] < 0.05, one
+    assert cli.run([*words, str(tmp_path / "on")]) == 0
+    said = capsys.readouterr().out
+    assert said.count(CANNOT_TELL) == 2 and "±" not in said
+
+
+def test_a_detector_that_adds_photons(rt, turned) -> None:
+    scan = turned(model="intensity")
+    (found,) = calibrate(moved(scan, Change(offset_u_mm=-OFFSET_MM)), rt, "offset-u").parameters
+    assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED
+
+
+def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt, right) -> None:
+    rng = np.random.default_rng(1)
+    planted = without_gauges(right, np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
+    off = moved(right, Change(), views_of(-planted))
+    found = find_wobble(rt, off, [(16, 30, 10), (32, 30, 10)], Change())
+    assert [one.verdict for one in found.table][1:] == [CORRECTED, CORRECTED]
+    left_mm = found.views.shift_mm - planted[:, 1:]
+    assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
+
+
+def test_gauges_of_views_are_what_another_object_looks_like(right) -> None:
+    angle = np.deg2rad(24 * np.arange(15))
+    gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
+    np.testing.assert_allclose(without_gauges(right, gauges), 0, atol=1e-12)
+    offset = np.zeros((15, 3))
+    offset[:, 2] = 0.2  # the panel's, which shows
+    np.testing.assert_allclose(without_gauges(right, offset), offset, atol=1e-12)
+
+
+def test_a_combination_in_words() -> None:
+    said = in_words({"readout": 0.2, "exposure": -0.9, "start": 0.8, "roll": 0.01})
+    assert said == "exposure against start: looks like an object turned about the axis, and smoother or sharper"
+
+
+def few(scan):
+    return replace(scan, projections=scan.projections[:5], frame_start_s=scan.frame_start_s[:5])
+
+
+@pytest.mark.parametrize(
+    ("what", "change", "others", "said"),
+    [
+        ("rol", lambda s: s, (), "did you mean 'roll'?"),
+        ("", lambda s: s, (), "--what: found ''"),
+        ("readout", lambda s: replace(s, is_fly=False), (), "stands still"),
+        ("roll", few, (), "found 5 frames"),
+        ("wobble", lambda s: s, (lambda s: s,), "one scan"),
+        ("roll", lambda s: s, (lambda s: moved(s, Change(offset_u_mm=1.0)),), "--with: geometry"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(rt, right, what, change, others, said) -> None:
+    with pytest.raises(InputError) as refused:
+        calibrate(change(right), rt, what, [other(right) for other in others])
+    assert said in str(refused.value)
+
+
+def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tmp_path) -> None:
+    path = tmp_path / "scan.h5"
+    write_scan(path, replace(right, shutter=replace(right.shutter, readout_s=1.5)))
+    refused(["calibrate", path, "--what", "wobble", "-o", tmp_path / "out.h5"], "do not overlap in time")
+    refused(["calibrate", path, "-o", path], "the input file")
+    assert not (tmp_path / "out.h5").exists()
+
+
+def test_views_in_a_result_are_its_trajectory(right) -> None:
+    views = Views.none(15)
+    assert not isinstance(moved(right, Change(), views).trajectory, CircularOrbit)

@@ -1,0 +1,101 @@
+"""Changed scans: what a change means, by two routes; and what a copy of a file holds of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PerRow, pixel_centres
+from phyradgs_cl.calibrate.moved import Change, Moved, Views, moved
+from phyradgs_cl.io import write_scan
+from phyradgs_cl.io.scan.copy import copy_with_motion
+from phyradgs_cl.workflow import load_scan
+
+NUMBERS = Change(offset_u_mm=0.3, offset_v_mm=-0.2, source_distance_mm=0.1, detector_distance_mm=-0.4)
+TURNS = Change(roll_rad=0.02, tilt_v_rad=-0.03, tilt_u_rad=0.01)
+TIMES = Change(readout_s=0.1, exposure_s=-0.2, start_s=0.05)
+
+TIMED = {"count_time", "detector_readout_time", "frame_start_time", "rotation_angle", "rotation_angle_end"}
+
+
+def poses(scan):
+    return np.concatenate([PerRow(3).cells(scan, frame).pose for frame in range(scan.frames)])
+
+
+def test_numbers_of_the_geometry_move_poses_as_that_does(right) -> None:
+    by_geometry = moved(right, NUMBERS)
+    assert isinstance(by_geometry.trajectory, CircularOrbit)
+    by_poses = replace(right, trajectory=Moved(right.trajectory, right.geometry.detector_shape, NUMBERS))
+    np.testing.assert_allclose(poses(by_poses), poses(by_geometry), atol=1e-12)
+
+
+def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
+    stated, turned = (pixel_centres(poses(scan)[:1], (32, 32))[0] for scan in (right, moved(right, TURNS)))
+    np.testing.assert_allclose(turned.mean((0, 1)), stated.mean((0, 1)), atol=1e-12)
+    for along, change in enumerate((Change(tilt_v_rad=0.1), Change(tilt_u_rad=0.1))):
+        shift = pixel_centres(poses(moved(right, change))[:1], (32, 32))[0] - stated
+        assert np.allclose(np.diff(shift, axis=along), 0), change  # along the axis of the tilt it moves as one
+        assert np.abs(shift).max() > 0.1, change
+    np.testing.assert_allclose(np.linalg.norm(turned[0, 1] - turned[0, 0]), 0.125)
+
+
+def test_views_move_by_themselves(right) -> None:
+    views = Views(np.zeros(15), np.zeros((15, 2)))
+    views.turn_rad[3], views.shift_mm[5] = 0.01, (0.2, 0.0)
+    after = moved(right, Change(), views)
+    time_s = np.array([1.0])
+    is_off = [not np.allclose(after.trajectory.pose(f, time_s), right.trajectory.pose(f, time_s)) for f in range(15)]
+    assert np.flatnonzero(is_off).tolist() == [3, 5]
+    shift = (after.trajectory.pose(5, time_s) - right.trajectory.pose(5, time_s))[0]
+    np.testing.assert_allclose(shift[3:6], [0, 0, 0.2], atol=1e-12)
+
+
+def datasets(path) -> dict[str, object]:
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "touched"),
+    [
+        (NUMBERS, {"detector_offset", "detector/distance", "source/distance"}),
+        (TURNS, {"poses/pose", "poses/time_s"}),
+        (TIMES, TIMED),
+        (replace(TIMES, offset_u_mm=0.3), TIMED | {"detector_offset"}),
+    ],
+)
+def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, touched) -> None:
+    path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
+    counts = np.random.default_rng(0).integers(1, 60000, (17, 32, 32)).astype(np.uint16)
+    write_scan(path, right, data=counts, image_key=[1, 2, *[0] * 15], quantity="counts")
+    stated = load_scan(path)
+    changed = moved(stated, change)
+    copy_with_motion(path, copy, replace(changed, provenance={"why": "a test"}))
+    read = load_scan(copy)
+    np.testing.assert_allclose(poses(read), poses(changed), atol=1e-5)
+    assert read.provenance == {"why": "a test"} and read.is_fly
+    before, after = datasets(path), datasets(copy)
+    differ = {name for name in after if name not in before or not np.array_equal(before[name], after[name])}
+    ends = {name for name in differ if name.endswith(tuple(touched))}
+    assert differ - ends == {"entry/phyradgs/provenance"} and len(ends) == len(touched)
+
+
+def test_encoder_standing_gantry_and_views_are_copied_too(right, tmp_path) -> None:
+    path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
+    table = EncoderTable(np.array([-1.0, 50.0]), np.array([0.0, 7.0]))
+    encoded = replace(right, trajectory=CircularOrbit(right.geometry, table))
+    views = Views(0.01 * np.arange(15), 0.1 * np.arange(30).reshape(15, 2))
+    for scan, change, off in (
+        (encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)
+    ):  # fmt: skip
+        write_scan(path, scan)
+        changed = moved(load_scan(path), change, off)
+        copy_with_motion(path, copy, changed)
+        read = load_scan(copy)
+        np.testing.assert_allclose(poses(read), poses(changed), atol=1e-5)
+        assert read.is_fly == scan.is_fly
