@@ -21,6 +21,7 @@ COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
     "check": ("check", "Look for what is wrong or suspicious in a scan."),
+    "prepare": ("prepare", "Undo what the panel and the beam did to a scan."),
     "reconstruct": ("reconstruct", "Reconstruct a scan into a volume."),
     "estimate": ("estimate", "Say what time and memory a reconstruction would take."),
     "evaluate": ("evaluate", "Measure a volume against the truth."),

@@ -12,6 +12,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
@@ -111,8 +112,11 @@ def reconstruct(
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method, rt)
-    ready = prepared(scan, InputOptions() if before is None else before)
-    return METHODS[method].run(ready, chosen, rt, seed=seed, report=report, **extra)
+    ready = prepared(scan, InputOptions() if before is None else before, rt)
+    result = METHODS[method].run(ready, chosen, rt, seed=seed, report=report, **extra)
+    if TOLD in ready.provenance:
+        result.facts[TOLD] = ready.provenance[TOLD]
+    return result
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:

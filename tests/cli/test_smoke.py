@@ -20,6 +20,7 @@ COMMANDS = (
     (f"simulate {SCAN} -o scan.h5", "scan.h5"),
     ("info scan.h5", ""),
     ("check scan.h5", ""),
+    ("prepare scan.h5 -o clean.h5", "clean.h5"),
     ("estimate scan.h5 --method sirt", ""),
     ("reconstruct scan.h5 --iterations 2 -o volume.h5", "volume.h5"),
     ("evaluate volume.h5 --reference scan.h5 --json", "volume.png"),

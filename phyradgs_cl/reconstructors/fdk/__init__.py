@@ -14,6 +14,7 @@ from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
+from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.arc import view_arc
 from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter
@@ -26,7 +27,6 @@ from phyradgs_cl.reconstructors.fdk.views import (
     widened,
 )
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.preprocess import unmasked_frames
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.runtime import Runtime
 

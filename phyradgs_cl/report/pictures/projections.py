@@ -49,7 +49,7 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[View]:
     under the scan's true motion; intensities where the panel averages them."""
     if run.scan is None or count < 1:
         return []
-    scan, chosen = prepared(run.scan, run.before), chosen_frames(run.scan.frames, count)
+    scan, chosen = prepared(run.scan, run.before, rt), chosen_frames(run.scan.frames, count)
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in chosen]
     operator = RayOperator(rt, run.stored.grid, scan.geometry.detector_shape, tables)
