@@ -10,8 +10,11 @@ from typing import Any
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare.air import AirOptions, normalise_air
 from phyradgs_cl.prepare.dead import DeadOptions, mask_dead
+from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
+from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
 from phyradgs_cl.prepare.sparks import SparkOptions, mask_sparks
 from phyradgs_cl.prepare.step import MakeModel, Step
 from phyradgs_cl.text import near_miss
@@ -21,6 +24,9 @@ log = logging.getLogger(__name__)
 STEPS: Mapping[str, Step] = {
     "sparks": mask_sparks,
     "dead": mask_dead,
+    "scatter": subtract_scatter,
+    "air": normalise_air,
+    "hardening": correct_hardening,
     "rings": remove_rings,
 }
 """In the order in which they are done, whatever the order in which they are asked for."""
@@ -36,6 +42,9 @@ class PrepareOptions:
     steps: str = ""
     sparks: SparkOptions = SparkOptions()
     dead: DeadOptions = DeadOptions()
+    scatter: ScatterOptions = ScatterOptions()
+    air: AirOptions = AirOptions()
+    hardening: HardeningOptions = HardeningOptions()
     rings: RingOptions = RingOptions()
 
     def __post_init__(self) -> None:

@@ -21,7 +21,7 @@ _STILL_SIDES = 0.5  # of the outermost columns: from here air has no noise
 _AROUND = np.ones((3, 3), bool)
 _NEAR_AXIS = 1.5  # columns
 _SHARED = 0.1  # of a pixel's distance, by its four neighbours: an object is never as sharp as a dead pixel
-_LINE = 0.5  # of a line's pixels: from here the whole line is dead
+_LINE = 0.9  # of a line's pixels: from here the whole line is dead
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ def find_dead(
 
     Dead is a pixel that never changes while those around it do, or one beyond all its neighbours in 70 % of the frames, more
     than ``deviations`` of the panel's usual ones from the median of 3 × 3 pixels; near ``axis_column``, where small parts of
-    the object stand still on the panel, it has to be sharper than these. A row or column of which half is apart from the
-    lines beside it is dead as a whole.
+    the object stand still on the panel, it has to be sharper than these. A row or column that is beyond those beside it
+    over nearly all its length is dead as a whole.
     """
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
@@ -52,7 +52,7 @@ def find_dead(
     if axis_column is not None:
         still = np.abs(np.arange(frames.shape[2]) - axis_column) <= _NEAR_AXIS
     dead = _constant(some) | (_apart(some, deviations) & ~(_shared(some) & still))
-    return dead | _lines(some, deviations, still)
+    return dead | _lines(some, deviations)
 
 
 def mask_dead(scan: Scan, options: DeadOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
@@ -69,23 +69,22 @@ def axis_column(scan: Scan) -> float:
     return float(np.linalg.lstsq(np.stack([u, v, source], axis=1), source - corner, rcond=None)[0][0])
 
 
-def _lines(frames: np.ndarray, deviations: float, still: np.ndarray) -> np.ndarray:
-    """Rows and columns (v, u) bool, whole, that are apart from those beside them in most of their pixels and frames."""
+def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
+    """Rows and columns (v, u) bool, whole: those beyond both lines beside them nearly everywhere, air included, in the
+    median over the frames; no object is that long and thin."""
     dead = np.zeros(frames.shape[1:], bool)
-    for axis in (1, 2):
-        if frames.shape[axis] < 5:
+    floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
+    for axis in (0, 1):
+        lines = np.moveaxis(frames, axis + 1, 0)
+        if len(lines) < 3:
             continue
-        size = tuple(5 if a == axis - 1 else 1 for a in (0, 1))
-        apart = np.median([f - scipy.ndimage.median_filter(f, size=size, mode="nearest") for f in frames], axis=0)
-        usual = _NORMAL_MAD * float(np.median(np.abs(apart - np.median(apart))))
-        floor = max(1e-3 * float(np.percentile(frames, 99.9)), 1e-12)
-        across = np.median(apart, axis=2 - axis)  # of each line
-        far = np.abs(across) > deviations * max(usual, floor)
-        share = np.mean(np.abs(apart) > deviations * max(usual, floor), axis=2 - axis)
-        line = far & (share > _LINE)
-        if axis == 2:
-            line &= ~still
-        dead |= line[:, None] if axis == 1 else line[None, :]
+        steps = np.diff(lines, axis=0)
+        usual = _NORMAL_MAD * float(np.median(np.abs(np.median(steps, axis=1))))
+        before, after = steps[:-1], -steps[1:]
+        peak = np.where(before * after > 0, np.sign(before) * np.minimum(np.abs(before), np.abs(after)), 0)
+        apart = np.abs(np.median(peak, axis=1)) > deviations * max(usual, floor)
+        line = 1 + np.flatnonzero(apart.mean(axis=1) > _LINE)
+        np.moveaxis(dead, axis, 0)[line] = True
     return dead
 
 

@@ -1,0 +1,95 @@
+"""What each effect of a real scan costs, and what its step of ``prepare`` gives back: PSNR without it, with it, corrected.
+
+    python benchmarks/prepare.py --size 48 --views 60 --output docs/results/prepare.jsonl
+
+A line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on a scan without the effect), ``spoilt`` and
+``prepared``, dB. docs/prepare.md has the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.runtime import Runtime
+
+PEAK = 3.0  # of the line integrals: a head's
+METHODS: dict[str, dict[str, Any]] = {"fdk": {"motion": "per-row"}, "fista-tv": {"motion": "per-row", "iterations": 30}}
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What is planted, the steps that undo it, and their options."""
+
+    planted: dict[str, float]
+    steps: str
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+EFFECTS = {
+    "sparks 0.01 %": Effect({"sparks": 1e-4}, "sparks"),
+    "sparks 0.1 %": Effect({"sparks": 1e-3}, "sparks"),
+    "rings 1 %": Effect({"rings": 0.01}, "rings"),
+    "rings 5 %": Effect({"rings": 0.05}, "rings"),
+    "drift 2 %": Effect({"drift": 0.02}, "air"),
+    "scatter 0.3, fitted": Effect({"scatter": 0.3}, "scatter"),
+    "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}),
+    "120 kVp, fitted": Effect({"kvp": 120.0}, "hardening"),
+    "120 kVp, water": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
+    "all": Effect(
+        {"sparks": 1e-4, "rings": 0.01, "drift": 0.02, "scatter": 0.3, "kvp": 120.0},
+        "sparks,scatter,air,hardening,rings",
+    ),
+}
+
+
+def scores(rt: Runtime, scan: Scan, method: str, effect: Effect | None = None) -> float:
+    """PSNR, dB, of a method on a scan, after an effect's steps."""
+    before = {} if effect is None else {"steps": effect.steps, **effect.options}
+    result = reconstruct(scan, method, device=rt, **METHODS[method], **before)
+    return float(compare(result.volume, scan.reference)["psnr_db"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", type=int, default=48)
+    parser.add_argument("--views", type=int, default=60)
+    parser.add_argument("--dose", type=float, default=1e5)
+    parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"])
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
+    parser.add_argument("--effects", nargs="+", default=list(EFFECTS))
+    parser.add_argument("--output", type=Path)
+    given = parser.parse_args()
+    rt, lines = Runtime(), []
+    usual = {
+        "size": given.size, "detector": 3 * given.size // 2, "views": given.views, "peak": PEAK, "noise": "beer",
+        "dose": given.dose, "exposure_deg": 0.8 * 360 / given.views, "device": rt,
+    }  # fmt: skip
+    for phantom in given.phantoms:
+        clean_scan = simulate(phantom, **usual)
+        clean = {method: scores(rt, clean_scan, method) for method in given.methods}
+        for name in given.effects:
+            effect = EFFECTS[name]
+            spoilt = simulate(phantom, **usual, **effect.planted)
+            for method in given.methods:
+                found = {
+                    "clean_prepared": scores(rt, clean_scan, method, effect),
+                    "spoilt": scores(rt, spoilt, method),
+                    "prepared": scores(rt, spoilt, method, effect),
+                }
+                line = {"effect": name, "phantom": phantom, "method": method, "clean": clean[method], **found}
+                line["regained"] = (line["prepared"] - line["spoilt"]) / max(line["clean"] - line["spoilt"], 1e-9)
+                lines.append({key: round(v, 3) if isinstance(v, float) else v for key, v in line.items()})
+                print(json.dumps(lines[-1]), flush=True)
+    if given.output is not None:
+        facts = {"size": given.size, "views": given.views, "dose": given.dose, "device": rt.device.name}
+        given.output.write_text("".join(json.dumps(line) + "\n" for line in [facts, *lines]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
