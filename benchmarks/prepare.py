@@ -16,6 +16,7 @@ from typing import Any
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.prepare import water_polynomial
 from phyradgs_cl.runtime import Runtime
 
 PEAK = 3.0  # of the line integrals: a head's
@@ -39,11 +40,12 @@ EFFECTS = {
     "drift 2 %": Effect({"drift": 0.02}, "air"),
     "scatter 0.3, fitted": Effect({"scatter": 0.3}, "scatter"),
     "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}),
-    "120 kVp, fitted": Effect({"kvp": 120.0}, "hardening"),
-    "120 kVp, water": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
+    "120 kVp, water": Effect({"kvp": 120.0}, "hardening", {"hardening": {"polynomial": water_polynomial(120.0)}}),
+    "120 kVp, bone": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
     "all": Effect(
         {"sparks": 1e-4, "rings": 0.01, "drift": 0.02, "scatter": 0.3, "kvp": 120.0},
         "sparks,scatter,air,hardening,rings",
+        {"hardening": {"kvp": 120.0}},
     ),
 }
 
@@ -83,7 +85,7 @@ def main() -> None:
                     "prepared": scores(rt, spoilt, method, effect),
                 }
                 line = {"effect": name, "phantom": phantom, "method": method, "clean": clean[method], **found}
-                line["regained"] = (line["prepared"] - line["spoilt"]) / max(line["clean"] - line["spoilt"], 1e-9)
+                line["regained"] = (line["prepared"] - line["spoilt"]) / max(line["clean"] - line["spoilt"], 1e-2)
                 lines.append({key: round(v, 3) if isinstance(v, float) else v for key, v in line.items()})
                 print(json.dumps(lines[-1]), flush=True)
     if given.output is not None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 _SPARK_HEIGHT = (0.3, 2.0)  # of the light without object
 _SCATTER_REACH = 6.0  # of the panel's longer side: the exponential's length is one part in so many
+_SCATTER_POWERS = (0.8, 1.5)  # of the primary light and of the line integral
 _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the object
 
 
@@ -35,11 +36,13 @@ def drifting_light(frames: int, largest: float, rng: np.random.Generator) -> Arr
 
 
 def add_scatter(line_integrals: Array, to_primary: float) -> Array:
-    """Line integrals (F, v, u) with scatter, float64: what the object takes out of the beam, spread by a kernel exp(−r/ℓ)
-    over a sixth of the panel; behind the object it is ``to_primary`` times the primary light, on the scan's mean."""
+    """Line integrals (F, v, u) with scatter, float64: a ray's share P^0.8 p^1.5, as Sun and Star-Lack (Phys. Med. Biol. 55
+    (2010) 6695) found for water, spread by a kernel exp(−r/ℓ) over a sixth of the panel. Behind the object it is
+    ``to_primary`` times the primary light, on the scan's mean."""
     p = np.asarray(line_integrals, np.float64)
     primary = np.exp(-p)
-    scatter = np.stack([_spread(1 - np.minimum(frame, 1), max(p.shape[1:]) / _SCATTER_REACH) for frame in primary])
+    lost = primary**_SCATTER_POWERS[0] * np.maximum(p, 0) ** _SCATTER_POWERS[1]
+    scatter = np.stack([_spread(frame, max(p.shape[1:]) / _SCATTER_REACH) for frame in lost])
     shadow = p > _SHADOW * p.max()
     if not shadow.any() or scatter[shadow].sum() <= 0:
         return p

@@ -1,8 +1,9 @@
-"""Beam hardening undone by a polynomial in the line integrals, its first coefficient 1: right in the thinnest layer.
+"""Beam hardening undone: line integrals as they are in the thinnest layer.
 
-The polynomial is stated (as measured with a wedge), follows for water from the tube's voltage, or is the one whose volume is
-most uniform in each of the materials that its own segmentation shows: air, soft and, with a second line integral reprojected
-from what is bone, bone. Kyriakou, Meyer, Prell and Kachelrieß, Med. Phys. 37 (2010) 5179, where a person judges uniformity.
+By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume is reprojected,
+and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100), again as the volume
+gets better. Or, of an object of one material, by the scan's consistency with its own reprojection: how line integrals grow with
+the path through the segmented volume says the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
 """
 
 from __future__ import annotations
@@ -10,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.detector import tube_spectrum
+from phyradgs_cl.detector import Spectrum, tube_spectrum
 from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.masked import unmasked_frames
@@ -24,15 +24,17 @@ Polynomial = tuple[float, float, float]
 _LARGEST = 1e3
 _DENSE = 1.5  # times the mean of what is soft: from here the densest class is another material
 _LEAST_SHARE = 1e-3  # of the object: a material of less cannot be fitted
-_RIDGE = 1e-4
+_PASSES = 3  # of bone from volume from bone
+_NEWTON = 8
+_UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
+_SHADOW = 0.1  # of the longest path
 _WATER_TO = 8.0  # largest line integral that the voltage's polynomial is fitted to
-_BALL = np.ones((3, 3, 3), bool)
 _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class HardeningOptions:
-    """polynomial: of p², p³ and p⁴; kvp: tube voltage, kV, whose polynomial for water is taken; neither: fitted."""
+    """polynomial: of p², p³ and p⁴; kvp: tube voltage, kV, whose spectrum is taken; neither: fitted to one material."""
 
     polynomial: Polynomial = _NONE
     kvp: float = 0.0
@@ -65,65 +67,90 @@ def water_polynomial(kvp: float) -> Polynomial:
 def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """The scan with straight line integrals."""
     frames = unmasked_frames(scan)
-    if options.kvp or any(options.polynomial):
-        polynomial = options.polynomial if any(options.polynomial) else water_polynomial(options.kvp)
-        return replace(scan, projections=straighten(frames, polynomial)), {"polynomial": list(polynomial)}
-    clean, facts = fit_hardening(frames, make_model(scan))
-    return replace(scan, projections=clean), facts
+    if options.kvp:
+        clean, bone = straighten_two(frames, tube_spectrum(options.kvp), make_model(scan), water_polynomial(options.kvp))
+        return replace(scan, projections=clean), {"kvp": options.kvp, "bone_share": bone}
+    fitted = not any(options.polynomial)
+    polynomial = fit_polynomial(frames, make_model(scan)) if fitted else options.polynomial
+    facts = {"polynomial": list(polynomial), "fitted": fitted}
+    return replace(scan, projections=straighten(frames, polynomial)), facts
 
 
-def fit_hardening(frames: np.ndarray, model: Model) -> tuple[np.ndarray, Facts]:
-    """Line integrals (F, v, u) corrected so that their volume is uniform per material, and the coefficients that do it: of p²,
-    p³ and, with bone's own line integral q where there is bone, of p q and q²."""
-    p = np.maximum(frames, 0)
-    first = model.volume(frames)
-    masks = _materials(first)
-    if masks is None:
-        return frames, {"coefficients": [], "bone": False}
-    air, soft, bone = masks
-    terms = [p**2, p**3]
-    if bone is not None:
-        q = model.frames(np.where(bone, first, 0).astype(np.float32))
-        terms += [p * q, q**2]
-    regions = [air, *(scipy.ndimage.binary_erosion(m, _BALL) for m in (soft, bone) if m is not None)]
-    regions = [regions[0], *(region for region in regions[1:] if region.any())]
-    wanted = _deviations(first, regions)
-    basis = np.stack([_deviations(model.volume(term), regions) for term in terms], axis=1)
-    scale = np.linalg.norm(basis, axis=0)
-    scale[scale == 0] = 1
-    matrix = basis / scale
-    normal = matrix.T @ matrix + _RIDGE * np.eye(len(terms))
-    found = -np.linalg.solve(normal, matrix.T @ wanted) / scale
-    left = float(np.linalg.norm(wanted + basis @ found) / max(np.linalg.norm(wanted), 1e-20))
-    clean = frames + sum(np.float32(c) * term for c, term in zip(found, terms, strict=True))
-    facts = {"coefficients": [float(c) for c in found], "bone": bone is not None, "deviation_left": left}
-    return clean.astype(np.float32), facts
+def straighten_two(
+    frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial
+) -> tuple[np.ndarray, float]:
+    """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the object's voxels; those of water
+    where no bone is found."""
+    clean, share = straighten(frames, water), 0.0
+    for _ in range(_PASSES):
+        volume = model.volume(clean)
+        masks = _materials(volume)
+        if masks is None or masks[1] is None:
+            break
+        bone = masks[1]
+        share = float(bone.sum() / max(masks[0].sum(), 1))
+        dense = np.maximum(model.frames(np.where(bone, volume, 0).astype(np.float32)), 0)
+        clean = (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
+    return clean, share
 
 
-def _materials(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:
-    """Air, soft and, if there is any, bone (z, y, x) bool in the middle of a volume; None where nothing stands out."""
+def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
+    """The soft tissue that, with ``dense`` line integrals of bone, gives what was measured: Newton's method."""
+    soft, step = np.asarray(frames - dense, np.float64), 1e-3
+    for _ in range(_NEWTON):
+        now = spectrum.hardened(soft, dense)
+        soft = soft - step * (now - frames) / (spectrum.hardened(soft + step, dense) - now)
+    return soft
+
+
+def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
+    """The polynomial for ``straighten`` that line integrals (F, v, u) of one material follow with their path through its volume.
+
+    InputError for an object that is not of one material.
+    """
+    volume = model.volume(frames)
+    masks = _materials(volume)
+    path = None if masks is None else model.frames(_smooth_part(volume))
+    through = None if path is None else path > _SHADOW * float(path.max())
+    if path is None or through is None or not through.any():
+        raise InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
+    length, seen = path[through].astype(np.float64), frames[through].astype(np.float64)
+    powers = np.stack([length, length**2, length**3], axis=1)
+    found = np.linalg.lstsq(powers, seen, rcond=None)[0]
+    left = float(np.sqrt(np.mean((seen - powers @ found) ** 2) / np.mean(seen**2)))
+    if left > _UNIFORM or found[0] <= 0:
+        told = f"{100 * left:.2g} % of the line integrals that the path through one material does not explain"
+        remedy = "state hardening.kvp or hardening.polynomial"
+        raise InputError("--steps hardening", told, f"at most {100 * _UNIFORM:.2g} %", remedy)
+    ladder = np.linspace(0.05, 1, 60) * length.max()
+    measured, true = np.stack([ladder, ladder**2, ladder**3], axis=1) @ found, found[0] * ladder
+    basis = np.stack([measured**2, measured**3, measured**4], axis=1)
+    square, cube, fourth = np.linalg.lstsq(basis, true - measured, rcond=None)[0]
+    return float(square), float(cube), float(fourth)
+
+
+def _smooth_part(volume: np.ndarray) -> np.ndarray:
+    """Shares (z, y, x) of voxels that are object: 0 to 1 about its half level, so that edges are as wide as in the volume."""
+    level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)]))
+    return np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32)
+
+
+def _materials(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """The object and, if there is any, what is bone in it (z, y, x) bool; None where nothing stands out."""
     from skimage.filters import threshold_multiotsu  # slow to import
 
-    inside = _measured(volume.shape)
-    values = volume[inside]
+    values = volume[_measured(volume.shape)]
     if np.ptp(values) == 0:
         return None
     low, high = threshold_multiotsu(values, classes=3)
-    middle, dense = volume[inside & (volume >= low) & (volume < high)], inside & (volume >= high)
-    object_ = inside & (volume >= low)
-    many = dense.sum() > _LEAST_SHARE * object_.sum()
-    has_bone = bool(many and volume[dense].mean() > _DENSE * middle.mean())
-    air = inside & ~scipy.ndimage.binary_dilation(volume >= 0.5 * low, _BALL, iterations=2)
-    return air, object_ & ~dense if has_bone else object_, dense if has_bone else None
+    inside, dense = volume >= low, volume >= high
+    soft = inside & ~dense
+    many = dense.sum() > _LEAST_SHARE * inside.sum() and soft.any()
+    has_bone = bool(many and volume[dense].mean() > _DENSE * volume[soft].mean())
+    return inside, dense if has_bone else None
 
 
 def _measured(shape: tuple[int, ...]) -> np.ndarray:
     """The middle of a volume (z, y, x), where a cone beam's views are complete enough: bool."""
     z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in shape)
     return (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
-
-
-def _deviations(volume: np.ndarray, regions: list[np.ndarray]) -> np.ndarray:
-    """What a volume (z, y, x) is off 0 in the first region and off the mean in each of the others, (n,) float64."""
-    values = [volume[region].astype(np.float64) for region in regions]
-    return np.concatenate([values[0], *(v - v.mean() for v in values[1:])])
