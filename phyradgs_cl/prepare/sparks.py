@@ -18,8 +18,9 @@ from phyradgs_cl.prepare.masked import unmasked_frames, with_masked
 from phyradgs_cl.prepare.step import Facts, MakeModel
 
 _NORMAL_MAD = 1.4826
-_SHARPNESS = 0.6  # of a spark's height, above what lies two pixels away on either side
-_DIRECTIONS = ((0, 2), (2, 0), (2, 2), (2, -2))
+_SHARPNESS = 0.4  # of a spark's height, above what lies on either side
+_NEAR, _FAR = 2, 3  # pixels away
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _AROUND = np.ones((3, 3), bool)
 
 
@@ -71,11 +72,14 @@ def _in_frame(frame: np.ndarray, threshold: float, least: float, pixels: int) ->
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Per direction, the lower of the two pixels at its ends (v, u); beyond the panel goes on what is at its edge."""
-    wide = np.pad(frame, 2, mode="reflect" if min(frame.shape) > 2 else "edge")
+    """Per direction, the lower of the two pixels on either side (v, u), two pixels away or, where another spark is there,
+    three; beyond the panel goes on what is at its edge, mirrored."""
+    wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 
     def moved(v: int, u: int) -> np.ndarray:
-        return wide[2 + v : 2 + v + rows, 2 + u : 2 + u + columns]
+        return wide[_FAR + v : _FAR + v + rows, _FAR + u : _FAR + u + columns]
 
-    return (np.minimum(moved(v, u), moved(-v, -u)) for v, u in _DIRECTIONS)
+    for v, u in _DIRECTIONS:
+        pairs = (np.minimum(moved(k * v, k * u), moved(-k * v, -k * u)) for k in (_NEAR, _FAR))
+        yield np.maximum(*pairs)
