@@ -104,35 +104,34 @@ def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> n
 
 
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
-    """The polynomial for ``straighten`` that line integrals (F, v, u) of one material follow with their path through its volume.
+    """The polynomial for ``straighten``, of p² alone, that line integrals (F, v, u) of one material follow with their path
+    through its volume. What the same way makes of straight line integrals of that volume is taken off.
 
     InputError for an object that is not of one material.
     """
-    volume = model.volume(frames)
-    masks = _materials(volume)
-    path = None if masks is None else model.frames(_smooth_part(volume))
-    through = None if path is None else path > _SHADOW * float(path.max())
-    if path is None or through is None or not through.any():
-        raise InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
-    length, seen = path[through].astype(np.float64), frames[through].astype(np.float64)
-    powers = np.stack([length, length**2, length**3], axis=1)
-    found = np.linalg.lstsq(powers, seen, rcond=None)[0]
-    left = float(np.sqrt(np.mean((seen - powers @ found) ** 2) / np.mean(seen**2)))
-    if left > _UNIFORM or found[0] <= 0:
+    path, level, bend, left = _bend(frames, model)
+    if left > _UNIFORM:
         told = f"{100 * left:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
         raise InputError("--steps hardening", told, f"at most {100 * _UNIFORM:.2g} %", remedy)
-    ladder = np.linspace(0.05, 1, 60) * length.max()
-    measured, true = np.stack([ladder, ladder**2, ladder**3], axis=1) @ found, found[0] * ladder
-    basis = np.stack([measured**2, measured**3, measured**4], axis=1)
-    square, cube, fourth = np.linalg.lstsq(basis, true - measured, rcond=None)[0]
-    return float(square), float(cube), float(fourth)
+    straight = _bend(path * np.float32(level), model)[2]
+    return straight - bend, 0.0, 0.0
 
 
-def _smooth_part(volume: np.ndarray) -> np.ndarray:
-    """Shares (z, y, x) of voxels that are object: 0 to 1 about its half level, so that edges are as wide as in the volume."""
-    level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)]))
-    return np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32)
+def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:
+    """Of line integrals (F, v, u): their path through the object (mm), its attenuation (1/mm), the b of p = t + b t² with t in
+    proportion to the path, and the share of them that this leaves unexplained."""
+    volume = model.volume(frames)
+    level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)])) if volume.max() > 0 else 0.0
+    path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))
+    through = path > _SHADOW * float(path.max())
+    if level <= 0 or not through.any():
+        raise InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
+    length, seen = path[through].astype(np.float64), frames[through].astype(np.float64)
+    powers = np.stack([length, length**2], axis=1)
+    found = np.linalg.lstsq(powers, seen, rcond=None)[0]
+    left = float(np.sqrt(np.mean((seen - powers @ found) ** 2) / np.mean(seen**2)))
+    return path, level, float(found[1] / found[0] ** 2), left
 
 
 def _materials(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray | None] | None:

@@ -18,7 +18,7 @@ from phyradgs_cl.prepare.masked import unmasked_frames, with_masked
 from phyradgs_cl.prepare.step import Facts, MakeModel
 
 _NORMAL_MAD = 1.4826
-_SHARPNESS = 0.4  # of a spark's height, above what lies on either side
+_SHARPNESS = 0.3  # of a spark's height, above what lies on either side
 _NEAR, _FAR = 2, 3  # pixels away
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _AROUND = np.ones((3, 3), bool)
@@ -29,7 +29,7 @@ class SparkOptions:
     """threshold: least height in local deviations (``find_sparks``); least: and in line integrals, dimensionless; pixels:
     largest number that touch and still are one spark."""
 
-    threshold: float = 8.0
+    threshold: float = 5.0
     least: float = 0.1
     pixels: int = 6
 
@@ -38,7 +38,7 @@ class SparkOptions:
 
 
 def find_sparks(
-    frames: np.ndarray, *, threshold: float = 8.0, least: float = 0.1, pixels: int = 6
+    frames: np.ndarray, *, threshold: float = 5.0, least: float = 0.1, pixels: int = 6
 ) -> np.ndarray:
     """Pixels of line integrals (F, v, u) that are brighter than any object can make them, bool (F, v, u).
 
