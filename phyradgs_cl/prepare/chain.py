@@ -12,6 +12,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.air import AirOptions, normalise_air
 from phyradgs_cl.prepare.dead import DeadOptions, mask_dead
+from phyradgs_cl.prepare.flats import WAYS
 from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
@@ -37,8 +38,10 @@ TOLD = "prepared"
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """steps: names of ``STEPS`` with commas between; the rest: a table of options per step."""
+    """flats: one of ``flats.WAYS``, asked when a file is read. steps: names of ``STEPS`` with commas between; the rest: a table of
+    options per step."""
 
+    flats: str = "mean"
     steps: str = ""
     sparks: SparkOptions = SparkOptions()
     dead: DeadOptions = DeadOptions()
@@ -48,6 +51,7 @@ class PrepareOptions:
     rings: RingOptions = RingOptions()
 
     def __post_init__(self) -> None:
+        checks.one_of("flats", self.flats, WAYS)
         for name in self.steps.split(",") if self.steps.strip() else ():
             if name.strip() not in STEPS:
                 remedy = near_miss(name.strip(), STEPS, "leave it out")
@@ -65,9 +69,10 @@ class PrepareOptions:
 
     def step_facts(self) -> dict[str, object]:
         """The steps and their options, by name; nothing where there are none."""
+        flats = {} if self.flats == "mean" else {"flats": self.flats}
         if not self.chosen:
-            return {}
-        return {"steps": ",".join(self.chosen), **{name: asdict(getattr(self, name)) for name in self.chosen}}
+            return {**flats}
+        return {**flats, "steps": ",".join(self.chosen), **{name: asdict(getattr(self, name)) for name in self.chosen}}
 
 
 STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
@@ -76,6 +81,9 @@ STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
 def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
     """The scan after the steps that are chosen; its provenance lists them with their options and numbers."""
     told: list[dict[str, Any]] = []
+    if options.flats not in ("mean", scan.provenance.get("flats")):
+        expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
+        raise InputError("option flats", "a scan of line integrals", expected, "leave it out")
     for name in options.chosen:
         chosen = getattr(options, name)
         scan, numbers = STEPS[name](scan, chosen, make_model)

@@ -25,18 +25,18 @@ def run_preparation(
 ) -> list[dict[str, Any]]:
     """Writes the scan ``source`` after the steps of ``options`` as line integrals; says what each did, in order. The file
     says the same, and of which scan. Bad pixels are masked and filled in. Raises InputError and OutputError as any run."""
-    if not options.chosen:
+    if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     refuse_overwriting("-o", output, source, *([config] if config else []))
     check_writable(output)
     with only_run(output):
         with hashing(source) as hash_of:
-            scan = load_scan(source)
+            scan = load_scan(source, options.flats)
             known = hash_of()
         clean = _named(prepared(scan, options, make_runtime()), source, known)
         with finish_despite_interrupt():
             write_scan(output, clean)
-    told: Any = clean.provenance[TOLD]
+    told: Any = clean.provenance.get(TOLD, [])
     return list(told)
 
 
