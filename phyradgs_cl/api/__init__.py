@@ -9,7 +9,15 @@ Everything is documented with runnable examples in docs/api.md. ``device`` is wh
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan, Static, StaticStart
 from phyradgs_cl.api.bridges import as_linear_operator, as_torch
 from phyradgs_cl.api.projectors import Projector, ray_operator
-from phyradgs_cl.api.runs import load_scan, load_volume, prepare, reconstruct, save_scan, save_volume, simulate
+from phyradgs_cl.api.runs import (
+    load_scan,
+    load_volume,
+    prepare,
+    reconstruct,
+    save_scan,
+    save_volume,
+    simulate,
+)
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.prepare import (

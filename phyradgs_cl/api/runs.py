@@ -29,8 +29,8 @@ from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
-    """A scan file as line integrals, with the mean of its flats, or flats by ``time`` or ``pca`` (docs/prepare.md); InputError
-    names what is wrong by its HDF5 path."""
+    """A scan file as line integrals, with the mean of its flats, or flats by ``time`` or ``pca`` (docs/prepare.md);
+    InputError names what is wrong by its HDF5 path."""
     scan = read_scan(path, flat_correction(flats))
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
@@ -86,8 +86,8 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     """The scan without what the panel and the beam did to it, by the steps of docs/prepare.md, names with commas between.
 
     options: tables of the steps' own (``rings={"window": 11}``), and what else comes before every method. What each step did
-    stands in the scan's provenance, under ``prepared``. Raises InputError for what is no step or option, or a scan that does not
-    show what a step looks for.
+    stands in the scan's provenance, under ``prepared``. Raises InputError for what is no step or option, or a scan that does
+    not show what a step looks for.
     """
     return prepared(scan, input_options({"steps": steps, **options}), runtime_of(device))
 

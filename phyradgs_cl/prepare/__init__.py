@@ -1,4 +1,5 @@
-"""Real scans: what panels, beams and large objects do to frames, undone before any method. A step a file, with its reference."""
+"""Real scans: what panels, beams and large objects do to frames, undone before any method. A step a file, with its
+reference."""
 
 from phyradgs_cl.prepare.air import find_air
 from phyradgs_cl.prepare.chain import DEFAULT_STEPS, STEP_FIELDS, STEPS, TOLD, PrepareOptions, prepare
@@ -12,6 +13,6 @@ from phyradgs_cl.prepare.step import Model
 
 __all__ = [
     "DEFAULT_STEPS", "STEPS", "STEP_FIELDS", "TOLD", "Model", "PrepareOptions", "find_air", "find_dead", "find_sparks",
-    "fit_polynomial", "fit_scatter", "flat_correction", "prepare", "remove_scatter", "ring_pattern", "sort_rings", "straighten",
-    "straighten_two", "water_polynomial"
+    "fit_polynomial", "fit_scatter", "flat_correction", "prepare", "remove_scatter", "ring_pattern", "sort_rings",
+    "straighten", "straighten_two", "water_polynomial"
 ]  # fmt: skip

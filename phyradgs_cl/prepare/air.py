@@ -33,8 +33,8 @@ class AirOptions:
 
 
 def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
-    """Pixels of line integrals (F, v, u) that no object covers, bool (F, v, u): those below the share ``below`` of the largest,
-    connected with the first or last column, two pixels from all others."""
+    """Pixels of line integrals (F, v, u) that no object covers, bool (F, v, u): those below the share ``below`` of the
+    largest, connected with the first or last column, two pixels from all others."""
     limit = below * float(np.percentile(frames, 99.9))
     air = np.empty(frames.shape, bool)
     for f, frame in enumerate(frames):
@@ -67,4 +67,5 @@ def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tup
     value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
     clean = frames - value[:, None, None].astype(np.float32)
     light = np.exp(-value)
-    return replace(scan, projections=clean), {"light": [float(light.min()), float(light.max())], "air_share": float(air.mean())}
+    facts = {"light": [float(light.min()), float(light.max())], "air_share": float(air.mean())}
+    return replace(scan, projections=clean), facts

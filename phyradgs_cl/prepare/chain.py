@@ -38,8 +38,8 @@ TOLD = "prepared"
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``flats.WAYS``, asked when a file is read. steps: names of ``STEPS`` with commas between; the rest: a table of
-    options per step."""
+    """flats: one of ``flats.WAYS``, asked when a file is read. steps: names of ``STEPS`` with commas between; the rest: a
+    table of options per step."""
 
     flats: str = "mean"
     steps: str = ""

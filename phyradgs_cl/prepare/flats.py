@@ -1,8 +1,8 @@
 """Flats that change during a scan: interpolated in time, or as many eigen-flats as they say.
 
 time: linearly between the means of flats that were taken together, in the order of the stored frames. pca: per frame the
-combination of their principal components that leaves the least total variation, in logarithms; Van Nieuwenhove et al., Opt. Express
-23 (2015) 27975. What they cannot see, one number per frame, is the step ``air``'s.
+combination of their principal components that leaves the least total variation, in logarithms; Van Nieuwenhove et al., Opt.
+Express 23 (2015) 27975. What they cannot see, one number per frame, is the step ``air``'s.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ ToAttenuation = Callable[[Counts, np.ndarray, str], tuple[np.ndarray, np.ndarray
 
 
 def flat_correction(way: str) -> ToAttenuation:
-    """What ``read_scan`` takes: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) and bad pixels, with flats
-    as ``way`` says. What it gives raises InputError for what has no flats, or too few."""
+    """What ``read_scan`` takes: (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) and bad pixels, with
+    flats as ``way`` says. What it gives raises InputError for what has no flats, or too few."""
     checks.one_of("flats", way, WAYS)
     if way == "mean":
         return counts_to_attenuation
@@ -93,8 +93,8 @@ def _of_components(
 
 
 def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
-    """The weights (k,) of components (k, v, u) that take the least total variation out of a frame (v, u): least squares, again
-    and again, with each difference weighed by its inverse size."""
+    """The weights (k,) of components (k, v, u) that take the least total variation out of a frame (v, u): least squares,
+    again and again, with each difference weighed by its inverse size."""
 
     def differences(image: np.ndarray) -> np.ndarray:
         return np.concatenate([np.diff(image, axis=axis).ravel() for axis in (-2, -1)])

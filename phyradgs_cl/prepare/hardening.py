@@ -1,9 +1,10 @@
 """Beam hardening undone: line integrals as they are in the thinnest layer.
 
-By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume is reprojected,
-and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100), again as the volume
-gets better. Or, of an object of one material, by the scan's consistency with its own reprojection: how line integrals grow with
-the path through the segmented volume says the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
+By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume is
+reprojected, and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100),
+again as the volume gets better. Or, of an object of one material, by the scan's consistency with its own reprojection: how
+line integrals grow with the path through the segmented volume says the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41
+(2008) 242).
 """
 
 from __future__ import annotations
@@ -119,8 +120,8 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
 
 
 def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:
-    """Of line integrals (F, v, u): their path through the object (mm), its attenuation (1/mm), the b of p = t + b t² with t in
-    proportion to the path, and the share of them that this leaves unexplained."""
+    """Of line integrals (F, v, u): their path through the object (mm), its attenuation (1/mm), the b of p = t + b t² with t
+    in proportion to the path, and the share of them that this leaves unexplained."""
     volume = model.volume(frames)
     level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)])) if volume.max() > 0 else 0.0
     path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))

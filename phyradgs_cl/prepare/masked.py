@@ -20,7 +20,7 @@ def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Frames (F, v, u) with masked pixels linearly interpolated along their row; rows without any other pixel along their
     columns, between the rows that have some (0 in a frame without any)."""
     filled = frames.copy()
-    empty = mask.all(axis=-1)
+    empty: np.ndarray = np.asarray(mask.all(axis=-1))
     for f, v in zip(*np.nonzero(mask.any(axis=-1) & ~empty), strict=True):
         bad = mask[f, v]
         good = np.flatnonzero(~bad)

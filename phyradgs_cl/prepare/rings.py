@@ -1,8 +1,9 @@
 """Rings: what stays in a pixel over all views, because its gain is not what the flats say.
 
-``few``: per frame what a median along the row takes away, and what of that the sectors of a turn have in common (Boin and Haibel,
-Opt. Express 14 (2006) 12071, with averages). It asks no more of a view than that the object moves on, and holds for fly-scans. ``many``: the sorting of Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396, algorithm 3: over a
-turn all neighbouring pixels see much the same values, in another order.
+``few``: per frame what a median along the row takes away, and what of that the sectors of a turn have in common (Boin and
+Haibel, Opt. Express 14 (2006) 12071, with averages). It asks no more of a view than that the object moves on, and holds for
+fly-scans. ``many``: the sorting of Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396, algorithm 3: over a turn all
+neighbouring pixels see much the same values, in another order.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ class RingOptions:
 def ring_pattern(frames: np.ndarray, *, window: int = 7, axis_column: float | None = None) -> np.ndarray:
     """What the pixels add to all line integrals (F, v, u), (v, u) float32: the method ``few``.
 
-    Views are taken in sectors of the turn. Of what their medians have in common every pixel gets the share that their scatter
-    says is real (Wiener's, the variance of the pattern from all pixels): structure that stays for some views only is left alone.
-    Pixels far beyond that scatter get all of it, but for those near ``axis_column``.
+    Views are taken in sectors of the turn. Of what their medians have in common every pixel gets the share that their
+    scatter says is real (Wiener's, the variance of the pattern from all pixels): structure that stays for some views only is
+    left alone. Pixels far beyond that scatter get all of it, but for those near ``axis_column``.
     """
     pattern = np.zeros(frames.shape[1:], np.float32)
     may_be_object = np.zeros(frames.shape[2], bool)

@@ -1,8 +1,8 @@
 """Scatter by a kernel: what a ray loses, P · (−ln P), comes back as wide Gaussians around it.
 
-Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for all thicknesses, where Sun and Star-Lack (Phys.
-Med. Biol. 55 (2010) 6695) take several. Its height and width are stated, or it is the sum of Gaussians, none of them negative,
-that explains best the light that the panel sees beside the object beyond that of the flats.
+Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for all thicknesses, where Sun and Star-Lack
+(Phys. Med. Biol. 55 (2010) 6695) take several. Its height and width are stated, or it is the sum of Gaussians, none of them
+negative, that explains best the light that the panel sees beside the object beyond that of the flats.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _USUAL_REACH = 0.18
 
 @dataclass(frozen=True)
 class ScatterOptions:
-    """to_primary: scatter over primary light behind the object; 0: fitted on air. reach: standard deviation of the kernel over
-    the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
+    """to_primary: scatter over primary light behind the object; 0: fitted on air. reach: standard deviation of the kernel
+    over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
 
     to_primary: float = 0.0
     reach: float = 0.0
@@ -50,7 +50,8 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
     integrals (F, v, u) beyond 1."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, _FITTED_FRAMES).round().astype(int))
     recorded, where = np.exp(-frames[chosen].astype(np.float64)), air[chosen]
-    reaches, kernel = (reach,) if reach > 0 else _REACHES, {}
+    reaches = (reach,) if reach > 0 else _REACHES
+    kernel: Kernel = {}
     for _ in range(_PASSES):
         primary = _primary(recorded, kernel)
         shapes = np.stack([_scattered(primary, width)[where] for width in reaches], axis=1)

@@ -94,7 +94,8 @@ def test_the_pattern_of_gains_is_what_was_planted(planted) -> None:
 
 
 def test_sorting_takes_a_column_out_of_many_views() -> None:
-    """A disc off the axis, which passes every pixel of the middle: a gain's stripe there is gone, and little else changes."""
+    """A disc off the axis, which passes every pixel of the middle: a gain's stripe there is gone, and little else
+    changes."""
     angle, u = np.linspace(0, 2 * np.pi, 720, endpoint=False), np.arange(64) - 31.5
     distance = u[None] - 14 * np.cos(angle)[:, None]
     clean = 2 * np.sqrt(np.maximum(12**2 - distance**2, 0))[:, None].astype(np.float32) / 12

@@ -19,8 +19,8 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
-from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume
 from phyradgs_cl.prepare.masked import fill_masked
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32
 

@@ -11,7 +11,8 @@ _QUESTION = "dead pixels"
 
 
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
-    """The share of pixels that are dead (``prepare.dead``) and not masked, against 0.02 %; and where they are (v, u) bool."""
+    """The share of pixels that are dead (``prepare.dead``) and not masked, against 0.02 %; and where they are (v, u)
+    bool."""
     known = ~scan.valid.any(0)
     if scan.frames < LEAST_FRAMES:
         text = f"fewer than {LEAST_FRAMES} frames"

@@ -1,8 +1,9 @@
 """Objects wider than the panel: what FDK's filter is told of the rays beyond it.
 
-cosine: rows end in a quarter of a cosine (as Ohnesorge et al., Med. Phys. 27 (2000) 39, smooth theirs). cylinder: in the chords of
-a cylinder that goes on from the row's last values and slope (Hsieh et al., Med. Phys. 31 (2004) 2385), of the attenuation that
-the squares of what the row shows are a parabola for. Both only keep the cut from ringing into the volume: what lies beyond the panel stays unknown.
+cosine: rows end in a quarter of a cosine (as Ohnesorge et al., Med. Phys. 27 (2000) 39, smooth theirs). cylinder: in the
+chords of a cylinder that goes on from the row's last values and slope (Hsieh et al., Med. Phys. 31 (2004) 2385), of the
+attenuation that the squares of what the row shows are a parabola for. Both only keep the cut from ringing into the volume:
+what lies beyond the panel stays unknown.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
 
 
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-    """Line integrals p (F, v, n): p² = edge² + 2 edge slope d − a d² at d pixels beyond, with a slope that does not rise, and an a
-    that ends it within the n pixels."""
+    """Line integrals p (F, v, n): p² = edge² + 2 edge slope d − a d² at d pixels beyond, with a slope that does not rise,
+    and an a that ends it within the n pixels."""
     falling, reach = np.minimum(slope, 0), beyond[-1]
     widest = (edge**2 + 2 * reach * edge * falling) / reach**2
     squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
