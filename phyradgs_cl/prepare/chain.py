@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
 from phyradgs_cl.prepare.sparks import SparkOptions, mask_sparks
-from phyradgs_cl.prepare.step import MakeModel, Step
+from phyradgs_cl.prepare.step import Facts, MakeModel, Step
 from phyradgs_cl.text import near_miss
 
 log = logging.getLogger(__name__)
@@ -80,16 +80,23 @@ STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
 
 def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
     """The scan after the steps that are chosen; its provenance lists them with their options and numbers."""
-    told: list[dict[str, Any]] = []
+    for _, after, _ in one_by_one(scan, options, make_model):
+        scan = after
+    return scan
+
+
+def one_by_one(
+    scan: Scan, options: PrepareOptions, make_model: MakeModel
+) -> Iterator[tuple[str, Scan, Facts]]:
+    """(name, scan after it, numbers) of every step that is chosen, as ``prepare`` does them."""
     if options.flats not in ("mean", scan.provenance.get("flats")):
         expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
         raise InputError("option flats", "a scan of line integrals", expected, "leave it out")
     for name in options.chosen:
         chosen = getattr(options, name)
         scan, numbers = STEPS[name](scan, chosen, make_model)
-        told.append({"step": name, **numbers, "options": asdict(chosen)})
+        told: Any = scan.provenance.get(TOLD) or []
+        line = {"step": name, **numbers, "options": asdict(chosen)}
+        scan = replace(scan, provenance={**scan.provenance, TOLD: [*told, line]})
         log.info("%s: %s", name, numbers)
-    if not told:
-        return scan
-    before: Any = scan.provenance.get(TOLD) or []
-    return replace(scan, provenance={**scan.provenance, TOLD: [*before, *told]})
+        yield name, scan, numbers

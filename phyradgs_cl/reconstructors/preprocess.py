@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
@@ -14,7 +15,9 @@ from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
+from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.masked import unmasked_frames
+from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors.reprojection import reprojection
 from phyradgs_cl.runtime import Runtime
 
@@ -44,13 +47,23 @@ class InputOptions(PrepareOptions, GridChoice):
 def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Scan:
     """The scan as a method gets it; the scan itself where nothing is to be done. ``rt``: where steps that ask the object
     reconstruct and project it."""
-    scan = scan.with_grid(options)
-    if not options.ignore_lag:
-        scan = without_lag(scan)
-    scan = prepare(scan, options, partial(_model, rt))
+    scan = prepare(_begun(scan, options), options, partial(_model, rt))
     if options.median_filter > 0:
         scan = replace(scan, projections=median_frames(scan, options.median_filter))
     return scan
+
+
+def stages(scan: Scan, options: InputOptions, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
+    """(name, scan, numbers) before the steps of ``options`` and after each of them."""
+    scan = _begun(scan, options)
+    yield "", scan, {}
+    yield from one_by_one(scan, options, partial(_model, rt))
+
+
+def _begun(scan: Scan, options: InputOptions) -> Scan:
+    """The scan as the first step gets it."""
+    scan = scan.with_grid(options)
+    return scan if options.ignore_lag else without_lag(scan)
 
 
 def _model(rt: Runtime | None, scan: Scan) -> Model:
