@@ -6,15 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition import LineMiddles, Scan
+from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.prepare import Model
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+from phyradgs_cl.reconstructors.voxels.sart import OS_SART, sart
 from phyradgs_cl.runtime import Runtime
+
+_ITERATIONS = 5
 
 
 def reprojection(rt: Runtime, scan: Scan) -> Model:
-    """FDK with every line at the middle of its own exposure, and rays at the same times, on the scan's grid."""
+    """FDK and OS-SART with every line at the middle of its own exposure, and rays at the same times, on the scan's grid."""
     motion = LineMiddles()
     options = FdkOptions(window="hann", motion=motion)
     tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
@@ -23,4 +26,8 @@ def reprojection(rt: Runtime, scan: Scan) -> Model:
     def volume(frames: np.ndarray) -> np.ndarray:
         return fdk(replace(scan, projections=np.asarray(frames, np.float32)), options, rt).volume
 
-    return Model(volume, operator.forward)
+    def fitted() -> np.ndarray:
+        times = replace(OS_SART, motion=PerRow(sub_intervals=1), iterations=_ITERATIONS)
+        return sart(scan, times, rt).volume
+
+    return Model(volume, operator.forward, fitted)

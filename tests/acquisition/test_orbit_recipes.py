@@ -12,7 +12,7 @@ def test_the_recipes_run() -> None:
     names: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", TEXT, re.S):
         exec(compile(block, "docs/orbits.md", "exec"), names)
-    least = {"helix": 25, "laminography": 20, "tomosynthesis": 14, "half-fan": 25, "half-fan, FDK": 18}
+    least = {"helix": 28, "laminography": 28, "tomosynthesis": 18, "half-fan": 28, "half-fan, FDK": 26}
     quality: dict[str, float] = names["quality"]  # type: ignore[assignment]
     assert set(quality) == set(least)
     assert all(quality[name] > least[name] for name in least), quality
