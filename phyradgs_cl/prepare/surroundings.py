@@ -1,4 +1,5 @@
-"""What lies around the box that is wanted: reconstructed on coarser voxels, projected and taken out of the frames, discarded.
+"""What lies around the box that is wanted: reconstructed on coarser voxels, projected and taken out of the frames,
+discarded.
 
 Ziegler, Nielsen and Grass, Med. Phys. 35 (2008) 1317. For methods that explain frames by what is in the box alone.
 """
@@ -17,7 +18,8 @@ from phyradgs_cl.prepare.step import Facts, MakeModel
 
 @dataclass(frozen=True)
 class SurroundingOptions:
-    """wider: sides of the box that is reconstructed over those of the one that is wanted; coarser: its voxels over the scan's."""
+    """wider: sides of the box that is reconstructed over those of the one that is wanted; coarser: its voxels over the
+    scan's."""
 
     wider: float = 2.0
     coarser: float = 2.0

@@ -11,7 +11,10 @@ import numpy as np
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.workflow import load_scan
 
-SPOILT = ["--phantom", "jaw", "--size", "12", "--detector", "20", "--views", "8", "--time-samples", "2", "--noise", "beer", "--rings", "0.02", "--sparks", "0.005", "--seed", "3"]
+SPOILT = (
+    "--phantom", "jaw", "--size", "12", "--detector", "20", "--views", "8", "--time-samples", "2",
+    "--noise", "beer", "--rings", "0.02", "--sparks", "0.005", "--seed", "3",
+)  # fmt: skip
 
 
 def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys) -> None:

@@ -183,7 +183,8 @@ def test_what_is_no_step_or_no_option_of_one(planted) -> None:
 
 
 def test_a_part_of_the_object_is_freed_of_what_surrounds_it(rt, planted) -> None:
-    """Voxels of the middle half by OS-SART: what lies beyond no longer ends up in them; the grid holds whole coarse voxels."""
+    """Voxels of the middle half by OS-SART: what lies beyond no longer ends up in them; the grid holds whole coarse
+    voxels."""
     scan = planted()
     half = scan.grid.part((7, 7, 7), (14, 14, 14))
     roi_mm = tuple(float(end) for end in half.box_mm.ravel())
