@@ -22,6 +22,7 @@ COMMANDS = {
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
     "check": ("check", "Look for what is wrong or suspicious in a scan."),
     "calibrate": ("calibrate", "Find a scan's true geometry and timing from its frames."),
+    "prepare": ("prepare", "Undo what the panel and the beam did to a scan."),
     "reconstruct": ("reconstruct", "Reconstruct a scan into a volume."),
     "estimate": ("estimate", "Say what time and memory a reconstruction would take."),
     "evaluate": ("evaluate", "Measure a volume against the truth."),

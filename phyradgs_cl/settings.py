@@ -49,7 +49,7 @@ class RunSettings:
             if culprit is None:
                 raise
             found = error.found
-            if found == "no such option":
+            if found == "no such option" and self.method:
                 found += f" of --method {self.method}"
             raise type(error)(culprit, found, error.expected, error.remedy) from error
 
@@ -59,6 +59,30 @@ def run_settings(
 ) -> RunSettings:
     """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None;
     all over the preset. They are checked here, so that an error can say where a wrong value stands."""
+    settings, origins = _collected(config, given, assignments)
+    chosen = _run_settings(settings, origins)
+    with chosen.naming_origins():
+        method_options(chosen.method, chosen.preset, chosen.changes)
+    return chosen
+
+
+def input_settings(
+    config: Path | None, given: Mapping[str, object], assignments: Sequence[str], usual: Mapping[str, object]
+) -> RunSettings:
+    """``run_settings`` of what comes before every method, and of no method: ``before``, device and memory. usual: values of
+    what nobody gave."""
+    settings, origins = _collected(config, given, assignments)
+    settings = {**usual, **settings}
+    wish, memory = _device_and_memory(settings, origins)
+    chosen = RunSettings("", None, 0, wish, {}, memory=memory, origins=origins)
+    with chosen.naming_origins():
+        return replace(chosen, before=input_options(settings))
+
+
+def _collected(
+    config: Path | None, given: Mapping[str, object], assignments: Sequence[str]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Values by name, and where each comes from."""
     settings = read_config(config)
     origins = {key: f"config {config}: {key}" for key in settings}
     for text in assignments:
@@ -68,23 +92,14 @@ def run_settings(
         if value is not None:
             settings[key] = value
             origins[key] = f"--{key.replace('_', '-')}"
-    chosen = _run_settings(settings, origins)
-    with chosen.naming_origins():
-        method_options(chosen.method, chosen.preset, chosen.changes)
-    return chosen
+    return settings, origins
 
 
 def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSettings:
     method = _word(settings, "method", origins)
     preset = _word(settings, "preset", origins)
-    device = settings.pop("device", None)
-    if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
-        device = str(device)  # in TOML an index is a number
     seed = _seed(settings.pop("seed", 0), origins.get("seed", "--seed"))
-    wish = device_wish(device, origins.get("device", "--device"))
-    memory = settings.pop("memory", None)
-    if memory is not None:
-        memory = bytes_of(memory, origins.get("memory", "--memory"))
+    wish, memory = _device_and_memory(settings, origins)
     names = [f.name for f in fields(InputOptions)]
     changes = {name: settings.pop(name) for name in names if name in settings}
     chosen = RunSettings(
@@ -92,6 +107,15 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
     )
     with chosen.naming_origins():
         return replace(chosen, method=method_name(chosen.method), before=input_options(changes))
+
+
+def _device_and_memory(settings: dict[str, Any], origins: Mapping[str, str]) -> tuple[str | None, int | None]:
+    device = settings.pop("device", None)
+    if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
+        device = str(device)  # in TOML an index is a number
+    wish = device_wish(device, origins.get("device", "--device"))
+    memory = settings.pop("memory", None)
+    return wish, None if memory is None else bytes_of(memory, origins.get("memory", "--memory"))
 
 
 def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:

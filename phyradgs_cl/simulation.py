@@ -12,7 +12,18 @@ from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
-from phyradgs_cl.detector import average, beer_lambert_noise, lagged, tigre_noise
+from phyradgs_cl.detector import (
+    add_scatter,
+    add_sparks,
+    average,
+    beer_lambert_noise,
+    drifting_light,
+    lagged,
+    pixel_gains,
+    tigre_noise,
+    tube_spectrum,
+)
+from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import LoadedVolume, Scanner, load_scanner, with_detector_count
@@ -33,6 +44,7 @@ NOISES = ("none", "tigre", "beer")
 LARGEST_PEAK, LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
 SMALLEST_DOSE, LARGEST_DOSE = 1e-3, 1e12
 LARGEST_GRID, LARGEST_DETECTOR = 4096, 32_000
+_DENSE = 0.5  # of the largest attenuation: from here a voxel is bone, in a beam of many energies
 SMALLEST_PHANTOM = 2  # procedural phantoms are drawn on twice as many voxels, of which they need 4
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
 log = logging.getLogger(__name__)
@@ -44,7 +56,8 @@ class SimulationOptions:
 
     time_samples: midpoint samples per line in its own exposure; 0: the volume's edge moves at most half a voxel of ``grid``
     between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
-    lag: λ of detector/lag.py.
+    lag: λ of detector/lag.py. rings, sparks, drift, scatter: of detector/effects.py, 0 without; kvp: of
+    detector/spectrum.py, 0 for a beam of one energy.
     """
 
     protocol: Protocol = Protocol()
@@ -59,6 +72,11 @@ class SimulationOptions:
     lag: float = 0.0
     time_samples: int = 0
     seed: int = 0
+    rings: float = 0.0
+    sparks: float = 0.0
+    drift: float = 0.0
+    scatter: float = 0.0
+    kvp: float = 0.0
 
     def __post_init__(self) -> None:
         if self.noise not in NOISES:
@@ -70,6 +88,9 @@ class SimulationOptions:
         checks.within("--jitter-deg", self.jitter_deg, 0, 360)
         checks.within("--time-samples", self.time_samples, 0, 10_000)
         checks.within("--seed", self.seed, 0, 2**63)
+        checks.fields_within("--", self, {"rings": (0, 0.5), "sparks": (0, 0.1), "drift": (0, 0.5), "scatter": (0, 10)})
+        if self.kvp != 0:
+            checks.within("--kvp (kV)", self.kvp, LOWEST_KVP, HIGHEST_KVP)
 
 
 OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
@@ -77,9 +98,13 @@ OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protoco
 
 
 def scanner_for(
-    name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None
+    name: str,
+    detector: int | None = None,
+    detector_offset_mm: tuple[float, float] | None = None,
+    truncation: float = 0.0,
 ) -> Scanner:
-    """A scanner by name or TOML file, with another number of columns (rows in proportion) or offset (v, u) of the panel."""
+    """A scanner by name or TOML file, with another number of columns (rows in proportion) or offset (v, u) of the panel, and
+    without the share ``truncation`` of its columns, half of it at each side."""
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -88,7 +113,10 @@ def scanner_for(
         geometry = with_detector_count(geometry, max(1, round(detector * rows / columns)), detector)
     if detector_offset_mm is not None:
         geometry = replace(geometry, detector_offset_mm=detector_offset_mm)
-    return replace(scanner, geometry=geometry)
+    checks.within("--truncation", truncation, 0, 0.95)
+    rows, columns = geometry.detector_shape
+    kept = max(1, columns - 2 * round(truncation * columns / 2))
+    return replace(scanner, geometry=replace(geometry, detector_shape=(rows, kept)))
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
@@ -129,9 +157,12 @@ def simulated_scan(
     scene.warn_of_inverse_crime()
     title = f"simulated scan of {scene.title}"
     scan = simulate(
-        scene.source, scanner.geometry, scene.grid, options, reference=scene.reference, title=title, report=report
-    )
-    asked = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise")}
+        scene.source, scanner.geometry, scene.grid, options,
+        reference=scene.reference, title=title, report=report,
+        bone=scene.bone() if options.kvp and scene.bone is not None else None,
+    )  # fmt: skip
+    effects = [name for name in ("rings", "sparks", "drift", "scatter", "kvp") if getattr(options, name)]
+    asked = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *effects)}
     told = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
     scan.provenance.update(told | asked)
     return scan
@@ -146,8 +177,13 @@ def simulate(
     reference: np.ndarray | None = None,
     title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None,
+    bone: FrameSource | None = None,
 ) -> Scan:
-    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by ``peak``."""
+    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by ``peak``.
+    bone: the part of it that is bone, which a beam of many energies (``kvp``) asks for."""
+    if options.kvp and bone is None:
+        expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
+        raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
     rng = np.random.default_rng(options.seed)
     protocol = options.protocol
     shutter = protocol.shutter(options.readout_axis, options.readout_direction)
@@ -167,9 +203,13 @@ def simulate(
         if largest <= 0:
             raise InputError("--peak", "an empty object", "something that attenuates")
         factor = options.peak / largest
+    spectrum = tube_spectrum(options.kvp) if options.kvp else None
     frames = np.empty((protocol.views, *geometry.detector_shape), np.float32)
     for frame, cells in enumerate(tables):
         frames[frame] = source.frame(cells, options.detector_model, factor)
+        if spectrum is not None and bone is not None:
+            dense = bone.frame(cells, options.detector_model, factor)
+            frames[frame] = spectrum.hardened(np.maximum(frames[frame] - dense, 0), dense)
         if not np.all(np.isfinite(frames[frame])):
             found, expected = "line integrals that are not finite", "a smaller geometry or attenuation"
             raise NumericalError(f"frame {frame}", found, expected)
@@ -177,7 +217,7 @@ def simulate(
     if frames.max() <= 0:
         log.warning("no ray meets anything that attenuates: all %d frames are empty", protocol.views)
     share = shutter.readout.spread(shutter.lit_share(lines))
-    recorded = _with_noise(frames, options, np.where(share > 0, share, 1.0), rng)
+    recorded = _recorded(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
         projections=recorded if np.all(share > 0) else recorded * (share > 0),  # lines without light are masked
         geometry=geometry,
@@ -262,13 +302,14 @@ def _on_panel(
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx). source_shape:
-    voxels (z, y, x) that are projected, where the source is a volume from outside."""
+    voxels (z, y, x) that are projected, where the source is a volume from outside. bone: the dense part of the source."""
 
     source: FrameSource
     grid: Grid
     reference: np.ndarray
     title: str
     source_shape: tuple[int, int, int] | None = None
+    bone: Callable[[], FrameSource] | None = None
 
     def warn_of_inverse_crime(self) -> None:
         """Says so where the projected voxels are no finer than the grid: reconstructions there look better than they are."""
@@ -304,9 +345,9 @@ def phantom_scene(
         text = "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
         log.warning(text + "are not used", name, 2 * half_size_mm)
     volume = phantom.voxelise(fine)
-    source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
+    source, bone = _voxel_sources(rt, volume, fine, geometry, axis, pixel_samples)
     truth = block_mean(volume, (size,) * 3)
-    return Scene(source, Grid.cube(size, 2 * half_size_mm), truth, f"phantom {name}")
+    return Scene(source, Grid.cube(size, 2 * half_size_mm), truth, f"phantom {name}", bone=bone)
 
 
 def volume_scene(
@@ -327,8 +368,19 @@ def volume_scene(
         fine = Grid(volume.shape, (voxel_mm,) * 3, box.offset_mm)
         volume = volume / np.float32(fine.half_longest_mm)
     grid = _resized(fine, size or max(fine.shape))
-    source = _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, volume, fine, panel, axis))
-    return Scene(source, grid, block_mean(volume, grid.shape), name, fine.shape)
+    source, bone = _voxel_sources(rt, volume, fine, geometry, axis, pixel_samples)
+    return Scene(source, grid, block_mean(volume, grid.shape), name, fine.shape, bone)
+
+
+def _voxel_sources(
+    rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str, pixel_samples: int
+) -> tuple[FrameSource, Callable[[], FrameSource]]:
+    """Frames of a volume, and, made when they are asked for, of what is bone in it."""
+
+    def of(values: np.ndarray) -> FrameSource:
+        return _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, values, grid, panel, axis))
+
+    return of(volume), lambda: of(np.where(volume >= _DENSE * volume.max(), volume, 0).astype(np.float32))
 
 
 def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
@@ -354,6 +406,22 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
     ranges = np.stack([cells.line_start, cells.line_stop], -1)
     for start, stop in np.unique(ranges, axis=0):
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
+
+
+def _recorded(
+    frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Frames (F, v, u) with scatter, the light of each frame, noise, gains and sparks, as far as they are asked for."""
+    if options.scatter > 0:
+        frames = add_scatter(frames, options.scatter).astype(np.float32)
+    if options.drift > 0:
+        frames = frames - np.log(drifting_light(len(frames), options.drift, rng)).astype(np.float32)[:, None, None]
+    frames = _with_noise(frames, options, light, rng)
+    if options.rings > 0:
+        frames = frames - np.log(pixel_gains(frames.shape[1:], options.rings, rng)).astype(np.float32)
+    if options.sparks > 0:
+        frames = add_sparks(frames, options.sparks, rng)[0].astype(np.float32)
+    return frames
 
 
 def _with_noise(

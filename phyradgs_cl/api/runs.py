@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,12 @@ import numpy as np
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
-from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import read_scan, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
+from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
     InputOptions,
@@ -34,16 +34,19 @@ from phyradgs_cl.reconstructors import (
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
+from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 
-def load_scan(path: str | Path) -> Scan:
+def load_scan(path: str | Path, flats: str = "mean") -> Scan:
     """A scan file (docs/formats.md) as a ``Scan``: line integrals (F, rows, columns), lengths in mm, times in s.
 
-    path: the HDF5 file. Raises InputError, which names what is wrong by its HDF5 path.
+    path: the HDF5 file. flats: their ``mean``, or by ``time`` or ``pca`` (docs/prepare.md). Raises InputError, which names
+    what is wrong by its HDF5 path.
     """
-    return read_scan(_checked_path(path), counts_to_attenuation)
+    scan = read_scan(_checked_path(path), flat_correction(flats))
+    return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
 
 def save_scan(path: str | Path, scan: Scan) -> None:
@@ -108,6 +111,16 @@ def simulate(
     of = str(phantom) if phantom in PHANTOMS else load_attenuation(phantom)
     name = f"volume {phantom}"
     return simulated_scan(runtime_of(device), of, described, chosen, size=size, name=name)
+
+
+def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **options: Any) -> Scan:
+    """The scan without what the panel and the beam did to it, by the steps of docs/prepare.md, names with commas between.
+
+    options: tables of the steps' own (``rings={"window": 11}``), and what else comes before every method. What each step did
+    stands in the scan's provenance, under ``prepared``. Raises InputError for what is no step or option, or a scan that does
+    not show what a step looks for.
+    """
+    return prepared(scan, input_options({"steps": steps, **options}), runtime_of(device))
 
 
 def reconstruct(

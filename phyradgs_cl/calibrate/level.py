@@ -14,7 +14,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
-from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions, axis_weights
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
+from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 

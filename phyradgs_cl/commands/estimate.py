@@ -16,7 +16,7 @@ def estimate_command(scan: Scan, request: RunRequest) -> None:
     """Say how long a reconstruction would take and how much memory, from a few iterations of it."""
     settings = request.settings()
     options = method_options(settings.method, settings.preset, settings.changes)
-    loaded = load_scan(scan)
+    loaded = load_scan(scan, settings.before.flats)
     with settings.naming_origins():
         rt = Runtime(settings.device, memory=settings.memory)
     before_s = seconds_since_start()  # a run will have started, and read the scan, as this did

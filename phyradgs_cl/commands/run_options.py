@@ -74,6 +74,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "ignore_lag": Annotated[
         bool, option("Leave the lag that the scan file states in the frames.", True, "--ignore-lag")
     ],
+    "steps": options.Steps,
     "median_filter": _asked(int, "Median filter of the frames: 3 or 5 pixels per side, 0 none.", "0"),
     "device": options.Device,
     "memory": options.Memory,

@@ -66,6 +66,14 @@ def simulate_command(
     electronic_noise: Annotated[
         float | None, option("Standard deviation of electronic noise, counts, for --noise.", "10")
     ] = None,
+    rings: Annotated[float | None, option("Spread of the pixels' gains (std), seen as rings.", "0")] = None,
+    sparks: Annotated[float | None, option("Share of all pixels that a spark hits.", "0")] = None,
+    drift: Annotated[float | None, option("Largest change of the tube's light from frame to flat.", "0")] = None,
+    scatter: Annotated[float | None, option("Scatter over primary light behind the object.", "0")] = None,
+    kvp: Annotated[
+        float | None, option("Tube voltage, kV, of a beam that hardens; dense voxels are bone.", "0: one energy")
+    ] = None,
+    truncation: Annotated[float, option("Share of the panel's columns cut off, half at each side.")] = 0.0,
     jitter_deg: Annotated[
         float | None,
         option("Wander of the gantry about constant speed (std, degrees), written to the encoder table.", "0"),
@@ -96,7 +104,7 @@ def simulate_command(
     refuse_jitter(protocol, jitter_deg)
     refuse_noise_options(noise, {"--dose": dose, "--electronic-noise": electronic_noise})
     wish = device_wish(device)
-    described = scanner_for(scanner, detector, detector_offset)
+    described = scanner_for(scanner, detector, detector_offset, truncation)
     options = scanner_options(described, protocol, **given)
     job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples)
     with Ticker("frame") as ticker:

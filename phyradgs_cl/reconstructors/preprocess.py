@@ -1,8 +1,10 @@
-"""What happens to a scan before any method sees it: another grid, lag undone, a median filter."""
+"""What happens to a scan before any method sees it: another grid, lag undone, the steps of ``prepare``, a median filter."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -10,37 +12,64 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import without_lag
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
+from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
+from phyradgs_cl.prepare.chain import one_by_one
+from phyradgs_cl.prepare.masked import unmasked_frames
+from phyradgs_cl.prepare.step import Facts
+from phyradgs_cl.reconstructors.reprojection import reprojection
+from phyradgs_cl.runtime import Runtime
 
 MEDIAN_EDGES = (0, 3, 5)
 
 
 @dataclass(frozen=True)
-class InputOptions(GridChoice):
+class InputOptions(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
-    median_filter: edge of its window in pixels, 0 for none.
+    median_filter: edge of its window in pixels, 0 for none. steps and a table each: as of ``PrepareOptions``.
     """
 
     ignore_lag: bool = False
     median_filter: int = 0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        GridChoice.__post_init__(self)
+        PrepareOptions.__post_init__(self)
         checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
 
     def facts(self) -> dict[str, object]:
         """What is chosen, by name."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        plain = {name: value for name, value in asdict(self).items() if name not in STEP_FIELDS and value is not None}
+        return {**plain, **self.step_facts()}
 
 
-def prepared(scan: Scan, options: InputOptions) -> Scan:
-    """The scan as a method gets it; the scan itself where nothing is to be done."""
-    scan = scan.with_grid(options)
-    if not options.ignore_lag:
-        scan = without_lag(scan)
+def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Scan:
+    """The scan as a method gets it; the scan itself where nothing is to be done. ``rt``: where steps that ask the object
+    reconstruct and project it."""
+    scan = prepare(_begun(scan, options), options, partial(_model, rt))
     if options.median_filter > 0:
         scan = replace(scan, projections=median_frames(scan, options.median_filter))
     return scan
+
+
+def stages(scan: Scan, options: InputOptions, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
+    """(name, scan, numbers) before the steps of ``options`` and after each of them."""
+    scan = _begun(scan, options)
+    yield "", scan, {}
+    yield from one_by_one(scan, options, partial(_model, rt))
+
+
+def _begun(scan: Scan, options: InputOptions) -> Scan:
+    """The scan as the first step gets it."""
+    scan = scan.with_grid(options)
+    return scan if options.ignore_lag else without_lag(scan)
+
+
+def _model(rt: Runtime | None, scan: Scan) -> Model:
+    if rt is None:
+        raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
+    return reprojection(rt, scan)
 
 
 def median_frames(scan: Scan, edge: int) -> np.ndarray:
@@ -51,20 +80,3 @@ def median_frames(scan: Scan, edge: int) -> np.ndarray:
     frames = unmasked_frames(scan)
     smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]
     return np.stack(smooth).astype(np.float32)
-
-
-def unmasked_frames(scan: Scan) -> np.ndarray:
-    """The scan's line integrals with masked pixels filled in, for methods that cannot leave pixels out."""
-    if scan.pixel_mask is None:
-        return scan.projections
-    return fill_masked(scan.projections, np.broadcast_to(scan.pixel_mask != 0, scan.projections.shape))
-
-
-def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Frames (F, v, u) with masked pixels linearly interpolated along their row (0 in a row without any)."""
-    filled = frames.copy()
-    for f, v in zip(*np.nonzero(mask.any(axis=-1)), strict=True):
-        bad = mask[f, v]
-        good = np.flatnonzero(~bad)
-        filled[f, v, bad] = np.interp(np.flatnonzero(bad), good, filled[f, v, good]) if good.size else 0.0
-    return filled

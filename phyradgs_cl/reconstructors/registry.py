@@ -16,6 +16,7 @@ from phyradgs_cl.acquisition.motion import MODELS, STILL, check_own_motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import resampled
+from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
@@ -142,11 +143,14 @@ def reconstruct(
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method_name(method), rt)
-    ready = prepared(scan, InputOptions() if before is None else before)
+    ready = prepared(scan, InputOptions() if before is None else before, rt)
     check_own_motion(getattr(chosen, "motion", None), ready)
     if initial is not None:
         extra["initial"] = _initial(method, *initial, ready.grid)
-    return method_of(method).run(ready, chosen, rt, seed=seed, report=report, **extra)
+    result = method_of(method).run(ready, chosen, rt, seed=seed, report=report, **extra)
+    if TOLD in ready.provenance:
+        result.facts[TOLD] = ready.provenance[TOLD]
+    return result
 
 
 def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.ndarray:

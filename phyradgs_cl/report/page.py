@@ -16,6 +16,7 @@ from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, element, joined, raw_text
 from phyradgs_cl.report.pictures.png import base64_of
 from phyradgs_cl.report.pictures.projections import computed_views
+from phyradgs_cl.report.pictures.steps import Change, step_changes
 from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 
@@ -42,15 +43,17 @@ def write_report(
         if path is not None and Path(output).resolve() == path.resolve():
             raise InputError("-o", f"the input file {path} itself", "another file to write")
     shown = computed_views(run, make_runtime(), views) if run.scan is not None and views > 0 else []
-    page = report_page(run, shown)
+    changes = step_changes(run, make_runtime()) if shown else []
+    page = report_page(run, shown, changes)
     with written_beside(output) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return run
 
 
-def report_page(run: Run, views: Sequence[FramePair] = ()) -> str:
-    """The page as text; ``views`` as from ``computed_views``."""
+def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
+    """The page as text; ``views`` as from ``computed_views``, ``changes`` as from ``step_changes``."""
     of_scan = {} if run.scan is None else {
+        "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),
         "scan": sections.scan_section(run),
         "geometry": sections.geometry_section(run.scan),

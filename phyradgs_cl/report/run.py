@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_from_facts
-from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import compare
+from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.text import plain_text
 
@@ -53,17 +53,22 @@ class Run:
     @property
     def before(self) -> InputOptions:
         """What was done to the frames first; nothing but what is usual where the provenance does not say."""
-        table = self.stored.provenance.get("input")
-        try:
-            return input_options(dict(table)) if isinstance(table, Mapping) else InputOptions()
-        except InputError:
-            return InputOptions()
+        return input_of(self.stored)
 
     @property
     def record(self) -> list[dict[str, float]]:
         """The convergence record: finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if NUMBER.fits(v)} for line in lines]
+
+
+def input_of(stored: StoredVolume) -> InputOptions:
+    """What was done to the frames before a volume was made of them, as far as its provenance says."""
+    table = stored.provenance.get("input")
+    try:
+        return input_options(dict(table)) if isinstance(table, Mapping) else InputOptions()
+    except InputError:
+        return InputOptions()
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
@@ -89,7 +94,9 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
     facts = scan_summary(found, str(known) if scan_path is None else None)
     if known is not None and facts["sha256"] != known:
         notes.append("The scan shown here is not the file that this volume was reconstructed from: its hash differs.")
-    whole = read_scan(found, counts_to_attenuation)
+    flats = input_of(stored).flats
+    whole = read_scan(found, flat_correction(flats))
+    whole = replace(whole, provenance={**whole.provenance, "flats": flats})
     scan = whole.on_grid(stored.grid)
     if whole.reference is not None and scan.reference is None:
         notes.append("The scan's reference is on another grid than the volume and is not shown.")

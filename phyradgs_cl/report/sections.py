@@ -6,14 +6,16 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.frame_pairs import TIMES_PER_LINE, FramePair
-from phyradgs_cl.report.charts.curve import convergence_charts
+from phyradgs_cl.report.charts.curve import convergence_charts, histogram
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
 from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
 from phyradgs_cl.report.pictures.slices import planes_of, windows_of
+from phyradgs_cl.report.pictures.steps import Change
 from phyradgs_cl.report.pictures.viewer import viewer
 from phyradgs_cl.report.run import Run
 
@@ -91,6 +93,44 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
         told += "Every frame is computed from its one pose."
     rows = [_view(view, (low, high), limit, proportion) for view in views]
     return _section("projections", "Projections", element("p", told, class_="note"), *rows)
+
+
+def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
+    """What each step before the method did: a frame, the line integrals of all, and numbers; those of a scan file that was
+    written by ``prepare`` in numbers alone."""
+    told = [] if run.scan is None else run.scan.provenance.get(TOLD)
+    earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(told)]
+    if not changes and not earlier:
+        return None
+    words = "The frame that each step changed most, in one range of grey values; difference, after less before."
+    note = element("p", words, class_="note") if changes else None
+    return _section("preparation", "Preparation", note, *earlier, *(_change(change) for change in changes))
+
+
+def _tables(told: object) -> list[Mapping[str, object]]:
+    return [line for line in told if isinstance(line, Mapping)] if isinstance(told, list) else []
+
+
+def _change(change: Change) -> Markup:
+    low, high = float(change.before.min()), float(change.before.max())
+    difference = change.after - change.before
+    limit = float(np.percentile(np.abs(difference), 99.9)) or float(np.abs(difference).max()) or 1.0
+    pictures = [
+        ("before", png_bytes(top_row_first(bytes_of(change.before, low, high)))),
+        ("after", png_bytes(top_row_first(bytes_of(change.after, low, high)))),
+        (f"difference, ±{number(limit)}", png_bytes(top_row_first(bytes_of(difference, -limit, limit)), diverging())),
+    ]
+    figures = [
+        element(
+            "figure",
+            element("div", element("img", src=data_uri(png), alt=f"{change.step}, {words}"), class_="picture"),
+            element("figcaption", words),
+        )
+        for words, png in pictures
+    ]
+    title = element("h3", f"{change.step}: frame {change.frame}")
+    chart = _charts([("Line integrals of all frames: dashed before, drawn after.", histogram(change.edges, change.counts))])
+    return joined(element("div", title, *figures, class_="view"), chart, facts_table(change.numbers))
 
 
 def provenance_section(run: Run) -> Markup:

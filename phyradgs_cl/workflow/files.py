@@ -2,18 +2,19 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.prepare import flat_correction
 
 _KINDS = {
     "scan": "a scan",
@@ -22,10 +23,11 @@ _KINDS = {
 }
 
 
-def load_scan(path: str | Path) -> Scan:
-    """A scan file as line integrals; see ``io.read_scan``."""
+def load_scan(path: str | Path, flats: str = "mean") -> Scan:
+    """A scan file as line integrals, its flats taken as ``prepare.flats`` says; see ``io.read_scan``."""
     with expecting(path, "scan"), held_warnings():
-        return read_scan(path, counts_to_attenuation)
+        scan = read_scan(path, flat_correction(flats))
+    return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
 
 @contextmanager

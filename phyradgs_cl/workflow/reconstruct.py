@@ -140,7 +140,7 @@ def _reconstructed(
     job: ReconstructionJob, options: Any, make_runtime: Callable[[], Runtime], report: ProgressReport
 ) -> tuple[Reconstruction, dict[str, float]]:
     with hashing(job.scan) as scan_hash_of:
-        scan = load_scan(job.scan)
+        scan = load_scan(job.scan, job.before.flats)
         scan_hash = scan_hash_of()
     _warn_of_doubts(job, scan, options)
     rt = make_runtime()

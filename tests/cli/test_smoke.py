@@ -22,6 +22,7 @@ COMMANDS = (
     ("check scan.h5", ""),
     (f"simulate {SCAN} --views 8 -o eight.h5", "eight.h5"),
     ("calibrate eight.h5 --what offset -o calibrated.h5", "calibrated.png"),
+    ("prepare scan.h5 -o clean.h5", "clean.h5"),
     ("estimate scan.h5 --method sirt", ""),
     ("reconstruct scan.h5 --iterations 2 -o volume.h5", "volume.h5"),
     ("evaluate volume.h5 --reference scan.h5 --json", "volume.png"),

@@ -16,6 +16,7 @@ from skimage import io
 
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
+from phyradgs_cl.reconstructors import input_options
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.pictures.projections import chosen_frames, computed_views
@@ -232,3 +233,21 @@ def test_the_command_writes_a_page_and_says_so(cli, files, tmp_path, capsys) -> 
     assert cli.run(["report", str(files[1]), "-o", str(page), "--views", "1"]) == 0
     assert capsys.readouterr().out.startswith(f"{page}: ")
     assert page.read_text(encoding="utf-8").count('class="view"') == 1
+
+
+def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> None:
+    """A frame before and after, their difference and a histogram for each; of a scan that was prepared already, its
+    numbers."""
+    sparked = small_scan.projections.copy()
+    sparked[1, 5, 6] -= 3
+    told = {"prepared": [{"step": "air", "light": [0.98, 1.01]}]}
+    write_scan(tmp_path / "scan.h5", replace(small_scan, projections=sparked, provenance=told))
+    before = input_options({"steps": "sparks,rings"})
+    job = ReconstructionJob(tmp_path / "scan.h5", tmp_path / "volume.h5", method="fdk", before=before)
+    run_reconstruction(job, lambda: rt, lambda progress: None)
+    write_report(tmp_path / "volume.h5", tmp_path / "page.html", lambda: rt)
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    section = text.split('id="preparation"')[1].split("</section>")[0]
+    assert "sparks: frame 1" in section and "rings: frame" in section and "0.98" in section
+    assert section.count("<img") == 6 and section.count("Histogram of line integrals") == 2
+    assert not parse(text).open

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,8 +15,10 @@ from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
+from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.arc import view_arc
+from phyradgs_cl.reconstructors.fdk.extrapolate import WAYS, extrapolated
 from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
@@ -26,10 +29,10 @@ from phyradgs_cl.reconstructors.fdk.views import (
     widened,
 )
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.preprocess import unmasked_frames
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.runtime import Runtime
 
+log = logging.getLogger(__name__)
 _SAME_POSE = 1e-9  # of the largest length: views whose poses differ by a turn alone share their weights
 _BLOCK_BYTES = 1 << 26  # rows that are filtered at one time
 
@@ -39,16 +42,19 @@ class FdkOptions:
     """``window`` is the ramp filter's (see ``WINDOWS``).
 
     ``motion``: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line
-    at the middle of its own exposure). Of a model with more poses it takes a line's middle one.
+    at the middle of its own exposure). Of a model with more poses it takes a line's middle one. ``extrapolate``: rows of an
+    object wider than the panel go on beyond it, one of ``WAYS``.
     """
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), StaticStart(), LineMiddles())
 
     window: str = "ram-lak"
     motion: Motion = Static()
+    extrapolate: str = "none"
 
     def __post_init__(self) -> None:
         checks.one_of("FDK window", self.window, WINDOWS)
+        checks.one_of("option extrapolate", self.extrapolate, WAYS)
         check_motion(self.motion, self.MOTIONS)
 
 
@@ -61,7 +67,8 @@ def fdk(
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     frames, axis = unmasked_frames(scan), scan.shutter.axis
-    volume = fdk_volume(rt, frames, pose, scan.grid, window=options.window, axis=axis)
+    how = {"window": options.window, "extrapolate": options.extrapolate}
+    volume = fdk_volume(rt, frames, pose, scan.grid, axis=axis, **how)
     facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
@@ -77,6 +84,7 @@ def fdk_volume(
     *,
     window: str = "ram-lak",
     axis: str = "rows",
+    extrapolate: str = "none",
 ) -> np.ndarray:
     """FDK of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
@@ -93,6 +101,11 @@ def fdk_volume(
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
     arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape)
+    if extrapolate != "none" and fan.is_displaced:
+        log.warning("FDK: the rows of a displaced detector are not extrapolated")
+    elif extrapolate != "none":
+        wide, count = extrapolated(frames, extrapolate)
+        return fdk_volume(rt, wide, widened(pose, axis, (count, count)), grid, window=window, axis=axis)
     warn_if_incomplete(arc, fan, canonical, grid)
     missing = fan.missing_columns if arc.is_full else (0, 0)
     filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan), missing, window)

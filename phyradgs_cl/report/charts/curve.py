@@ -2,6 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from phyradgs_cl.report.charts.axes import Axes, svg
 from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, joined
@@ -22,6 +25,16 @@ def convergence_charts(record: Record) -> list[tuple[str, Markup]]:
         if len(points) > 1 and max(values) > min(values):
             charts.append((_caption(name, points), _chart(name, points)))
     return charts[:MOST_CHARTS]
+
+
+def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
+    """How often line integrals between ``edges`` (n + 1,) are there, ``counts`` (2, n): before and after."""
+    axes = Axes((float(edges[0]), float(edges[-1])), (0.9, 1.2 * float(max(counts.max(), 1))), log=True)
+    middles = (edges[:-1] + edges[1:]) / 2
+    drawn = [axes.frame("line integral", "pixels")]
+    for values, class_ in zip(counts, ("former", "curve"), strict=True):
+        drawn.append(axes.polyline([(float(x), max(float(n), 0.9)) for x, n in zip(middles, values, strict=True)], class_))
+    return svg(joined(*drawn), "Histogram of line integrals", "Pixels of all frames by line integral, before and after.")
 
 
 def _caption(name: str, points: list[tuple[float, float]]) -> str:

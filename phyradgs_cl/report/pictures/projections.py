@@ -17,5 +17,5 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     """
     if run.scan is None or count < 1:
         return []
-    scan = prepared(run.scan, run.before)
+    scan = prepared(run.scan, run.before, rt)
     return frame_pairs(rt, scan, run.stored.volume, run.stored.grid, chosen_frames(scan.frames, count))

@@ -1,0 +1,105 @@
+"""The steps by name, in physical order, and a scan through those that are chosen."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare.air import AirOptions, normalise_air
+from phyradgs_cl.prepare.dead import DeadOptions, mask_dead
+from phyradgs_cl.prepare.flats import WAYS
+from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
+from phyradgs_cl.prepare.rings import RingOptions, remove_rings
+from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
+from phyradgs_cl.prepare.sparks import SparkOptions, mask_sparks
+from phyradgs_cl.prepare.step import Facts, MakeModel, Step
+from phyradgs_cl.prepare.surroundings import SurroundingOptions, subtract_surroundings
+from phyradgs_cl.text import near_miss
+
+log = logging.getLogger(__name__)
+
+STEPS: Mapping[str, Step] = {
+    "sparks": mask_sparks,
+    "dead": mask_dead,
+    "scatter": subtract_scatter,
+    "air": normalise_air,
+    "hardening": correct_hardening,
+    "rings": remove_rings,
+    "surroundings": subtract_surroundings,
+}
+"""In the order in which they are done, whatever the order in which they are asked for."""
+DEFAULT_STEPS = "sparks,dead,rings"
+TOLD = "prepared"
+"""Where a scan's provenance lists what was done to it."""
+
+
+@dataclass(frozen=True)
+class PrepareOptions:
+    """flats: one of ``flats.WAYS``, asked when a file is read. steps: names of ``STEPS`` with commas between; the rest: a
+    table of options per step."""
+
+    flats: str = "mean"
+    steps: str = ""
+    sparks: SparkOptions = SparkOptions()
+    dead: DeadOptions = DeadOptions()
+    scatter: ScatterOptions = ScatterOptions()
+    air: AirOptions = AirOptions()
+    hardening: HardeningOptions = HardeningOptions()
+    rings: RingOptions = RingOptions()
+    surroundings: SurroundingOptions = SurroundingOptions()
+
+    def __post_init__(self) -> None:
+        checks.one_of("flats", self.flats, WAYS)
+        for name in self.steps.split(",") if self.steps.strip() else ():
+            if name.strip() not in STEPS:
+                remedy = near_miss(name.strip(), STEPS, "leave it out")
+                raise InputError("--steps", checks.shown(name.strip()), f"some of {', '.join(STEPS)}", remedy)
+        for name in STEPS:
+            if name not in self.chosen and getattr(self, name) != type(getattr(self, name))():
+                found = f"options of a step that is not among --steps {self.steps or '(none)'}"
+                raise InputError(f"option {name}", found, f"{name} among the steps", "add it, or leave the options out")
+
+    @property
+    def chosen(self) -> list[str]:
+        """The steps that are asked for, in their order."""
+        asked = {name.strip() for name in self.steps.split(",")}
+        return [name for name in STEPS if name in asked]
+
+    def step_facts(self) -> dict[str, object]:
+        """The steps and their options, by name; nothing where there are none."""
+        flats = {} if self.flats == "mean" else {"flats": self.flats}
+        if not self.chosen:
+            return {**flats}
+        return {**flats, "steps": ",".join(self.chosen), **{name: asdict(getattr(self, name)) for name in self.chosen}}
+
+
+STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
+
+
+def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
+    """The scan after the steps that are chosen; its provenance lists them with their options and numbers."""
+    for _, after, _ in one_by_one(scan, options, make_model):
+        scan = after
+    return scan
+
+
+def one_by_one(
+    scan: Scan, options: PrepareOptions, make_model: MakeModel
+) -> Iterator[tuple[str, Scan, Facts]]:
+    """(name, scan after it, numbers) of every step that is chosen, as ``prepare`` does them."""
+    if options.flats not in ("mean", scan.provenance.get("flats")):
+        expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
+        raise InputError("option flats", "a scan of line integrals", expected, "leave it out")
+    for name in options.chosen:
+        chosen = getattr(options, name)
+        scan, numbers = STEPS[name](scan, chosen, make_model)
+        told: Any = scan.provenance.get(TOLD) or []
+        line = {"step": name, **numbers, "options": asdict(chosen)}
+        scan = replace(scan, provenance={**scan.provenance, TOLD: [*told, line]})
+        log.info("%s: %s", name, numbers)
+        yield name, scan, numbers

@@ -1,0 +1,105 @@
+"""Scatter by a kernel: what a ray loses, P · (−ln P), comes back as wide Gaussians around it.
+
+Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for all thicknesses, where Sun and Star-Lack
+(Phys. Med. Biol. 55 (2010) 6695) take several. Its height and width are stated, or it is the sum of Gaussians, none of them
+negative, that explains best the light that the panel sees beside the object beyond that of the flats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.prepare.air import enough_air
+from phyradgs_cl.prepare.masked import unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel
+
+Kernel = dict[float, float]
+_REACHES = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)  # of the panel's longer side
+_PASSES = 6  # of scatter from primary from scatter
+_LEAST_PRIMARY = 0.05  # of what was measured
+_SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the object
+_FITTED_FRAMES = 24
+_USUAL_REACH = 0.18
+
+
+@dataclass(frozen=True)
+class ScatterOptions:
+    """to_primary: scatter over primary light behind the object; 0: fitted on air. reach: standard deviation of the kernel
+    over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
+
+    to_primary: float = 0.0
+    reach: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.fields_within("scatter.", self, {"to_primary": (0, 5), "reach": (0, 2)})
+
+
+def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
+    """Line integrals (F, v, u) without the scatter of a kernel {standard deviation as a share of the panel's longer side:
+    height}, float32."""
+    return -np.log(_primary(np.exp(-frames.astype(np.float64)), kernel)).astype(np.float32)
+
+
+def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
+    """The kernel, of the one width ``reach`` if that is not 0, that explains best the light of the pixels ``air`` of line
+    integrals (F, v, u) beyond 1."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _FITTED_FRAMES).round().astype(int))
+    recorded, where = np.exp(-frames[chosen].astype(np.float64)), air[chosen]
+    reaches = (reach,) if reach > 0 else _REACHES
+    kernel: Kernel = {}
+    for _ in range(_PASSES):
+        primary = _primary(recorded, kernel)
+        shapes = np.stack([_scattered(primary, width)[where] for width in reaches], axis=1)
+        kernel = dict(zip(reaches, map(float, scipy.optimize.nnls(shapes, recorded[where] - 1)[0]), strict=True))
+    return {width: height for width, height in kernel.items() if height > 0}
+
+
+def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """The scan without scatter."""
+    frames = unmasked_frames(scan)
+    if options.to_primary > 0:
+        reach = options.reach or _USUAL_REACH
+        kernel = {reach: _height_for(frames, options.to_primary, reach)}
+    else:
+        air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
+        kernel = fit_scatter(frames, air, options.reach)
+    clean = remove_scatter(frames, kernel)
+    facts = {"reach": list(kernel), "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
+    return replace(scan, projections=clean), facts
+
+
+def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
+    """The height that leaves this ratio, by bisection: the ratio grows with it."""
+    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, _FITTED_FRAMES).round().astype(int))]
+    low, high = 0.0, 20.0
+    for _ in range(20):
+        middle = (low + high) / 2
+        below = _ratio(chosen, remove_scatter(chosen, {reach: middle})) < to_primary
+        low, high = (middle, high) if below else (low, middle)
+    return (low + high) / 2
+
+
+def _ratio(before: np.ndarray, after: np.ndarray) -> float:
+    """Scatter over primary behind the object."""
+    shadow = after > _SHADOW * float(np.percentile(after, 99.9))
+    primary = float(np.exp(-after[shadow].astype(np.float64)).sum())
+    return float(np.exp(-before[shadow].astype(np.float64)).sum()) / max(primary, 1e-20) - 1
+
+
+def _primary(recorded: np.ndarray, kernel: Kernel) -> np.ndarray:
+    primary = recorded
+    for _ in range(_PASSES if kernel else 0):
+        scatter = sum(height * _scattered(primary, reach) for reach, height in kernel.items())
+        primary = np.maximum(recorded - scatter, _LEAST_PRIMARY * recorded)
+    return primary
+
+
+def _scattered(primary: np.ndarray, reach: float) -> np.ndarray:
+    source = primary * np.maximum(-np.log(np.maximum(primary, 1e-12)), 0)
+    sigma = reach * max(primary.shape[1:])
+    return scipy.ndimage.gaussian_filter(source, (0, sigma, sigma), mode="constant")

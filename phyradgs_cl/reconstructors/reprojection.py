@@ -1,0 +1,33 @@
+"""A scan's own reconstruction and reprojection, for steps that compare frames with what they say of the object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
+from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.prepare import Model
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+from phyradgs_cl.reconstructors.voxels.sart import OS_SART, sart
+from phyradgs_cl.runtime import Runtime
+
+_ITERATIONS = 5
+
+
+def reprojection(rt: Runtime, scan: Scan) -> Model:
+    """FDK and OS-SART with every line at the middle of its own exposure, and rays at the same times, on the scan's grid."""
+    motion = LineMiddles()
+    options = FdkOptions(window="hann", motion=motion)
+    tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
+    operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+
+    def volume(frames: np.ndarray) -> np.ndarray:
+        return fdk(replace(scan, projections=np.asarray(frames, np.float32)), options, rt).volume
+
+    def fitted() -> np.ndarray:
+        times = replace(OS_SART, motion=PerRow(sub_intervals=1), iterations=_ITERATIONS)
+        return sart(scan, times, rt).volume
+
+    return Model(volume, operator.forward, fitted)

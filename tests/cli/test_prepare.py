@@ -1,0 +1,69 @@
+"""phyradgs prepare: a file that says what was done to it, and bad input in one line that loses nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from phyradgs_cl.io import read_volume
+from phyradgs_cl.workflow import load_scan
+
+SPOILT = (
+    "--phantom", "jaw", "--size", "12", "--detector", "20", "--views", "8", "--time-samples", "2",
+    "--noise", "beer", "--rings", "0.02", "--sparks", "0.005", "--seed", "3",
+)  # fmt: skip
+
+
+def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys) -> None:
+    source, output = simulated(*SPOILT), tmp_path / "clean.h5"
+    assert cli.run(["prepare", str(source), "-o", str(output), "--json", "--set", "rings.window=5"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])["steps"]
+    assert [step["step"] for step in told] == ["sparks", "dead", "rings"] and told[0]["pixels"] > 0
+    before, after = load_scan(source), load_scan(output)
+    assert after.provenance["prepared"] == told and after.provenance["prepared_from"] == str(source)
+    assert (~after.valid).sum() == told[0]["pixels"] + told[1]["pixels"] * after.frames
+    assert np.abs(after.projections - before.projections).max() > 0.1
+    np.testing.assert_array_equal(after.reference, before.reference)
+    np.testing.assert_array_equal(after.frame_start_s, before.frame_start_s)
+    volume = tmp_path / "v.h5"
+    steps = ["--steps", "sparks,dead,rings", "--set", "rings.window=5"]
+    assert cli.run(["reconstruct", str(source), "-o", str(volume), "--method", "fdk", *steps]) == 0
+    direct = read_volume(volume)
+    assert cli.run(["reconstruct", str(output), "-o", str(volume), "--method", "fdk"]) == 0
+    np.testing.assert_allclose(direct.volume, read_volume(volume).volume, atol=1e-6)
+    assert [step["step"] for step in direct.provenance["prepared"]] == ["sparks", "dead", "rings"]
+
+
+def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) -> None:
+    config = tmp_path / "steps.toml"
+    config.write_text('steps = "rings"\n[rings]\nmethod = "few"\nwindow = 5\n')
+    command = ["prepare", str(simulated(*SPOILT)), "-o", str(tmp_path / "clean.h5"), "--config", str(config), "--json"]
+    assert cli.run(command) == 0
+    (step,) = json.loads(capsys.readouterr().out.splitlines()[-1])["steps"]
+    assert step["options"] == {"method": "few", "window": 5}
+
+
+def test_bad_input_is_one_line_and_loses_nothing(refused, simulated, tmp_path) -> None:
+    source, output = simulated(*SPOILT), tmp_path / "clean.h5"
+    output.write_bytes(b"what was there before")
+    flooded = tmp_path / "flooded.h5"
+    flooded.write_bytes(Path(source).read_bytes())
+    with h5py.File(flooded, "r+") as file:
+        file["entry/instrument/detector/data"][...] += 2
+    for words, parts in (
+        (["--steps", "ring"], ("--steps", "did you mean 'rings'")),
+        (["--steps", ""], ("--steps", "found none")),
+        (["--set", "scatter.reach=0.1"], ("--set scatter.reach=0.1", "scatter among the steps")),
+        (["--steps", "rings", "--set", "rings.windows=3"], ("rings.windows", "did you mean 'window'")),
+        (["--set", "iterations=3"], ("--set iterations=3", "no such option")),
+        (["--set", "flats=time"], ("flats=time", "attenuation with 0 flats", "flats=mean")),
+        (["-o", source], ("-o", "the input file")),
+    ):
+        refused(["prepare", source, "-o", output, *words], *parts)
+    for step, part in (("air", "pixels of air"), ("scatter", "state scatter.to_primary"), ("hardening", "hardening")):
+        refused(["prepare", flooded, "-o", output, "--steps", step], f"--steps {step}", part)
+    assert output.read_bytes() == b"what was there before"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["clean.h5", "flooded.h5"]

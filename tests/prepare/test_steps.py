@@ -1,0 +1,197 @@
+"""Every step against the effect that it undoes, planted in a fly-scan; and on the scan without it, which it leaves alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.detector import tube_spectrum
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare import (
+    STEPS,
+    TOLD,
+    find_dead,
+    find_sparks,
+    remove_scatter,
+    ring_pattern,
+    sort_rings,
+    straighten,
+    water_polynomial,
+)
+from phyradgs_cl.prepare.surroundings import surrounding_grid
+from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.reconstructors.preprocess import prepared
+from phyradgs_cl.reconstructors.reprojection import reprojection
+
+LOST_DB = 0.05
+# effect, step, its options, least share of the loss that FDK gets back on this small scan
+CASES = (
+    ({"sparks": 1e-3}, "sparks", {}, 0.6),
+    ({"rings": 0.05}, "rings", {}, 0.4),
+    ({"scatter": 0.3}, "scatter", {}, 0.6),
+    ({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}, 0.75),
+    ({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}, 0.6),
+)
+
+
+def psnr_db(rt, scan: Scan, steps: str = "", **options: object) -> float:
+    volume = reconstruct(scan, "fdk", motion="per-row", steps=steps, device=rt, **options).volume
+    return float(compare(volume, scan.reference)["psnr_db"])
+
+
+@pytest.mark.parametrize(("effect", "step", "options", "share"), CASES, ids=lambda case: str(case))
+def test_a_step_gives_back_what_its_effect_took(rt, planted, effect, step, options, share) -> None:
+    clean, spoilt = psnr_db(rt, planted()), psnr_db(rt, planted(**effect))
+    found = psnr_db(rt, planted(**effect), step, **options)
+    assert spoilt < clean - 0.3, "nothing to give back"
+    assert found - spoilt > share * (clean - spoilt), (clean, spoilt, found)
+
+
+def test_steps_that_look_for_their_effect_leave_a_clean_scan_alone(rt, planted) -> None:
+    for noise in ("beer", "none"):
+        effects = {} if noise == "beer" else {"noise": "none", "dose": None}
+        clean = planted(**effects)
+        before = psnr_db(rt, clean)
+        for step in ("sparks", "dead", "scatter", "air", "rings"):
+            assert psnr_db(rt, clean, step) > before - LOST_DB, (step, noise)
+
+
+def test_sparks_are_found_one_by_one(planted) -> None:
+    clean, spoilt = planted().projections, planted(sparks=1e-3).projections
+    hit = np.abs(spoilt - clean) > 1e-6
+    found = find_sparks(spoilt)
+    assert not (found & ~hit).any() and not find_sparks(clean).any()
+    assert (found & hit).sum() > 0.9 * hit.sum()
+    masked = prepared(planted(sparks=1e-3), InputOptions(steps="sparks"))
+    assert (masked.valid == ~found).all()
+    assert np.abs(masked.projections - clean)[found].mean() < 0.2 * np.abs(spoilt - clean)[found].mean()
+
+
+def test_dead_pixels_and_lines_are_masked_and_filled_in(rt, planted) -> None:
+    clean = planted()
+    p = clean.projections.copy()
+    p[:, 20, 11], p[:, 12, 9], p[:, 5, :], p[:, :, 33] = 0.0, 9.0, 0.7, -0.5
+    wanted = np.zeros(p.shape[1:], bool)
+    wanted[20, 11] = wanted[12, 9] = wanted[5] = wanted[:, 33] = True
+    spoilt = replace(clean, projections=p)
+    found = prepared(spoilt, InputOptions(steps="dead"))
+    assert (find_dead(p) == wanted).all() and (~found.valid.any(0) == wanted).all()
+    told = found.provenance[TOLD][0]
+    assert (told["step"], told["rows"], told["columns"]) == ("dead", 1, 1)
+    assert np.abs(found.projections - clean.projections)[:, wanted].mean() < 0.1
+    assert psnr_db(rt, spoilt, "dead") > psnr_db(rt, clean) - 1 > psnr_db(rt, spoilt) + 1
+    assert not find_dead(p[:4]).any(), "too few frames to tell"
+
+
+def test_the_pattern_of_gains_is_what_was_planted(planted) -> None:
+    clean, spoilt = planted().projections, planted(rings=0.05).projections
+    true = (spoilt - clean).mean(0)
+    found = ring_pattern(spoilt)
+    assert np.std(true - found) < 0.7 * np.std(true) and np.std(ring_pattern(clean)) < 0.1 * np.std(true)
+
+
+def test_sorting_takes_a_column_out_of_many_views() -> None:
+    """A disc off the axis, which passes every pixel of the middle: a gain's stripe there is gone, and little else
+    changes."""
+    angle, u = np.linspace(0, 2 * np.pi, 720, endpoint=False), np.arange(64) - 31.5
+    distance = u[None] - 14 * np.cos(angle)[:, None]
+    clean = 2 * np.sqrt(np.maximum(12**2 - distance**2, 0))[:, None].astype(np.float32) / 12
+    spoilt = clean.copy()
+    spoilt[:, :, 25] += 0.1
+    found, untouched = (np.abs(sort_rings(frames) - clean).mean((0, 1)) for frames in (spoilt, clean))
+    assert found[25] < 0.04 and untouched.mean() < 0.02, (found[25], untouched.mean())
+
+
+def test_air_takes_the_drift_of_the_light_out(rt, planted) -> None:
+    scan = planted(drift=0.1)
+    found = prepared(scan, InputOptions(steps="air"))
+    corner = np.s_[:, :4, :4]
+    assert np.abs(scan.projections[corner].mean((1, 2))).max() > 0.08
+    assert np.abs(found.projections[corner].mean((1, 2))).max() < 0.005
+    low, high = found.provenance[TOLD][0]["light"]
+    assert low < 0.95 or high > 1.05
+
+
+def test_scatter_and_polynomials_in_closed_form() -> None:
+    p = np.zeros((2, 40, 60), np.float32)
+    p[:, 10:30, 20:40] = 2.0
+    clean = remove_scatter(p, {0.2: 0.5})
+    assert (clean[:, 12:28, 22:38] > 2.05).all() and (clean >= p - 1e-6).all()
+    np.testing.assert_array_equal(remove_scatter(p, {}), p)
+    np.testing.assert_allclose(straighten(np.array([2.0, -1.0]), (0.5, 0.25, 0.0)), [2 + 2 + 2, -1])
+    water = np.linspace(0.1, 6, 50)
+    seen = tube_spectrum(120.0).hardened(water)
+    assert (seen < water).all() and seen[-1] < 0.95 * water[-1]
+    np.testing.assert_allclose(straighten(seen, water_polynomial(120.0)), water, rtol=2e-3)
+
+
+def test_one_material_says_its_own_polynomial(rt, planted) -> None:
+    """A ball of water: its path through the volume tells how line integrals bend; an object of many is refused."""
+    scan = simulate("spheres", size=24, detector=36, views=40, exposure_deg=7.0, peak=4.0, device=rt)
+    z, y, x = np.mgrid[:24, :24, :24] - 11.5
+    ball = (x**2 + y**2 + z**2 < 81).astype(np.float32)
+    true = reprojection(rt, scan).frames(ball)
+    true *= 5 / true.max()
+    straight = replace(scan, projections=true, reference=None)
+    bent = replace(straight, projections=tube_spectrum(120.0).hardened(true).astype(np.float32))
+    found = prepared(bent, InputOptions(steps="hardening"), rt).projections
+    error, before = (np.sqrt(np.mean((f - true) ** 2)) for f in (found, bent.projections))
+    assert error < 0.7 * before, (error, before)
+    with pytest.raises(InputError, match="hardening.kvp"):
+        prepared(planted(kvp=120.0), InputOptions(steps="hardening"), rt)
+
+
+def test_all_effects_together(rt, planted) -> None:
+    effects = {"sparks": 1e-3, "rings": 0.02, "drift": 0.02, "scatter": 0.3, "kvp": 120.0}
+    steps = "rings,hardening,air,scatter,sparks"
+    clean, spoilt = psnr_db(rt, planted()), psnr_db(rt, planted(**effects))
+    found = psnr_db(rt, planted(**effects), steps, hardening={"kvp": 120.0})
+    assert found - spoilt > 0.5 * (clean - spoilt), (clean, spoilt, found)
+
+
+def test_steps_keep_their_order_and_are_told(rt, planted) -> None:
+    result = reconstruct(planted(), "fdk", steps="rings, sparks", rings={"window": 5}, device=rt)
+    told = result.facts[TOLD]
+    assert [line["step"] for line in told] == ["sparks", "rings"] and told[1]["options"]["window"] == 5
+    again = prepared(prepared(planted(), InputOptions(steps="sparks")), InputOptions(steps="rings"))
+    assert [line["step"] for line in again.provenance[TOLD]] == ["sparks", "rings"]
+    facts = input_options({"steps": "rings", "rings": {"window": 5}}).facts()
+    assert input_options(facts) == InputOptions(steps="rings", rings=replace(InputOptions().rings, window=5))
+
+
+def test_what_is_no_step_or_no_option_of_one(planted) -> None:
+    full = replace(planted(), projections=planted().projections + 1)
+    cases = (
+        (lambda: InputOptions(steps="spark"), "did you mean 'sparks'"),
+        (lambda: input_options({"rings": {"window": 5}}), "rings among the steps"),
+        (lambda: input_options({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
+        (lambda: input_options({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
+        (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
+        (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 80, "polynomial": [1, 0, 0]}}), "one of the two"),
+        (lambda: prepared(full, InputOptions(steps="air")), "pixels of air"),
+        (lambda: prepared(full, InputOptions(steps="scatter")), "scatter.to_primary"),
+        (lambda: prepared(full, InputOptions(steps="hardening")), "without a device"),
+    )
+    for call, told in cases:
+        with pytest.raises(InputError, match=told):
+            call()
+    assert set(STEPS) <= set(vars(InputOptions()))
+
+
+def test_a_part_of_the_object_is_freed_of_what_surrounds_it(rt, planted) -> None:
+    """Voxels of the middle half by OS-SART: what lies beyond no longer ends up in them; the grid holds whole coarse
+    voxels."""
+    scan = planted()
+    half = scan.grid.part((7, 7, 7), (14, 14, 14))
+    roi_mm = tuple(float(end) for end in half.box_mm.ravel())
+    truth = scan.on_grid(half).reference
+    usual = {"motion": "per-row", "iterations": 5, "roi_mm": roi_mm, "device": rt}
+    plain, freed = (reconstruct(scan, "os-sart", steps=steps, **usual).volume for steps in ("", "surroundings"))
+    errors = [float(np.sqrt(np.mean((volume - truth) ** 2))) for volume in (plain, freed)]
+    assert errors[1] < 0.5 * errors[0], errors
+    about, inside = surrounding_grid(half, 2.0, 2.0)
+    assert about.part(tuple(s.start for s in inside), (7, 7, 7)).box_mm == pytest.approx(half.box_mm)
