@@ -2,6 +2,9 @@
    sums that the chain rule needs. Gathers only, no atomics: results repeat bit for bit.
    splat_backward_rows: one work-item per Gaussian, vectors along its lines (CPUs).
    splat_backward_group: GROUP work-items share the pixels of a Gaussian (GPUs). */
+#if GROUP > 1
+#define SPLAT_SPACE __local
+#endif
 #include "common/footprint.h"
 #include "common/splat_sums.h"
 
@@ -78,6 +81,7 @@ ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int 
 }
 #endif
 
+#if GROUP == 1
 typedef struct { splat_sums sums; __global const float *image; int pitch; float limit; } gatherer;
 
 ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
@@ -89,6 +93,7 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
 
 #define VISITOR gatherer
 #include "common/footprint_walk.h"
+#endif
 
 #define ARGUMENTS                                                                                                    \
     __global const float *records,    /* (stride, C, RECORD) */                                                      \
@@ -123,16 +128,20 @@ __kernel void splat_backward_rows(ARGUMENTS)
 __kernel void splat_backward_group(ARGUMENTS)
 {
     const int g = (int)get_group_id(0), item = (int)get_local_id(0);
-    __local float tree[SUM_COUNT * GROUP];
+    __local float tree[SUM_COUNT * GROUP], rec[RECORD], cell[CELL];
+    __local const int *whole = (__local const int *)rec;
     if (g >= count)
         return;
     for (int c = 0; c < cell_count; ++c) {
         const size_t at = (size_t)g * cell_count + c;
         if (!seen[at])
             continue;
-        __global const float *rec = records + at * RECORD, *cell = cells + c * CELL;
+        for (int f = item; f < RECORD; f += GROUP)
+            rec[f] = records[at * RECORD + f];
+        for (int f = item; f < CELL; f += GROUP)
+            cell[f] = cells[c * CELL + f];
+        barrier(CLK_LOCAL_MEM_FENCE);
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
-        __global const int *whole = (__global const int *)rec;
         __global const float *image = images + LAYER_AT(cell, lines, pitch);
         const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
         const int span = whole[REC_U_HI] - whole[REC_U_LO] + 1;

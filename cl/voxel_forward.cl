@@ -1,7 +1,13 @@
 /* Voxeliser: every tile of voxels sums its list of Gaussians. A work-item owns rows of x (BLOCK_PIXEL 0) or
-   one voxel (BLOCK_PIXEL 1, where a work-group runs along x). */
+   voxels along z (BLOCK_PIXEL 1), where a work-group owns a tile, tile.x by tile.y items, and reads its records once. */
+#if BLOCK_PIXEL
+#define VOXEL_SPACE __local
+#endif
 #include "common/tile.h"
 #include "common/voxel.h"
+
+#define STAGED 32 /* Gaussians that a group reads at a time */
+#define DEPTH 8   /* voxels of a work-item: tile.z */
 
 __kernel void voxel_forward(
     __global const float *records, __global const int *starts, __global const int *entries,
@@ -11,26 +17,41 @@ __kernel void voxel_forward(
 {
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
 #if BLOCK_PIXEL
-    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
-    if (x >= pitch)
-        return;
-    const size_t at = IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch + x;
-    if (x >= shape.x) {
-        volume[at] = 0.0f;
-        return;
+    __local float records_here[STAGED * VOXEL_RECORD];
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_group_id(2) * DEPTH;
+    const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
+    const int items = (int)(get_local_size(0) * get_local_size(1));
+    const int t = ((int)get_group_id(2) * tiles.y + (int)get_group_id(1)) * tiles.x + (int)get_group_id(0);
+    const int fits = starts[t + 1] <= capacity;
+    const int first = fits ? starts[t] : 0, listed = fits ? starts[t + 1] - first : count;
+    float sum[DEPTH] = {0.0f};
+    for (int done = 0; done < listed; done += STAGED) {
+        const int here = min(STAGED, listed - done);
+        barrier(CLK_LOCAL_MEM_FENCE); /* all have read what was there */
+        for (int f = item; f < here * VOXEL_RECORD; f += items) {
+            const int e = done + f / VOXEL_RECORD;
+            records_here[f] = records[(size_t)(fits ? entries[first + e] : e) * VOXEL_RECORD + f % VOXEL_RECORD];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int k = 0; k < here; ++k) {
+            __local const float *rec = records_here + k * VOXEL_RECORD;
+            __local const int *whole = (__local const int *)rec;
+            if (x < whole[VOX_LO] || x > whole[VOX_HI] || y < whole[VOX_LO + 1] || y > whole[VOX_HI + 1])
+                continue;
+#pragma unroll
+            for (int d = 0; d < DEPTH; ++d)
+                if (z_first + d >= whole[VOX_LO + 2] && z_first + d <= whole[VOX_HI + 2]) {
+                    const voxel_row r = voxel_row_at(rec, y, z_first + d);
+                    sum[d] += voxel_value(r, voxel_dx(r, x), 1.0f, limit);
+                }
+        }
     }
-    const int t = ((z / tile.z) * tiles.y + y / tile.y) * tiles.x + x / tile.x;
-    float sum = 0.0f;
-    FOR_LISTED(g, starts, entries, t, capacity, count) {
-        __global const float *rec = records + (size_t)g * VOXEL_RECORD;
-        __global const int *whole = (__global const int *)rec;
-        if (x < whole[VOX_LO] || x > whole[VOX_HI] || y < whole[VOX_LO + 1] || y > whole[VOX_HI + 1] ||
-            z < whole[VOX_LO + 2] || z > whole[VOX_HI + 2])
-            continue;
-        const voxel_row r = voxel_row_at(rec, y, z);
-        sum += voxel_value(r, voxel_dx(r, x), 1.0f, limit);
-    }
-    volume[at] = sum;
+    if (x >= shape.x || y >= shape.y)
+        return;
+#pragma unroll
+    for (int d = 0; d < DEPTH; ++d)
+        if (z_first + d < shape.z)
+            volume[IMAGE_GUARD + ((size_t)(z_first + d) * shape.y + y) * pitch + x] = sum[d];
 #else
     const int t = (int)get_global_id(0);
     if (t >= tiles.y * tiles.z)

@@ -2,6 +2,10 @@
    value = density exp(-|U D|^2 / 2), U upper triangular. */
 #include "common/falling_exp2.h"
 
+#ifndef VOXEL_SPACE
+#define VOXEL_SPACE __global /* where records are read from */
+#endif
+
 #define VOXEL_RECORD 20
 #define VOX_REST 0      /* 3: centre minus its nearest voxel, x y z */
 #define VOX_U11 3
@@ -18,9 +22,9 @@
 /* a Gaussian on one row of voxels */
 typedef struct { float u11, a0, k, density, dy, dz, x_rest; int x_whole; } voxel_row;
 
-ALWAYS_INLINE voxel_row voxel_row_at(__global const float *rec, const int y, const int z)
+ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *rec, const int y, const int z)
 {
-    __global const int *whole = (__global const int *)rec;
+    VOXEL_SPACE const int *whole = (VOXEL_SPACE const int *)rec;
     voxel_row r;
     r.dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
     r.dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];

@@ -50,17 +50,6 @@ from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.prepare import (
-    find_air,
-    find_dead,
-    find_sparks,
-    fit_scatter,
-    remove_scatter,
-    ring_pattern,
-    sort_rings,
-    straighten,
-    water_polynomial,
-)
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 
 __all__ = [
@@ -94,10 +83,6 @@ __all__ = [
     "as_torch",
     "calibrate",
     "compare",
-    "find_air",
-    "find_dead",
-    "find_sparks",
-    "fit_scatter",
     "fly_scan",
     "initial_gaussians",
     "load_scan",
@@ -105,16 +90,11 @@ __all__ = [
     "prepare",
     "ray_operator",
     "reconstruct",
-    "remove_scatter",
-    "ring_pattern",
     "save_scan",
     "save_volume",
     "simulate",
-    "sort_rings",
     "splat_operator",
     "static_scan",
-    "straighten",
     "voxel_operator",
     "voxelise",
-    "water_polynomial",
 ]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
+from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
 
@@ -26,5 +27,6 @@ def calibrate(
     Raises InputError for names that there are not, timing of a gantry that stands still, fewer than 8 frames or 12 columns,
     and others that do not fit the first.
     """
+    check_scan(scan)
     scan.check_timing()
     return run_calibration(scan, runtime_of(device), what, others)

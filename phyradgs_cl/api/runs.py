@@ -120,6 +120,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     stands in the scan's provenance, under ``prepared``. Raises InputError for what is no step or option, or a scan that does
     not show what a step looks for.
     """
+    check_scan(scan)
     return prepared(scan, input_options({"steps": steps, **options}), runtime_of(device))
 
 

@@ -231,7 +231,7 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
     ) -> None:
-        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group`` (1 on further axes)."""
+        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return

@@ -232,7 +232,19 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: VOLUME.plot("scan.h5"), "scan: found 'scan.h5'"),
         (lambda: VOLUME.plot(GOOD, frame=9), "frame: found 9"),
     ],
+    "calibrate": [
+        (lambda: api.calibrate("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
+        (lambda: api.calibrate(GOOD, "rol"), "rol"),
+        (lambda: api.calibrate(GOOD), "4 frames|12 columns|8 frames|columns"),
+    ],
+    "prepare": [
+        (lambda: api.prepare("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
+        (lambda: api.prepare(GOOD, "spark"), "spark"),
+        (lambda: api.prepare(GOOD, "rings", rings={"windo": 3}), "windo"),
+    ],
     "reconstruct": [
+        (lambda: reconstruct(GOOD, "sirt", initial=np.zeros((2, 3))), "initial: found shape"),
+        (lambda: reconstruct(GOOD, "fdk", initial=VOLUME), "--initial: found --method fdk"),
         (
             lambda: reconstruct("scan.h5"),
             "scan: found 'scan.h5'; expected a Scan; read a file with load_scan",
@@ -325,7 +337,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "as_torch": [(lambda: api.as_torch(3), "torch|operator")],
 }
 # what is raised, reported or only described: there is nothing to give it
-NO_INPUT = {"InputError", "PhyradgsError", "Progress", "Trajectory"}
+NO_INPUT = {"Calibration", "InputError", "PhyradgsError", "Progress", "Trajectory"}
 
 
 def test_every_name_has_a_case() -> None:

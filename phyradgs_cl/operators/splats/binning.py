@@ -6,7 +6,8 @@ import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512
+_CHUNK, _SHORT_CHUNK = 512, 32  # splats that a work-item counts on a CPU, and on a GPU where counts stay few
+_MANY_COUNTS = 1 << 22
 _SLACK = 1.5  # entries that there is memory for, over those of a build that was looked at
 _NEAR = 1.25  # grow before they outgrow it
 _MOST_ENTRIES = 2**31 - 1  # indices of entries are ints
@@ -43,14 +44,15 @@ class TileLists:
         Raises MemoryShortage for 2^31 entries or more, which smaller bricks of a volume may not have.
         """
         rt = self.rt
-        chunks = chunks_of(count)
+        chunk = chunk_of(rt, self.total, count)
+        chunks = max(-(-count // chunk), 1)
         if self._counts.size < self.total * chunks:
             self._counts = rt.empty(1, np.int32)  # the old goes before the new comes
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = (
             np.int32(stride),
             np.int32(count),
-            np.int32(_CHUNK),
+            np.int32(chunk),
             np.int32(chunks),
             self.tile,
             self.tiles,
@@ -88,9 +90,9 @@ class TileLists:
             self._needed = rt.read_item_later(self.starts, self.total)
 
     @staticmethod
-    def bytes(tiles: int, count: int) -> int:
+    def bytes(rt: Runtime, tiles: int, count: int) -> int:
         """What lists of ``count`` splats take beside their entries."""
-        return 4 * (tiles + 1 + tiles * chunks_of(count))
+        return 4 * (tiles + 1 + tiles * max(-(-count // chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:
         """Memory for ``needed`` entries and more, unless there is enough for ``share`` times as many."""
@@ -103,6 +105,9 @@ class TileLists:
             self.entries = self.rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
 
 
-def chunks_of(count: int) -> int:
-    """Parts in which splats are counted, each by one work-item."""
-    return max(-(-count // _CHUNK), 1)
+def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
+    """Splats that one work-item counts, one after the other: a GPU has more work-items than there are long chunks."""
+    chunk = _SHORT_CHUNK if rt.pixel_items else _CHUNK
+    while chunk < _CHUNK and tiles * -(-count // chunk) > _MANY_COUNTS:
+        chunk *= 2
+    return chunk

@@ -52,10 +52,10 @@ class Voxeliser:
         rt = self.rt
         self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
-        nz, ny, _ = self.shape
+        nz, ny, nx = self.shape
         rt.launch(
             self._forward,
-            (self.pitch, ny, nz) if self.by_pixel else self.lists.total,
+            (nx, ny, -(-nz // _TILE_ROWS)) if self.by_pixel else self.lists.total,
             self._records,
             self.lists.starts,
             self.lists.entries,
@@ -67,7 +67,7 @@ class Voxeliser:
             self.lists.tiles,
             self.cutoff2,
             self.volume,
-            group=16 if self.by_pixel else 1,
+            group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1,
         )
         return self.volume
 
@@ -181,7 +181,7 @@ def _in_bricks(
         voxels_bytes = 4 * (2 * GUARD + nz * ny * pitch_of(nx))
         if voxels_bytes > brick_bytes and nz * ny > 1:
             return (room.free_bytes + 1,)  # more than was asked for
-        lists_bytes = TileLists.bytes(int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
+        lists_bytes = TileLists.bytes(rt, int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
         entries_bytes = lists_bytes  # how many there are is known when they are counted
         return voxels_bytes, lists_bytes, entries_bytes, records_bytes
 
