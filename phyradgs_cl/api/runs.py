@@ -116,6 +116,7 @@ def simulate(
 def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **options: Any) -> Scan:
     """The scan without what the panel and the beam did to it, by the steps of docs/prepare.md, names with commas between.
 
+    Line integrals (F, rows, columns), dimensionless, go in and come out. device: what ``--device`` takes, or a Runtime.
     options: tables of the steps' own (``rings={"window": 11}``), and what else comes before every method. What each step did
     stands in the scan's provenance, under ``prepared``. Raises InputError for what is no step or option, or a scan that does
     not show what a step looks for.

@@ -33,7 +33,8 @@ class Calibration:
     """``scan``: with what was corrected, all else as it was. parameters: a line each. alike: combinations that leave no
     trace of their own, in words. residual_rms: of the frames before and after, dimensionless, at the finest level, whose
     residuals ``before`` and ``after`` (F, rows, columns) are kept for a picture. views: their own turns and shifts, where
-    some were found; the table has the root mean square of each kind, with the deviation of a single one."""
+    some were found; the table has the root mean square of each kind, with the deviation of a single one. Lengths are in mm,
+    angles in degrees, times in s. ``calibrate`` makes it, and raises InputError where it cannot."""
 
     scan: Scan
     parameters: list[Found]
@@ -45,6 +46,7 @@ class Calibration:
 
     @property
     def corrected(self) -> list[Found]:
+        """The parameters that were put right."""
         return [one for one in self.parameters if one.verdict == CORRECTED]
 
     def facts(self) -> dict[str, object]:
