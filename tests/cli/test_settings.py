@@ -88,7 +88,7 @@ def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
 
 
 def test_a_method_offers_only_what_it_has() -> None:
-    for method, offered in (("fdk", "window, motion"), ("sart", "motion, strips, sub_intervals")):
+    for method, offered in (("fdk", "window, extrapolate, motion"), ("sart", "motion, strips, sub_intervals")):
         with pytest.raises(InputError) as caught:
             method_options(method, None, {"length": 1})
         assert caught.value.expected.endswith(offered)
