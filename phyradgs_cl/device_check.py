@@ -25,6 +25,7 @@ from phyradgs_cl.objective import (
     parameter_loss,
     total_variation,
 )
+from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.tv_descent import TvDescent, tv_descent
 from phyradgs_cl.objective.tv_prox import TvProx, tv_prox
 from phyradgs_cl.operators import (
@@ -243,6 +244,7 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     yield TvDescent(rt, GRID.shape)(volume, 0.1, 2), tv_descent(volume, 0.1, 2), VALUE
     found = TvProx(rt, GRID.shape)(volume, 0.2, 4, nonnegative=True)
     yield found, tv_prox(volume, 0.2, 4, nonnegative=True), VALUE
+    yield DctProx(rt, GRID.shape)(volume, 0.2, nonnegative=True), dct_prox(volume, 0.2, nonnegative=True), VALUE
 
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:

@@ -129,4 +129,4 @@ RANK_VOLUME = 1e-5
 # --- voxel methods on the device -------------------------------------------------------------------------------
 # relative L2 to the same lines over NumPy's arrays: rounding of single operations (1e-7), which steps of a fixed length
 # down a gradient of unit vectors do not damp
-RESIDENT = dict.fromkeys(("sart", "os-sart", "sirt", "cgls", "fista-tv"), 1e-6) | {"asd-pocs": 2e-4}
+RESIDENT = dict.fromkeys(("sart", "os-sart", "sirt", "cgls", "fista", "fista-tv"), 1e-6) | {"asd-pocs": 2e-4}

@@ -134,7 +134,7 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
         for options in OPTIONS:
             found[f"splats {model} {options}"] = partial(splats, model=model, options=options)
     for name in [name for name in METHODS if name not in NEURAL]:
-        for motion in ("static", "exact" if name in SPLATTING else "per-row"):
+        for motion in ("static", "exact" if name in (*SPLATTING, "fused") else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
     return found
 

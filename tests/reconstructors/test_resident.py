@@ -19,7 +19,7 @@ from phyradgs_cl.runtime import DeviceSpace, Runtime, Traffic
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
-ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")
+ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista", "fista-tv")
 MOST_BYTES, MOST_WAITS = 1024, 8  # over the bus in an iteration, however many subsets it has
 MODELS = ("log", "intensity")
 GRID = Grid.cube(20, 2.0)
@@ -39,7 +39,7 @@ def scan() -> Scan:
 
 def options_of(method: str, model: str, iterations: int = 4):
     changes = {"motion": "per-row", "sub_intervals": 2, "iterations": iterations, "detector_model": model}
-    if method in ("sart", "fista-tv"):
+    if method in ("sart", "fista", "fista-tv"):
         changes["transmission_weights"] = True
     if method == "cgls":
         changes["noise_stop"] = 0
