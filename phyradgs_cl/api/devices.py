@@ -11,7 +11,9 @@ Device = str | Runtime | None
 
 def runtime_of(device: Device) -> Runtime:
     """The Runtime for what ``--device`` takes; None is the best device."""
-    return device if isinstance(device, Runtime) else _runtime_by_name(device)
+    if isinstance(device, Runtime):
+        return device
+    return _runtime_by_name(None if device is None else str(device))
 
 
 @lru_cache(maxsize=4)

@@ -69,7 +69,7 @@ def own_method(name: str, function: Any) -> Method:
 
     def run(scan: Scan, options: Any, rt: Runtime, **given: Any) -> Reconstruction:
         started = time.perf_counter()
-        made = function(scan, options, rt, **{key: value for key, value in given.items() if key in takes})
+        made = function(scan, options, rt, **{key: given.get(key) for key in takes})
         seconds = time.perf_counter() - started
         facts = {"method": name, "options": _plain(option_facts(options)), "seconds": seconds}
         result = _result(culprit, made, scan)

@@ -284,7 +284,10 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
             r"result: .*for an array, Reconstruction\(volume, grid\)",
         ),
     ],
-    "compare": [(lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3))), "shape")],
+    "compare": [
+        (lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3))), "shape"),
+        (lambda: api.compare(VOLUME.volume, GOOD), "reference: found a Scan; expected an array"),
+    ],
     "ray_operator": [
         (lambda: ray_operator(GOOD, "exact"), "--motion: found Exact.*PerRow"),
         (lambda: ray_operator("scan.h5"), "scan: found 'scan.h5'; expected a Scan; read a file with load_scan"),

@@ -29,6 +29,11 @@ def peak_megabytes() -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
 
 
+def reset_peak() -> None:
+    """``peak_megabytes`` counts from now on."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
 def cpu_s() -> float:
     """Of this process. The one that tries HDF5 files has a limit of its own, and lives on from file to file."""
     use = resource.getrusage(resource.RUSAGE_SELF)
@@ -76,7 +81,7 @@ def main() -> None:
     work, answers = WORK[sys.argv[1]], os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     for line in sys.stdin:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from now on
+        reset_peak()
         before_s, before_wall_s = cpu_s(), time.monotonic()
         answer = work(json.loads(line))
         seconds = min(cpu_s() - before_s, time.monotonic() - before_wall_s)
