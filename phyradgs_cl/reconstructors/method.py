@@ -67,9 +67,13 @@ def own_method(name: str, function: Any) -> Method:
     takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     takes = {key for key in ("seed", "report", "resume") if takes_all or key in parameters}
 
+    is_asked = "resume" in parameters and parameters["resume"].default is inspect.Parameter.empty
+    without = {"resume": None} if is_asked else {}
+
     def run(scan: Scan, options: Any, rt: Runtime, **given: Any) -> Reconstruction:
         started = time.perf_counter()
-        made = function(scan, options, rt, **{key: given.get(key) for key in takes})
+        told = {**without, **given}
+        made = function(scan, options, rt, **{key: value for key, value in told.items() if key in takes})
         seconds = time.perf_counter() - started
         facts = {"method": name, "options": _plain(option_facts(options)), "seconds": seconds}
         result = _result(culprit, made, scan)
