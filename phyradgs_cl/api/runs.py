@@ -164,7 +164,8 @@ def reconstruct(
     _check_reconstruct(scan, grid, report, on_interrupt, seed)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
-    given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options}
+    own = {f.name for f in fields(method_options(method, preset))}  # go before the frames' of the same name
+    given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options and f.name not in own}
     chosen = method_options(method, preset, options)
     before = input_options(given)
     more: dict[str, Any] = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
