@@ -35,6 +35,7 @@ class ConeGeometry:
         counts = checks.numbers("detector_shape", self.detector_shape, (2,))
         if (counts < 1).any() or (counts != np.floor(counts)).any():
             raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
+        object.__setattr__(self, "detector_shape", (int(counts[0]), int(counts[1])))
         _positive_mm("pixel_size_mm", self.pixel_size_mm, (2,))
         checks.numbers("detector_offset_mm", self.detector_offset_mm, (2,))
 

@@ -93,7 +93,9 @@ class Operator:
             raise InputError("frames", repr(self), "an operator from something to frames")
         count = self._range[1][0]
         numbers = list(chosen) if isinstance(chosen, Sequence | np.ndarray) else chosen
-        known = isinstance(numbers, list) and all(isinstance(f, int | np.integer) and 0 <= f < (count or 0) for f in numbers)
+        known = isinstance(numbers, list) and all(
+            isinstance(f, int | np.integer) and not isinstance(f, bool) and 0 <= f < (count or 0) for f in numbers
+        )
         if not known or not numbers:
             raise InputError("frames", checks.shown(numbers), f"at least one whole number from 0 to {(count or 0) - 1}")
         return self._frames([int(f) for f in numbers])

@@ -106,6 +106,8 @@ def simulate(
 
     Raises InputError for what there is not, or what is out of range.
     """
+    if not isinstance(phantom, str | Path):
+        raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
     described = scanner_for(scanner, detector)
     chosen = scanner_options(described, protocol, **options)
     of = str(phantom) if phantom in PHANTOMS else load_attenuation(phantom)

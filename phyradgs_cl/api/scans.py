@@ -142,6 +142,9 @@ def _pixels(
     own = np.asarray(mask) != 0
     if own.shape not in (panel, values.shape):
         raise InputError("mask", f"shape {own.shape}", f"{panel} or {values.shape}")
+    if own.all():
+        expected = "non-zero where a pixel must not be used"
+        raise InputError("mask", "every pixel masked", expected, "turn it round")
     return replace(found, mask=own if found.mask is None else own | found.mask)
 
 

@@ -56,7 +56,8 @@ class Gaussians:
 
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> Gaussians:
-        """From (11, G) rows."""
+        """From (11, G) rows; InputError for another shape."""
+        checks.shape("rows", rows, (11, None))
         return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
 
     def scaled(self, length: float, density: float) -> Gaussians:

@@ -111,6 +111,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "fly_scan": [
         (lambda: fly(FRAMES[0]), r"frames: found shape \(6, 8\); expected shape \(any, 6, 8\)"),
         (lambda: fly(FRAMES[:0]), "frames: found no frame"),
+        (lambda: fly(mask=np.ones((6, 8))), "mask: found every pixel masked"),
         (lambda: fly(NAN), "pixels: found no usable value"),
         (lambda: fly("frames.npy"), "frames: found 'frames.npy'; expected numbers"),
         (lambda: fly(geometry=(5.0, 7.0)), r"geometry: found \(5.0, 7.0\); expected a ConeGeometry"),
@@ -220,6 +221,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: Grid.cube(0, 2.0), "count: found 0"),
     ],
     "Gaussians": [
+        (lambda: Gaussians.from_rows(np.zeros((10, 5))), r"rows: found shape \(10, 5\)"),
         (
             lambda: Gaussians(np.zeros((2, 3)), np.ones((2, 3)), np.ones((2, 3)), np.ones(2)),
             "quaternion: found shape",
@@ -264,6 +266,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     ],
     "simulate": [
         (lambda: api.simulate("elbow"), "elbow"),
+        (lambda: api.simulate(np.ones((2, 2, 2))), "phantom: found"),
         (lambda: api.simulate("foot", scanner="none"), "none"),
     ],
     "load_scan": [
@@ -320,6 +323,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "Operator": [
         (lambda: rays().frames([4]), r"frames: found \[4\].*0 to 3"),
         (lambda: rays().frames([0.5]), r"frames: found \[0.5\]"),
+        (lambda: rays().frames([True, False]), "frames: found"),
         (lambda: rays().frames(2), "frames: found 2"),
         (lambda: splats().frames([]), "frames: found"),
         (lambda: rays().T.frames([0]), "frames: .*from something to frames"),
