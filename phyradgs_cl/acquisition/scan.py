@@ -72,7 +72,7 @@ class Scan:
                 raise InputError(name, checks.shown(getattr(self, name)), f"a {kind.__name__}")
         if not callable(getattr(self.trajectory, "pose", None)):
             raise InputError("trajectory", checks.shown(self.trajectory), "anything with pose(frame, time_s)")
-        object.__setattr__(self, "projections", _line_integrals(self.projections))
+        object.__setattr__(self, "projections", _line_integrals(self.projections, self.pixel_mask))
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
         if self.projections.shape != expected:
@@ -230,11 +230,13 @@ def check_others(others: Iterable[str]) -> None:
             raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
 
 
-def _line_integrals(frames: ArrayLike) -> np.ndarray:
-    """Frames as float32; InputError for what is no finite number."""
+def _line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
+    """Frames as float32, 0 for what is no finite number in a masked pixel; InputError for one elsewhere."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)
     if not all(np.isfinite(frame).all() for frame in values):  # by frame, which needs little memory
+        if mask is not None and np.shape(mask) in (values.shape, values.shape[1:]):
+            values = np.where((np.asarray(mask) != 0) & ~np.isfinite(values), np.float32(0), values)
         checks.finite("projections", values)
     return values
