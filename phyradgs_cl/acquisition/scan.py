@@ -108,7 +108,7 @@ class Scan:
 
         Raises InputError for shapes that do not fit, and a panel that the source does not face.
         """
-        values = _line_integrals(frames)
+        values = _line_integrals(frames, others.get("pixel_mask"))
         checks.shape("frames", values, (None, None, None))
         table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
         if (np.linalg.norm(np.cross(table[:, 6:9], table[:, 9:12]), axis=1) <= 0).any():
@@ -128,7 +128,7 @@ class Scan:
         vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. grid, others: as for
         ``from_poses``. ``astra_vectors`` is the way back. Raises InputError for shapes that do not fit.
         """
-        values, table = _line_integrals(frames), np.asarray(vectors)
+        values, table = _line_integrals(frames, others.get("pixel_mask")), np.asarray(vectors)
         checks.shape("vectors", table, (None, POSE_LENGTH))
         if values.ndim == 3 and len(values) != len(table) == values.shape[1]:
             remedy = "ASTRA's order is (rows, frames, columns): give frames.swapaxes(0, 1)"
