@@ -66,6 +66,9 @@ class Runtime:
         self.pixel_items = self.device.kind != "cpu" if pixel_items is None else pixel_items
         if self.pixel_items and self.lanes != 1:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
+        # A CPU's driver may put memory off to a buffer's first use, and then end the process where there is none.
+        at_once = cl.mem_flags.ALLOC_HOST_PTR if self.device.kind == "cpu" else 0
+        self._memory_flags = cl.mem_flags.READ_WRITE | at_once
         self.profile = profile
         self._tile: tuple[int, int] | None = None
         self._profile = Profile()
@@ -125,7 +128,7 @@ class Runtime:
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
         self.ledger.check(nbytes, self.device.largest_allocation_bytes)
         try:
-            buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes)
+            buffer = cl.Buffer(self.context, self._memory_flags, nbytes)
         except cl.Error as error:
             raise translated(error, self.ledger, f"{nbytes / 2**20:.0f} MiB") from error
         array = DeviceArray(buffer, shape, kind)

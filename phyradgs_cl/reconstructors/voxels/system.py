@@ -83,8 +83,6 @@ class System:
         if not (whole and rt.room().holds(*sizes_bytes)):
             log.info("the device has no room for all arrays of the method: they stay on the host")
             return self
-        if rt.device.kind == "cpu":  # whose driver ends the process where NumPy says that memory is short
-            np.empty(sum(sizes_bytes), np.uint8)
         space = DeviceSpace(rt)
         valid, transmission = (None if a is None else space.array(a) for a in (self.valid, self.transmission))
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
