@@ -7,8 +7,7 @@ sure.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -17,23 +16,19 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, Motion, PerRow, Scan, Static
 from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
-    Progress,
     ProgressReport,
     Reconstruction,
     State,
     ignore_progress,
     option_facts,
-    state_arrays,
 )
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
-from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista
+from phyradgs_cl.reconstructors.stages import Stage, run_stages
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.runtime import Runtime
-
-_VOXELS = "voxels"  # the finished volume in the state of a run that is at its splats
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ class FusedOptions:
 
     motion: Motion = Exact()
     iterations: int = 2000
-    voxel_iterations: int = 30
+    voxel_iterations: int = FistaOptions.iterations
     splat_weight: float = 0.5
     prior_weight: float = FistaOptions.prior_weight
     detector_model: str = "scan"
@@ -88,79 +83,28 @@ def fused(
 ) -> Reconstruction:
     """The mean of both volumes in 1/mm, with the Gaussians of one; the seed is the splats'.
 
-    Facts ``voxels`` and ``splats`` are the halves' own; ``disagreement_per_mm`` is half the RMS of their difference.
+    The fact ``stages`` has those of the parts; ``disagreement_per_mm`` is half the RMS of their difference.
     """
-    before, total = options.voxel_iterations, options.voxel_iterations + options.iterations
-    at_splats = resume is not None and _VOXELS in resume
-    if resume is not None and at_splats:
-        (volume,) = state_arrays(resume, [_VOXELS])
-        first = Reconstruction(volume, scan.grid)
-    else:
-        told = _part(report, 0, total, lambda state: state, lambda volume: volume)
-        first = fista(scan, options.voxels(), rt, seed=seed, report=told, resume=resume, initial=initial)
-        if first.state is not None:  # interrupted
-            return replace(first, facts=_facts(options, first, None, first.facts["interrupted_at"]))
+    voxels = fista_stages(scan, options.voxels(), rt)
+    halves: dict[str, np.ndarray] = {}
 
-    def both(volume: np.ndarray) -> np.ndarray:
-        mean: np.ndarray = first.volume + np.float32(options.splat_weight) * (volume - first.volume)
+    def splats(before: np.ndarray | None, told: ProgressReport, left: State | None) -> Reconstruction:
+        assert before is not None
+        start = np.maximum(before, 0)
+        return phyradgs(scan, options.splats(), rt, seed=seed, report=told, resume=left, initial=start)
+
+    def both(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+        assert before is not None
+        halves["difference"] = volume - before
+        mean: np.ndarray = before + np.float32(options.splat_weight) * halves["difference"]
         return mean
 
-    told = _part(report, before, total, lambda state: {**state, _VOXELS: first.volume}, both)
-    left = None if not at_splats or resume is None else {name: a for name, a in resume.items() if name != _VOXELS}
-    second = phyradgs(
-        scan, options.splats(), rt, seed=seed, report=told, resume=left, initial=np.maximum(first.volume, 0)
-    )
-    at = second.facts["interrupted_at"]
-    facts = _facts(options, first, second, None if at is None else before + at)
-    record = first.record + [{**line, "iteration": before + line["iteration"]} for line in second.record]
-    state = None if second.state is None else {**second.state, _VOXELS: first.volume}
-    return Reconstruction(both(second.volume), scan.grid, second.gaussians, record, facts, state)
+    stages = [*voxels, Stage("splats", options.iterations, splats, both)]
+    result = run_stages(stages, scan.grid, report, resume, initial)
+    result.facts.update(method="fused", options=option_facts(options))
+    if "difference" in halves:
+        result.facts["disagreement_per_mm"] = float(np.std(halves["difference"], dtype=np.float64) / 2)
+    return result
 
 
 METHOD = Method(fused, {"default": FusedOptions()}, takes_initial=True)
-
-
-def _facts(
-    options: FusedOptions, first: Reconstruction, second: Reconstruction | None, interrupted_at: int | None
-) -> dict[str, object]:
-    halves = {"voxels": first.facts} if second is None else {"voxels": first.facts, "splats": second.facts}
-    facts: dict[str, object] = {
-        "method": "fused",
-        "options": option_facts(options),
-        **halves,
-        "seconds": sum(half.get("seconds", 0.0) for half in halves.values()),
-        "interrupted_at": interrupted_at,
-    }
-    if second is not None:
-        facts["disagreement_per_mm"] = float(np.std(second.volume - first.volume, dtype=np.float64) / 2)
-    return facts
-
-
-def _part(
-    report: ProgressReport,
-    before: int,
-    total: int,
-    whole_state: Callable[[State], State],
-    whole_volume: Callable[[np.ndarray], np.ndarray],
-) -> ProgressReport:
-    """Reports of one half as of the whole run."""
-
-    def told(progress: Progress) -> None:
-        state, volume = progress.state, progress.volume
-
-        def present() -> tuple[np.ndarray, Grid]:
-            assert volume is not None
-            values, grid = volume()
-            return whole_volume(values), grid
-
-        report(
-            replace(
-                progress,
-                iteration=before + progress.iteration,
-                iterations=total,
-                state=None if state is None else lambda: whole_state(state()),
-                volume=None if volume is None else present,
-            )
-        )
-
-    return told

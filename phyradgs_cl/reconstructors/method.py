@@ -83,7 +83,7 @@ def own_method(name: str, function: Any) -> Method:
     return Method(run, presets, is_resumable="resume" in takes)
 
 
-def imported(text: str) -> Any:
+def imported(text: str, culprit: str = "--method") -> Any:
     """What ``package.module:name`` names, found as by ``python -m`` in the present folder too."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
@@ -92,14 +92,14 @@ def imported(text: str) -> Any:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         remedy = "start in its folder, or add that to PYTHONPATH"
-        raise InputError("--method", f"{text}: {error}", "package.module:function", remedy) from error
+        raise InputError(culprit, f"{text}: {error}", "package.module:function", remedy) from error
     except Exception as error:  # whatever a module does as it is imported
         found_there = f"{text}: {type(error).__name__}: {error}"
-        raise InputError("--method", found_there, "a module that can be imported") from error
+        raise InputError(culprit, found_there, "a module that can be imported") from error
     try:
         return operator.attrgetter(name)(found)
     except AttributeError:
-        raise InputError("--method", text, f"a function {name} in {module}") from None
+        raise InputError(culprit, text, f"a function {name} in {module}") from None
 
 
 def _plain(value: Any) -> Any:

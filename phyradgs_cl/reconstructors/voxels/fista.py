@@ -1,4 +1,7 @@
-"""FISTA with a prior, over subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes.
+"""FISTA with a prior, over subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes a grid.
+
+The volume that is asked for is a mean over each of its voxels; a ray through large voxels sees their corners too. So
+half of the passes are on a grid of smaller voxels, where there is room for it, and its means are the result.
 
 Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183) whose gradients are those of ordered
 subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
@@ -6,22 +9,27 @@ subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 3
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.detector import noise_level
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
     State,
     ignore_progress,
+    option_facts,
     state_arrays,
 )
+from phyradgs_cl.reconstructors.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Prior, prior_of
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
@@ -30,26 +38,33 @@ from phyradgs_cl.runtime import Runtime
 
 _GROWTH = 1.2  # of the residual from pass to pass: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
+_VOLUMES, _FRAMES = 16, 3  # held at one time
 
 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
-    """prior: one of ``PRIORS``. prior_weight: its strength, relative to the noise of the frames as it reaches a voxel.
+    """prior: one of ``PRIORS``, or ``package.module:function`` of one's own: (volume (nz, ny, nx) in 1/mm, noise in 1/mm) to
+    a volume. prior_weight: its strength, relative to the noise of the frames as it reaches a voxel.
 
+    subvoxels: parts of a voxel's side in the second half of the passes; 0: 2 where the device has room for them, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
-    iterations: int = 30
+    motion: Motion = PerRow()
+    iterations: int = 24
     prior: str = "dct"
     prior_weight: float = 0.45
+    subvoxels: int = 0
     frames_per_subset: int = 5
     tv_iterations: int = 5
     transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.one_of("prior", self.prior, PRIORS)
+        if ":" not in self.prior:
+            checks.one_of("prior", self.prior, PRIORS)
+        checks.within("subvoxels", self.subvoxels, 0, 8)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)
         checks.within("frames_per_subset", self.frames_per_subset, 0, 1_000_000)
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
@@ -66,6 +81,69 @@ def fista(
     initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
+    stages = fista_stages(scan, options, rt)
+    result = run_stages(stages, scan.grid, report, resume, initial)
+    result.facts["options"] = option_facts(options)
+    return result
+
+
+METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
+
+
+def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
+    """All passes on the scan's own grid, or half of them and the rest on one of smaller voxels."""
+    parts = options.subvoxels or (2 if _has_room(scan.grid, 2, rt) else 1)
+    first = options.iterations - options.iterations // 2 if parts > 1 else options.iterations
+
+    def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
+        return _run(scan, replace(options, iterations=first), rt, report, resume, before)
+
+    def parted(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
+        assert before is not None
+        grid = finer(scan.grid, parts)
+        start = before.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
+        # the same threshold in 1/mm: less than the same prior, as blurred edges of small voxels are no error of the mean
+        weight = options.prior_weight / parts
+        small = replace(options, iterations=options.iterations - first, prior_weight=weight)
+        return _run(replace(scan, grid=grid, reference=None), small, rt, report, resume, start)
+
+    if parts == 1:
+        return [Stage("voxels", first, voxels)]
+    rest = Stage("subvoxels", options.iterations - first, parted, lambda volume, before: block_means(volume, parts))
+    return [Stage("voxels", first, voxels), rest]
+
+
+def finer(grid: Grid, parts: int) -> Grid:
+    """The same box with ``parts`` voxels for one along each axis."""
+    z, y, x = grid.shape
+    dz, dy, dx = grid.voxel_size_mm
+    return replace(grid, shape=(parts * z, parts * y, parts * x), voxel_size_mm=(dz / parts, dy / parts, dx / parts))
+
+
+def block_means(volume: np.ndarray, parts: int) -> np.ndarray:
+    """Means of a volume (parts nz, parts ny, parts nx) over blocks, (nz, ny, nx) float32."""
+    nz, ny, nx = (count // parts for count in volume.shape)
+    blocks = volume.reshape(nz, parts, ny, parts, nx, parts)
+    means: np.ndarray = blocks.mean((1, 3, 5), dtype=np.float64).astype(np.float32)
+    return means
+
+
+def _has_room(grid: Grid, parts: int, rt: Runtime) -> bool:
+    """Whether every rank's device holds the method's volumes with voxels so much smaller."""
+    voxels = math.prod(grid.shape) * parts**3
+    holds = voxels <= MOST_VOXELS and rt.room().holds(*[4 * voxels] * (_VOLUMES + 2))
+    return not rt.ranks.any(not holds)
+
+
+def _run(
+    scan: Scan,
+    options: FistaOptions,
+    rt: Runtime,
+    report: ProgressReport,
+    resume: State | None,
+    initial: np.ndarray | None,
+) -> Reconstruction:
+    """All passes on the scan's grid."""
     valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
     noise = noise_level(np.asarray(scan.projections, np.float32), valid)
 
@@ -73,10 +151,8 @@ def fista(
         prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations)
         return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
 
-    return run_iterations("fista", make, scan, options, rt, report, resume, initial, volumes=16, frames=3)
-
-
-METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
+    sizes = {"volumes": _VOLUMES, "frames": _FRAMES}
+    return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
 
 
 class Fista:

@@ -11,6 +11,7 @@ import numpy as np
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import DctProx, TvProx
+from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
 
@@ -33,7 +34,9 @@ class Prior(Interface):
 
 
 def prior_of(name: str, rt: Runtime, grid: Grid, tv_iterations: int) -> Prior:
-    """A prior by its name in ``PRIORS``."""
+    """A prior by its name in ``PRIORS``, or by ``package.module:function`` of one's own (``Denoiser``)."""
+    if ":" in name:
+        return OwnPrior(imported(name, "prior"))
     tv = TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations)
     if name == "tv":
         return tv
