@@ -13,7 +13,13 @@ from typing import Any
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.tables import read_toml
-from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options
+from phyradgs_cl.reconstructors import (
+    DEFAULT_METHOD,
+    InputOptions,
+    input_options,
+    method_name,
+    method_options,
+)
 from phyradgs_cl.runtime import bytes_of
 
 if sys.version_info >= (3, 11):
@@ -103,7 +109,7 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
     names = [f.name for f in fields(InputOptions)]
     changes = {name: settings.pop(name) for name in names if name in settings}
     chosen = RunSettings(
-        "phyradgs" if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
+        DEFAULT_METHOD if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
     )
     with chosen.naming_origins():
         return replace(chosen, method=method_name(chosen.method), before=input_options(changes))

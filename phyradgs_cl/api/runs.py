@@ -21,6 +21,7 @@ from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
+    DEFAULT_METHOD,
     InputOptions,
     ProgressReport,
     Reconstruction,
@@ -129,7 +130,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
 
 def reconstruct(
     scan: Scan,
-    method: str | Callable[..., Reconstruction | np.ndarray] = "phyradgs",
+    method: str | Callable[..., Reconstruction | np.ndarray] = DEFAULT_METHOD,
     *,
     preset: str | None = None,
     grid: Grid | None = None,

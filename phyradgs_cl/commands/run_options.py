@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from phyradgs_cl.commands import options
 from phyradgs_cl.commands.files import file_option, option
-from phyradgs_cl.reconstructors import METHODS
+from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
 from phyradgs_cl.settings import RunSettings, run_settings
 from phyradgs_cl.workflow import ReconstructionJob
 
@@ -40,11 +40,11 @@ def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
 
 
 RUN_OPTIONS: dict[str, Any] = {
-    "method": _asked(str, _METHOD, "phyradgs", metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
+    "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
     "motion": _asked(
         Literal["static", "static-start", "micro-views", "per-row", "exact"],
         _MOTION,
-        "exact for phyradgs, else static",
+        "each line at its own times for fista, phyradgs and fused; else static",
     ),
     "strips": _asked(int, "Strips M of a frame (rolling shutter); means micro-views.", "8"),
     "sub_intervals": _asked(

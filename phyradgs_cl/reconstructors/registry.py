@@ -55,6 +55,7 @@ class _Methods(MutableMapping[str, Method]):
         return len(self._found)
 
 
+DEFAULT_METHOD = "fista"
 METHODS = _Methods({
     "phyradgs": "splats.phyradgs",
     "r2": "splats.r2",
@@ -242,13 +243,20 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
     for key, value in changes.items():
         if key not in known:
             names = [*known, *_motion_options(options)]
-            remedy = near_miss(key, names, "leave it out")
+            remedy = near_miss(key, names, _having(key) or "leave it out")
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
         values[key] = _converted(known[key], value, f"{culprit}: option {key}")
     try:
         return replace(options, **values)
     except (TypeError, ValueError) as error:  # of options of one's own, which check in their own way
         raise InputError(culprit, str(error), "values that its options take") from error
+
+
+def _having(option: str) -> str:
+    """The methods that have an option, as advice; nothing where none has."""
+    usual = {name: next(iter(one.presets.values())) for name, one in METHODS.items()}
+    having = [name for name, options in usual.items() if hasattr(options, option)]
+    return f"--method {' or '.join(having)} has it" if having else ""
 
 
 def _converted(current: Any, value: Any, culprit: str) -> Any:

@@ -32,6 +32,7 @@ from phyradgs_cl.io import (
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import (
+    DEFAULT_METHOD,
     METHODS,
     InputOptions,
     Progress,
@@ -58,7 +59,7 @@ class ReconstructionJob:
 
     scan: Path
     output: Path
-    method: str = "phyradgs"
+    method: str = DEFAULT_METHOD
     preset: str | None = None
     changes: Mapping[str, Any] | None = None
     seed: int = 0

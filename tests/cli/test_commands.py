@@ -112,7 +112,7 @@ def test_switches_win_over_assignments_and_both_over_the_file(scan, reconstructe
 
 
 def test_more_gaussians_than_voxels_are_said_and_kept(scan, reconstructed, caplog):
-    facts = facts_of(reconstructed(scan, "--iterations", "1", "--gaussians", "100000"))
+    facts = facts_of(reconstructed(scan, "--method", "phyradgs", "--iterations", "1", "--gaussians", "100000"))
     assert facts["gaussians_asked"] == 100_000 and 0 < facts["gaussians_first"] < 16**3
     assert caplog.text.count("100000 Gaussians asked for") == 1
     assert f"starting with {facts['gaussians_first']}" in caplog.text

@@ -31,7 +31,7 @@ def interrupted_before(function):
 
 COMMANDS = {
     "simulate": ["simulate", "--size", "8", "--detector", "12", "--views", "4"],
-    "reconstruct": ["reconstruct", "{scan}", "--iterations", "4", "--gaussians", "20"],
+    "reconstruct": ["reconstruct", "{scan}", "--method", "phyradgs", "--iterations", "4", "--gaussians", "20"],
     "fdk": ["reconstruct", "{scan}", "--method", "fdk"],
     "evaluate": ["evaluate", "{volume}", "--reference", "{scan}"],
 }

@@ -17,7 +17,7 @@ from phyradgs_cl.io.lock import lock_path
 
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
 RUNS = {
-    "phyradgs": ["--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
+    "phyradgs": ["--method", "phyradgs", "--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "300"],
     "cgls": ["--method", "cgls", "--iterations", "300", "--set", "noise_stop=0"],
     "fista-tv": ["--method", "fista-tv", "--iterations", "200"],

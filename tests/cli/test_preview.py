@@ -18,8 +18,8 @@ GRID = Grid.cube(4, 2.0)
 @pytest.mark.parametrize(
     "words",
     [
-        "--iterations 60 --gaussians 60",
-        "--iterations 60 --gaussians 60 --set pixel_footprint=true",
+        "--method phyradgs --iterations 60 --gaussians 60",
+        "--method phyradgs --iterations 60 --gaussians 60 --set pixel_footprint=true",
         "--method sirt --iterations 3",
     ],
 )

@@ -63,7 +63,7 @@ RESUMED = {
     "cgls": ["--iterations", "6", "--set", "noise_stop=0"],
     "fista-tv": ["--iterations", "6"],
     "os-sart": ["--iterations", "6"],
-    "phyradgs": ["--iterations", "100", "--gaussians", "30", "--motion", "static"],
+    "phyradgs": ["--method", "phyradgs", "--iterations", "100", "--gaussians", "30", "--motion", "static"],
 }
 
 
@@ -75,7 +75,7 @@ def write_good(folder: Path, seed: int = 0) -> Path:
     simulate += ["--time-samples", "2", "--jitter-deg", "0.1", "--seed", str(seed)]
     assert cli.run([*simulate, "-o", str(folder / "fly.h5")]) == 0
     _write_counts(folder / "counts.h5", folder / "fly.h5", np.random.default_rng(seed))
-    tiny = ["--iterations", "3", "--gaussians", "20", "--motion", "static"]
+    tiny = ["--method", "phyradgs", "--iterations", "3", "--gaussians", "20", "--motion", "static"]
     assert cli.run(["reconstruct", str(folder / "fly.h5"), *tiny, "-o", str(folder / "volume.h5")]) == 0
     with h5py.File(folder / "bare.h5", "w") as file:
         file["volume"] = np.random.default_rng(seed).integers(0, 255, (5, 6, 7), np.uint8)

@@ -19,7 +19,7 @@ RUNS = {
     "fista-tv": ["--method", "fista-tv", "--iterations", "4"],
     "os-sart": ["--method", "os-sart", "--iterations", "4"],
     "asd-pocs": ["--method", "asd-pocs", "--iterations", "4"],
-    "phyradgs": ["--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],
+    "phyradgs": ["--method", "phyradgs", "--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],
 }
 
 

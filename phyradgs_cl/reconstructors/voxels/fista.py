@@ -1,7 +1,7 @@
 """FISTA with a prior, over subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes a grid.
 
 The volume that is asked for is a mean over each of its voxels; a ray through large voxels sees their corners too. So
-half of the passes are on a grid of smaller voxels, where there is room for it, and its means are the result.
+the last third of the passes is on a grid of smaller voxels, where there is room for it, and its means are the result.
 
 Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183) whose gradients are those of ordered
 subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
@@ -46,13 +46,13 @@ class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or ``package.module:function`` of one's own: (volume (nz, ny, nx) in 1/mm, noise in 1/mm) to
     a volume. prior_weight: its strength, relative to the noise of the frames as it reaches a voxel.
 
-    subvoxels: parts of a voxel's side in the second half of the passes; 0: 2 where the device has room for them, else 1.
+    subvoxels: parts of a voxel's side in the last third of the passes; 0: 2 where the device has room for them, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
     motion: Motion = PerRow()
-    iterations: int = 24
+    iterations: int = 30
     prior: str = "dct"
     prior_weight: float = 0.45
     subvoxels: int = 0
@@ -91,9 +91,9 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
-    """All passes on the scan's own grid, or half of them and the rest on one of smaller voxels."""
+    """All passes on the scan's own grid, or two thirds of them and the rest on one of smaller voxels."""
     parts = options.subvoxels or (2 if _has_room(scan.grid, 2, rt) else 1)
-    first = options.iterations - options.iterations // 2 if parts > 1 else options.iterations
+    first = options.iterations - options.iterations // 3 if parts > 1 else options.iterations
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
         return _run(scan, replace(options, iterations=first), rt, report, resume, before)

@@ -13,7 +13,14 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
-from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options, usual_preset
+from phyradgs_cl.reconstructors import (
+    DEFAULT_METHOD,
+    InputOptions,
+    input_options,
+    method_name,
+    method_options,
+    usual_preset,
+)
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
@@ -28,7 +35,6 @@ _ELSEWHERE = {
     "device": "say it as --device, or in the environment of the workers",
     "memory": f"say it as {MEMORY_VARIABLE} in the environment of the workers",
 }
-_DEFAULT_METHOD = "phyradgs"
 Table = Mapping[str, Any]
 
 
@@ -186,7 +192,7 @@ def _setting(values: dict[str, Any], where: str) -> Setting:
 
 def _checked(values: dict[str, Any]) -> Setting:
     changes = dict(values)
-    method, preset = method_name(changes.pop("method", _DEFAULT_METHOD)), changes.pop("preset", None)
+    method, preset = method_name(changes.pop("method", DEFAULT_METHOD)), changes.pop("preset", None)
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
