@@ -109,7 +109,7 @@ def test_wrong_options(kept, scan, tmp_path, command) -> None:
     text = tmp_path / "text.h5"
     text.write_text("this is [not a table")
     start, table = {
-        "reconstruct": (f"reconstruct {scan}", RECONSTRUCT),
+        "reconstruct": (f"reconstruct {scan} --method phyradgs", RECONSTRUCT),
         "simulate": (f"simulate {SMALL}", SIMULATE),
         "others": ("", {
             "none.h5": ("reconstruct {tmp}/none.h5",),
@@ -182,7 +182,8 @@ def test_wrong_configs(kept, scan, tmp_path) -> None:
     for culprit, texts in CONFIGS.items():
         for text in texts:
             config.write_text(text)
-            kept(["reconstruct", scan, "--config", config], culprit)
+            method = [] if text.startswith("method") else ["--method", "phyradgs"]
+            kept(["reconstruct", scan, "--config", config, *method], culprit)
 
 
 def test_outputs_that_cannot_be_written(refused, scan, tmp_path) -> None:

@@ -99,7 +99,7 @@ def test_simulating_twice_with_one_seed_gives_the_same_frames(cli, scan, tmp_pat
 def test_switches_win_over_assignments_and_both_over_the_file(scan, reconstructed, tmp_path):
     config = tmp_path / "run.toml"
     config.write_text(
-        "iterations = 7.0\ngaussians = 50\nseed = 3.0\ndevice = 0\nstrips = 2.0\nsub_intervals = 3\n"
+        "method = 'phyradgs'\niterations = 7.0\ngaussians = 50\nseed = 3.0\ndevice = 0\nstrips = 2.0\nsub_intervals = 3\n"
         "ssim_weight = 0.1\n[rates]\nposition = [1e-3, 1e-4]\ndensity = [1e-2, 1e-3]\n"
     )
     given = ["--set", "rates.position=[2e-3, 2e-4]", "--set", "ssim_weight=0.3", "--set", "iterations=5"]

@@ -38,7 +38,7 @@ def warned(cli, scan, tmp_path, caplog):
 
 
 def test_doubtful_options_are_said_and_others_not(warned) -> None:
-    few = ["--iterations", "1"]
+    few = ["--method", "phyradgs", "--iterations", "1"]
     threshold = warned(*few, "--set", "initial_threshold=5")
     assert "no voxel of the first volume is above initial_threshold 5" in threshold
     assert "13 strips are more than the 12 lines of " in warned(*few, "--strips", "13")
