@@ -97,7 +97,9 @@ class GridChoice:
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
     """A number, or a sequence of numbers, as finite numbers of which there may be so many."""
+    value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # Grid.box_mm is (3, 2)
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    parts = [part.item() if isinstance(part, np.generic) else part for part in parts]
     fits = len(parts) in counts and all(isinstance(n, int | float) and not isinstance(n, bool) for n in parts)
     if not (fits and all(abs(n) < 1e300 for n in parts)):  # false for NaN too
         many = " or ".join(str(count) for count in counts)

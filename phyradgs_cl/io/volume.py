@@ -279,4 +279,6 @@ def _read_gaussians(source: Hdf5Source) -> Gaussians | None:
         with np.errstate(over="ignore"):  # what float32 cannot hold is infinite for everybody who reads on
             arrays[name] = read_values(source, address, dataset).astype(np.float32)
         checks.finite(source.name(address), arrays[name])
+    if (arrays["scale"] <= 0).any():
+        raise source.error(f"{_GAUSSIANS}/scale", f"{arrays['scale'].min():g}", "lengths above 0")
     return Gaussians(**arrays)

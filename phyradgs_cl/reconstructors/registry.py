@@ -158,7 +158,13 @@ def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.n
     if not method_of(method).takes_initial:
         taking = ", ".join(name for name, one in METHODS.items() if one.takes_initial)
         raise InputError("--initial", f"--method {method_name(method)}", f"one of {taking}", "leave --initial out")
-    return volume if grid == onto else resampled(volume, grid, onto)[0]
+    if grid == onto:
+        return volume
+    first, share = resampled(volume, grid, onto)
+    if share == 0:
+        box_mm = np.round(grid.box_mm, 3).tolist()
+        raise InputError("--initial", f"a volume in {box_mm} mm (z, y, x)", "one that meets the scan's grid")
+    return first
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:
@@ -254,7 +260,9 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
 def _converted(current: Any, value: Any, culprit: str) -> Any:
     """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
     if current is None:  # the options check it themselves
-        return value
+        return value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
     if is_dataclass(current):
         if not isinstance(value, Mapping):
             raise InputError(culprit, checks.shown(value), "a table")
