@@ -13,7 +13,7 @@ from typing import Any
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.tables import read_toml
-from phyradgs_cl.reconstructors import InputOptions, input_options, method_name, method_options
+from phyradgs_cl.reconstructors import InputOptions, input_names, input_options, method_name, method_options
 from phyradgs_cl.runtime import bytes_of
 
 if sys.version_info >= (3, 11):
@@ -91,8 +91,12 @@ def _collected(
     for key, value in given.items():
         if value is not None:
             settings[key] = value
-            origins[key] = f"--{key.replace('_', '-')}"
+            origins[key] = _flag(key)
     return settings, origins
+
+
+def _flag(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
 
 
 def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSettings:
@@ -100,13 +104,14 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
     preset = _word(settings, "preset", origins)
     seed = _seed(settings.pop("seed", 0), origins.get("seed", "--seed"))
     wish, memory = _device_and_memory(settings, origins)
-    names = [f.name for f in fields(InputOptions)]
-    changes = {name: settings.pop(name) for name in names if name in settings}
     chosen = RunSettings(
         "phyradgs" if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
     )
     with chosen.naming_origins():
-        return replace(chosen, method=method_name(chosen.method), before=input_options(changes))
+        theirs = input_names(chosen.method, preset)
+        flags = [f.name for f in fields(InputOptions) if origins.get(f.name) == _flag(f.name)]  # mean what --help says
+        before = {name: settings.pop(name) for name in {*theirs, *flags} if name in settings}
+        return replace(chosen, method=method_name(chosen.method), before=input_options(before))
 
 
 def _device_and_memory(settings: dict[str, Any], origins: Mapping[str, str]) -> tuple[str | None, int | None]:

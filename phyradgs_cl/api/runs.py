@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,11 @@ from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
-    InputOptions,
     ProgressReport,
     Reconstruction,
     State,
     ignore_progress,
+    input_names,
     input_options,
     interrupted,
     method_name,
@@ -166,8 +166,7 @@ def reconstruct(
     _check_reconstruct(scan, grid, report, on_interrupt, seed)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
-    own = {f.name for f in fields(method_options(method, preset))}  # go before the frames' of the same name
-    given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options and f.name not in own}
+    given = {name: options.pop(name) for name in input_names(method, preset) if name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)
     more: dict[str, Any] = {} if resume is None else {"resume": _state_of(resume, method, chosen)}

@@ -186,6 +186,12 @@ def input_options(changes: Mapping[str, Any]) -> InputOptions:
     return _changed(InputOptions(), changes, "reconstruct")
 
 
+def input_names(method: object, preset: str | None = None) -> list[str]:
+    """The names of the input options, but those that the method's own options have too, which go before them."""
+    own = {f.name for f in fields(method_options(method, preset))}
+    return [f.name for f in fields(InputOptions) if f.name not in own]
+
+
 def motions_of(method: object) -> tuple[str, ...]:
     """The names of the motion models that a method takes."""
     return tuple(_models(next(iter(method_of(method).presets.values()))))
