@@ -307,6 +307,10 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
             lambda: api.save_volume("v.h5", VOLUME.volume),
             r"result: .*for an array, Reconstruction\(volume, grid\)",
         ),
+        (lambda: api.save_volume("v.png", VOLUME), "path: found output v.png; .*a suffix of .nii.*or .h5"),
+        (lambda: api.save_volume("v.ply", VOLUME), "result:/entry/gaussians: found nothing there"),
+        (lambda: api.save_volume("v.nii", VOLUME, {"psnr_db": 3.0}), "metrics: found some for v.nii"),
+        (lambda: api.save_volume("v.npy", replace(VOLUME, volume=VOLUME.volume * np.nan)), "volume: found 64 NaN"),
     ],
     "compare": [
         (lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3))), "shape"),
