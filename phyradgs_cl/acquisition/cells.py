@@ -4,6 +4,8 @@ A frame is a sum over cells: pixel lines [line_start, line_stop) of the merged f
 projection from the cell's pose. Weights of a line sum to 1.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -1,5 +1,7 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
+from __future__ import annotations
+
 import logging
 from dataclasses import replace
 from typing import Any
