@@ -181,7 +181,7 @@ def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     write_scan(path, negative(clean))
     assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
     facts = json.loads(capsys.readouterr().out)
-    assert facts["suspicious"] == 1 and len(facts["findings"]) == 11
+    assert facts["suspicious"] == 1 and len(facts["findings"]) == 12
     assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(
         facts["findings"][0]
     )
