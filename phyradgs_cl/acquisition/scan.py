@@ -231,19 +231,22 @@ def check_others(others: Iterable[str]) -> None:
             raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
 
 
-def check_not_counts(frames: np.ndarray, remedy: str) -> None:
-    """InputError for frames that are whole numbers, or larger than line integrals are, and so raw counts."""
+def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:
+    """InputError for frames that are whole numbers, or unmasked larger than line integrals are, and so raw counts."""
     if frames.dtype.kind in "iu":
         raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
-    if frames.dtype.kind == "f" and np.mean(frames > _OPAQUE) > _FEW:
-        found = f"values of up to {np.nanmax(frames):g} without flats"
+    opaque = frames > _OPAQUE
+    if np.shape(mask) in (frames.shape, frames.shape[1:]):
+        opaque &= np.asarray(mask) == 0
+    if np.count_nonzero(opaque) > _FEW * opaque.size:
+        found = f"values of up to {frames[opaque].max():g} without flats"
         raise InputError("frames", found, f"line integrals, which are below {_OPAQUE:g}", remedy)
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
     """Frames of which nobody says what they hold as ``_line_integrals``; InputError for counts too."""
     values = checks.real_array("frames", frames)
-    check_not_counts(values, "give −ln(counts / flats)")
+    check_not_counts(values, "give −ln(counts / flats)", mask)
     return _line_integrals(values, mask)
 
 

@@ -263,9 +263,10 @@ def _state_of(partial: object, method: object, options: Any) -> State:
         raise InputError(
             "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
         )
-    found, asked = partial.facts.get("options"), option_facts(options)
-    is_same = json.dumps(found, sort_keys=True, default=repr) == json.dumps(asked, sort_keys=True, default=repr)
-    if partial.facts.get("method") != method_name(method) or not is_same:  # in files tuples are lists
+    then, now = (
+        json.dumps(facts, sort_keys=True, default=repr) for facts in (partial.facts.get("options"), option_facts(options))
+    )
+    if partial.facts.get("method") != method_name(method) or then != now:  # as JSON: in files tuples are lists
         raise InputError(
             "resume", "another method, or other options", "those of the run that was interrupted"
         )

@@ -154,7 +154,7 @@ def _pixels(
             "flats, darks", f"some beside {held}", "both, or flats alone, beside counts", "leave them out"
         )
     if quantity is None and flat is None:
-        check_not_counts(values, 'give flats=, or quantity="attenuation"')
+        check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
     found = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, custom=held)
     if mask is None:
         return found

@@ -149,6 +149,6 @@ def _seen_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """Frames (F, v, u) with masked pixels filled in, and their numbers: those that are masked whole are left out, as the
     views beside them then stand for the angle between."""
     frames, seen = unmasked_frames(scan), np.arange(scan.frames)
-    if np.ndim(scan.pixel_mask) == 3:
+    if np.asarray(scan.pixel_mask).ndim == 3:
         seen = np.flatnonzero(scan.valid.any(axis=(1, 2)))
     return (frames, np.arange(scan.frames)) if len(seen) in (0, scan.frames) else (frames[seen], seen)
