@@ -24,7 +24,7 @@ def test_the_blocks_of_the_page_run_in_order(tmp_path, monkeypatch, capsys) -> N
             exec(compile(block, "docs/api.md", "exec"), names)
     said = capsys.readouterr().out
     assert "(12, 24, 24)" in said and "PSNR" in said
-    assert {path.name for path in tmp_path.iterdir()} == {"scan.h5", "volume.h5"}
+    assert {path.name for path in tmp_path.iterdir()} == {"scan.h5", "volume.h5", "partial.h5"}
 
 
 def test_the_page_names_everything_and_nothing_else() -> None:
