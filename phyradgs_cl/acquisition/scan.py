@@ -236,7 +236,7 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
     if frames.dtype.kind in "iu":
         raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
     opaque = frames > _OPAQUE
-    if np.shape(mask) in (frames.shape, frames.shape[1:]):
+    if mask is not None and np.shape(mask) in (frames.shape, frames.shape[1:]):
         opaque &= np.asarray(mask) == 0
     if np.count_nonzero(opaque) > _FEW * opaque.size:
         found = f"values of up to {frames[opaque].max():g} without flats"

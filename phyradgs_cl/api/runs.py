@@ -15,8 +15,8 @@ from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation
 from phyradgs_cl.importers import load_volume as load_voxels
 from phyradgs_cl.io import StoredVolume, read_scan, read_state, read_volume, write_scan, write_volume

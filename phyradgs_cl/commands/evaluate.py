@@ -18,11 +18,12 @@ def evaluate_command(
     as_json: AsJson = False,
     picture: Annotated[
         Path | None,
-        file_option("PNG of slices: result, truth, difference.", "--picture", default="NAME.png of NAME.h5, else VOLUME.png"),
+        file_option("PNG of slices: result, truth, difference.", "--picture", default="v.png of v.h5, v.nii.png of v.nii"),
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    usual = volume.with_suffix(".png") if volume.suffix in ("", ".h5") else volume.with_name(f"{volume.name}.png")
+    is_ours = volume.suffix in ("", ".h5")
+    usual = volume.with_suffix(".png") if is_ours else volume.with_name(f"{volume.name}.png")
     facts = run_evaluation(volume, reference, picture or usual)
     if as_json:
         say(json.dumps(facts))

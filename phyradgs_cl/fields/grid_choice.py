@@ -72,7 +72,8 @@ class GridChoice:
             shape = np.maximum(np.ceil(sides_mm / self.voxel_mm - _ROUNDING), 1)
             if shape.max() == 1 < max(grid.shape):
                 box = " × ".join(f"{side:.4g}" for side in sides_mm)
-                raise InputError("--voxel-mm", checks.shown(self.voxel_mm), f"several voxels in the box of {box} mm (z, y, x)")
+                expected = f"several voxels in the box of {box} mm (z, y, x)"
+                raise InputError("--voxel-mm", checks.shown(self.voxel_mm), expected)
         elif self.roi_mm is not None:
             return self._cut(grid, box_mm)
         else:

@@ -22,7 +22,7 @@ def check_distances(rt: Runtime, scan: Scan) -> Finding:
     others = {factor: fitted(rt, stretched(scan, factor, factor)) for factor in _OTHERS}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}
     best = min(ratios, key=lambda factor: ratios[factor])
-    text = f"pixels over the distance of the panel {best:g} times as large leave {ratios[best]:.3g} times the squared residual"
+    text = f"pixels over the panel's distance {best:g} times as large leave {ratios[best]:.3g} times the squared residual"
     fit_worse = all(ratios[f] >= _OK_RATIO and t_statistic(stated, others[f]) >= _ERRORS for f in _OTHERS)
     advice = "" if fit_worse else "compare distances and pixel sizes with the scanner's log"
     return Finding(DISTANCES, OK if fit_worse else CANNOT_TELL, ratios[best], _OK_RATIO, "share", text, advice)
