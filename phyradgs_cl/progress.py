@@ -45,6 +45,12 @@ class Ticker:
             _say(self._over(text), ends_line=False)
             self.is_open, self.is_counting = True, False
 
+    def end(self, text: str) -> None:
+        """Says at once, on a terminal, what stays in the place of the line."""
+        if self.is_terminal:
+            _say(self._over(text), ends_line=False)
+            self.is_open = self.is_counting = True
+
     def progress(self, p: Progress) -> None:
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")

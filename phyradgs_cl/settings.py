@@ -16,6 +16,7 @@ from phyradgs_cl.io.tables import read_toml
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
     InputOptions,
+    input_names,
     input_options,
     method_name,
     method_options,
@@ -97,8 +98,12 @@ def _collected(
     for key, value in given.items():
         if value is not None:
             settings[key] = value
-            origins[key] = f"--{key.replace('_', '-')}"
+            origins[key] = _flag(key)
     return settings, origins
+
+
+def _flag(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
 
 
 def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSettings:
@@ -106,13 +111,14 @@ def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSe
     preset = _word(settings, "preset", origins)
     seed = _seed(settings.pop("seed", 0), origins.get("seed", "--seed"))
     wish, memory = _device_and_memory(settings, origins)
-    names = [f.name for f in fields(InputOptions)]
-    changes = {name: settings.pop(name) for name in names if name in settings}
     chosen = RunSettings(
         DEFAULT_METHOD if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
     )
     with chosen.naming_origins():
-        return replace(chosen, method=method_name(chosen.method), before=input_options(changes))
+        theirs = input_names(chosen.method, preset)
+        flags = [f.name for f in fields(InputOptions) if origins.get(f.name) == _flag(f.name)]  # mean what --help says
+        before = {name: settings.pop(name) for name in {*theirs, *flags} if name in settings}
+        return replace(chosen, method=method_name(chosen.method), before=input_options(before))
 
 
 def _device_and_memory(settings: dict[str, Any], origins: Mapping[str, str]) -> tuple[str | None, int | None]:

@@ -20,7 +20,7 @@ class ConeGeometry:
 
     ``source_to_axis_mm`` and ``source_to_detector_mm`` are along the central ray, ``detector_shape`` counts (rows, columns),
     ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm`` (along v, along u) shifts the panel's centre away from that ray.
-    Raises InputError for lengths and counts that are not above 0.
+    Raises InputError for lengths and counts that are not above 0, and a panel nearer to the source than the axis.
     """
 
     source_to_axis_mm: float
@@ -32,6 +32,9 @@ class ConeGeometry:
     def __post_init__(self) -> None:
         for name in ("source_to_axis_mm", "source_to_detector_mm"):
             _positive_mm(name, getattr(self, name), ())
+        if self.source_to_detector_mm < self.source_to_axis_mm:
+            expected = f"at least source_to_axis_mm ({self.source_to_axis_mm:g}): the panel stands behind the axis"
+            raise InputError("source_to_detector_mm", f"{self.source_to_detector_mm:g}", expected, "are they exchanged?")
         counts = checks.numbers("detector_shape", self.detector_shape, (2,))
         if (counts < 1).any() or (counts != np.floor(counts)).any():
             raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
@@ -110,7 +113,8 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
     offset_v, offset_u, away = (np.einsum("ij,ij->i", ray, axis) for axis in (v_hat, u_hat, normal))
     to_axis = np.linalg.norm(source[:, :2], axis=1)
     means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
-    return ConeGeometry(means[0], means[1], panel, (means[2], means[3]), (means[4], means[5]))
+    to_detector = max(means[:2])  # a panel that does not turn with the source may have its plane nearer than the axis
+    return ConeGeometry(means[0], to_detector, panel, (means[2], means[3]), (means[4], means[5]))
 
 
 def transpose_pose(pose: np.ndarray) -> np.ndarray:

@@ -148,6 +148,7 @@ def motion_of(motion: str | Motion) -> Motion:
 def motion_facts(motion: Motion) -> dict[str, object]:
     """Name and fields of a model, for a result's facts; what JSON has no word for as Python prints it."""
     own: dict[str, Any] = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
+    own = {key: value.item() if isinstance(value, np.generic) else value for key, value in own.items()}
     plain = {key: value if isinstance(value, int | float | str) else repr(value) for key, value in own.items()}
     return {"name": str(getattr(motion, "name", type(motion).__name__)), **plain}
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 DETECTOR_MODELS = ("log", "intensity")
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
+_OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels that may be broken
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
 
 
@@ -108,7 +109,7 @@ class Scan:
 
         Raises InputError for shapes that do not fit, and a panel that the source does not face.
         """
-        values = _line_integrals(frames, others.get("pixel_mask"))
+        values = _uncounted(frames, others.get("pixel_mask"))
         checks.shape("frames", values, (None, None, None))
         table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
         if (np.linalg.norm(np.cross(table[:, 6:9], table[:, 9:12]), axis=1) <= 0).any():
@@ -128,7 +129,7 @@ class Scan:
         vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. grid, others: as for
         ``from_poses``. ``astra_vectors`` is the way back. Raises InputError for shapes that do not fit.
         """
-        values, table = _line_integrals(frames, others.get("pixel_mask")), np.asarray(vectors)
+        values, table = _uncounted(frames, others.get("pixel_mask")), np.asarray(vectors)
         checks.shape("vectors", table, (None, POSE_LENGTH))
         if values.ndim == 3 and len(values) != len(table) == values.shape[1]:
             remedy = "ASTRA's order is (rows, frames, columns): give frames.swapaxes(0, 1)"
@@ -228,6 +229,25 @@ def check_others(others: Iterable[str]) -> None:
     for name in others:
         if name not in _OTHERS:
             raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
+
+
+def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:
+    """InputError for frames that are whole numbers, or unmasked larger than line integrals are, and so raw counts."""
+    if frames.dtype.kind in "iu":
+        raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
+    opaque = frames > _OPAQUE
+    if mask is not None and np.shape(mask) in (frames.shape, frames.shape[1:]):
+        opaque &= np.asarray(mask) == 0
+    if np.count_nonzero(opaque) > _FEW * opaque.size:
+        found = f"values of up to {frames[opaque].max():g} without flats"
+        raise InputError("frames", found, f"line integrals, which are below {_OPAQUE:g}", remedy)
+
+
+def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
+    """Frames of which nobody says what they hold as ``_line_integrals``; InputError for counts too."""
+    values = checks.real_array("frames", frames)
+    check_not_counts(values, "give −ln(counts / flats)", mask)
+    return _line_integrals(values, mask)
 
 
 def _line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:

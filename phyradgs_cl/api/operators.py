@@ -35,6 +35,8 @@ class Operator:
     Raises InputError, before anything is computed, for arrays of another shape, type or device.
     """
 
+    _instead = "vjp has the derivative"
+
     def __init__(
         self,
         rt: Runtime,
@@ -65,9 +67,28 @@ class Operator:
         """The pyopencl.CommandQueue (in order) on which Arrays have to be."""
         return self.rt.queue
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(size of y, size of x), which SciPy asks for, of a ``LinearOperator``; of any other an InputError that says so."""
+        raise self._not_linear()
+
+    def __matmul__(self, x: Any) -> Any:
+        raise self._not_linear()
+
+    def _not_linear(self) -> InputError:
+        return InputError(repr(self), "what is not linear in x", "a LinearOperator", self._instead)
+
     def to_device(self, values: Any) -> Any:
-        """An array of any shape as a pyopencl Array, float32, on ``queue``: what loops on the device begin with."""
-        return given_back(self.rt, self.rt.upload(on_host("values", values)))
+        """An x or a y, or a stack of them, as a pyopencl Array, float32, on ``queue``: what loops on the device begin with.
+
+        Raises InputError for what is no array of real numbers, and one whose last axes are those of neither side.
+        """
+        array = on_host("values", values)
+        sides = self.domain_shape, self.range_shape
+        if not any(_ends_with(array.shape, side) for side in sides):
+            expected = " or ".join(_text(side) for side in sides)
+            raise InputError("values", f"shape {array.shape}", f"{expected}, or a stack of such")
+        return given_back(self.rt, self.rt.upload(array))
 
     def __call__(self, x: Any) -> Any:
         """y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
@@ -149,6 +170,9 @@ class LinearOperator(Operator, ScipyOperator):
         ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
         self._pair = forward, adjoint
 
+    shape = (0, 0)  # SciPy's, one for every operator
+    __matmul__ = ScipyOperator.__matmul__
+
     @property
     def T(self) -> LinearOperator:  # noqa: N802
         """The exact transpose: frames (F, rows, columns) to x, by the forward weights."""
@@ -172,7 +196,16 @@ def _no_derivative(_: Values) -> Values:
 
 def _shown(side: tuple[str, Shape]) -> str:
     name, shape = side
-    return f"{name} ({', '.join('any' if n is None else str(n) for n in shape)})"
+    return f"{name} {_text(shape)}"
+
+
+def _text(shape: Shape) -> str:
+    return f"({', '.join('any' if n is None else str(n) for n in shape)})"
+
+
+def _ends_with(shape: tuple[int, ...], side: Shape) -> bool:
+    last = shape[len(shape) - len(side) :]
+    return len(shape) >= len(side) and all(n in (None, found) for n, found in zip(side, last, strict=True))
 
 
 def _size(side: tuple[str, Shape]) -> int:

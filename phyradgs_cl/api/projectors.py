@@ -148,6 +148,8 @@ class GaussianOperator(Operator):
 class SplatProjection(GaussianOperator):
     """What ``splat_operator`` gives: an ``Operator`` from Gaussians to frames."""
 
+    _instead = f"of_densities(gaussians) is linear in densities; {Operator._instead}"
+
     def __init__(
         self, engine: SplatOperator, chosen: Sequence[int], intensity: Callable[[Sequence[int]], SplatOperator] | None
     ) -> None:

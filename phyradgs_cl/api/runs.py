@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +15,21 @@ from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers import load_attenuation
-from phyradgs_cl.io import read_scan, read_volume, write_scan, write_volume
+from phyradgs_cl.importers import foreign_volume, load_attenuation
+from phyradgs_cl.importers import load_volume as load_voxels
+from phyradgs_cl.io import StoredVolume, read_scan, read_state, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
-    InputOptions,
     ProgressReport,
     Reconstruction,
     State,
     ignore_progress,
+    input_names,
     input_options,
     interrupted,
     method_name,
@@ -61,14 +64,21 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record and facts.
+    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record, facts and, of an interrupted run, its state.
 
-    path: the HDF5 file. Raises InputError, which names what is wrong by its HDF5 path.
+    path: the HDF5 file, or one of ``phyradgs export`` (docs/export.md) with a grid, which has no more than that. Raises
+    InputError, which names what is wrong by its HDF5 path.
     """
-    stored = read_volume(_checked_path(path))
+    file = _checked_path(path)
+    if foreign_volume(file) is not None:
+        volume, grid = load_voxels(file)
+        if grid is None:
+            raise InputError(str(file), "values without voxel sizes", "a volume with its grid in mm")
+        return Reconstruction(volume, grid)
+    stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts)
+    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, read_state(file))
 
 
 def save_volume(
@@ -76,14 +86,24 @@ def save_volume(
 ) -> None:
     """Writes a volume file, whole or not at all: volume (nz, ny, nx) in 1/mm, lengths in mm.
 
-    path: the HDF5 file; one that exists is replaced. result: what to write. metrics: as from ``compare``, kept with it.
-    Raises InputError for what is no result, OutputError where nothing can be written.
+    path: the HDF5 file; one that exists is replaced. Under a suffix of ``phyradgs export`` (.nii, .mha, .nrrd, .tif, .npy;
+    .ply and .npz of the Gaussians) that format is written, which holds nothing else. result: what to write; the partial one
+    of an interrupted run keeps how it goes on. metrics: as from ``compare``, kept with it.
+    Raises InputError for what is no result, or a suffix of what cannot be written, OutputError where nothing can be written.
     """
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.shown(result), "a Reconstruction", remedy)
+    file = _checked_path(path)
+    if foreign_suffix(file) is not None:
+        checks.finite("volume", result.volume)
+        if metrics is not None:
+            raise InputError("metrics", f"some for {file.name}", "a file that has a place for them, as volume.h5")
+        stored = StoredVolume(result.volume, result.grid, {}, result.gaussians)
+        export_stored(stored, format_of(file, "path"), file, "result")
+        return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    write_volume(_checked_path(path), result.volume, result.grid, facts, result.gaussians, metrics)
+    write_volume(file, result.volume, result.grid, facts, result.gaussians, metrics, result.state)
 
 
 def simulate(
@@ -150,7 +170,8 @@ def reconstruct(
     grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
     (docs/methods.md#the-grid).
     seed: of what is drawn at random; the same seed on the same device gives the same bits.
-    report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
+    report: a function that is called with every ``Progress``, of voxels each iteration, of splats every 50 and where ten
+    seconds went by; True: a line with rate and time left, on a terminal or in a
     notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
     resume: the partial result of an interrupted run of the same scan and options, to go on from.
     initial: a volume from which an iterative or splatting method starts: a result, resampled where its grid is another, or
@@ -167,8 +188,7 @@ def reconstruct(
     _check_reconstruct(scan, grid, report, on_interrupt, seed)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
-    own = {f.name for f in fields(method_options(method, preset))}  # go before the frames' of the same name
-    given = {f.name: options.pop(f.name) for f in fields(InputOptions) if f.name in options and f.name not in own}
+    given = {name: options.pop(name) for name in input_names(method, preset) if name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)
     more: dict[str, Any] = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
@@ -176,10 +196,12 @@ def reconstruct(
         more["initial"] = _first_volume(initial, scan.with_grid(before).grid)
     result: Reconstruction | None = None
     try:
-        with _reporting(report) as tell, keep_finished_work():
+        with _reporting(report) as (tell, end), keep_finished_work():
             result = run_method(
                 scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more
             )
+            if result.early_stop:
+                end(f"{method_name(method)}{result.early_stop}")
     except KeyboardInterrupt as error:
         if result is None or on_interrupt == "raise":
             raise interrupted(result) from (error if result is None else None)
@@ -221,33 +243,31 @@ def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt:
 
 
 @contextmanager
-def _reporting(report: ProgressReport | bool) -> Iterator[ProgressReport]:
-    """The report that is meant; the line is ended with the body."""
+def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
+    """The report that is meant, and what says the line's last words; the line is ended with the body."""
     if not isinstance(report, bool):
-        yield report
+        yield report, lambda text: None
     elif not (report and has_reader()):
-        yield ignore_progress
+        yield ignore_progress, lambda text: None
     else:
         with Ticker("iteration") as ticker:
             ticker.stage("building kernels")
-            yield ticker.progress
+            yield ticker.progress, ticker.end
 
 
 def _state_of(partial: object, method: object, options: Any) -> State:
     """How to go on from a result that was interrupted, of the same method and options."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
-        found = (
-            checks.shown(partial)
-            if not isinstance(partial, Reconstruction)
-            else "a result that is complete, or from a file"
-        )
+        found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.shown(partial)
         raise InputError("resume", found, "the partial result of an interrupted run")
     if not method_of(method).is_resumable:
         raise InputError(
             "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
         )
-    found_facts = partial.facts.get("method"), partial.facts.get("options")
-    if found_facts != (method_name(method), option_facts(options)):
+    then, now = (
+        json.dumps(facts, sort_keys=True, default=repr) for facts in (partial.facts.get("options"), option_facts(options))
+    )
+    if partial.facts.get("method") != method_name(method) or then != now:  # as JSON: in files tuples are lists
         raise InputError(
             "resume", "another method, or other options", "those of the run that was interrupted"
         )

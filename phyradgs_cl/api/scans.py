@@ -1,5 +1,8 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
+from __future__ import annotations
+
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +12,7 @@ from numpy.typing import ArrayLike
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.field_of_view import default_grid
-from phyradgs_cl.acquisition.scan import check_others
+from phyradgs_cl.acquisition.scan import check_not_counts, check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.detector.attenuation import QUANTITIES
 from phyradgs_cl.errors import InputError
@@ -17,6 +20,10 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
 
+log = logging.getLogger(__name__)
+_TURN_RAD = 2 * np.pi
+_SLACK = 1e-3  # relative: angles come rounded
+_MANY = 16  # frames: fewer may well be of a few degrees
 _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the gantry turns
 
 
@@ -72,6 +79,7 @@ def fly_scan(
         raise InputError("exposure_deg", found, "the sign of the angles' steps", remedy)
     shutter = Shutter(exposure_s, readout_ratio * exposure_s, readout, readout_direction)
     in_turn = np.all(steps > 0)
+    _warn_of_angles(turned_deg, steps.min(initial=np.inf) if in_turn else np.inf)
     exposures = (
         (turned_deg - turned_deg[:1]) / exposure_deg
         if in_turn
@@ -102,10 +110,22 @@ def static_scan(
     Raises InputError for shapes that do not fit and numbers out of range.
     """
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
-    angle_rad = np.deg2rad(checks.numbers("angles_deg", angles_deg, (len(pixels.values),)))
+    angle_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
+    _warn_of_angles(angle_deg)
+    angle_rad = np.deg2rad(angle_deg)
     start_s = np.arange(len(angle_rad), dtype=np.float64)
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, 0.0, angle_rad, angle_rad))
     return _scan(pixels, orbit, Shutter(0.0), start_s, grid, False, others)
+
+
+def _warn_of_angles(angle_deg: np.ndarray, least_step: float = np.inf) -> None:
+    """Says what angles (F,) look like that are radians; ``least_step``: of the shortest step, how many exposures it has."""
+    span_deg = float(np.ptp(angle_deg))
+    if len(angle_deg) >= _MANY and 0 < span_deg <= _TURN_RAD * (1 + _SLACK):
+        log.warning("angles_deg: %d frames within %.4g°: are they radians? np.rad2deg(angles)", len(angle_deg), span_deg)
+    elif least_step < 1 - _SLACK:
+        found = "angles_deg: frames follow each other within %.3g of an exposure: a line would open again while it is open"
+        log.warning(found + "; expected steps of exposure_deg or more, but where turns are sorted by angle", least_step)
 
 
 def _pixels(
@@ -133,9 +153,8 @@ def _pixels(
         raise InputError(
             "flats, darks", f"some beside {held}", "both, or flats alone, beside counts", "leave them out"
         )
-    if quantity is None and flat is None and values.dtype.kind != "f":
-        remedy = 'give flats=, or quantity="attenuation"'
-        raise InputError("frames", f"whole numbers ({values.dtype}) without flats", "line integrals", remedy)
+    if quantity is None and flat is None:
+        check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
     found = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, custom=held)
     if mask is None:
         return found

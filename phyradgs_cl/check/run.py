@@ -14,6 +14,7 @@ from phyradgs_cl.check.questions.angles import check_angles
 from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
 from phyradgs_cl.check.questions.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
+from phyradgs_cl.check.questions.distances import DISTANCES, check_distances
 from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
 from phyradgs_cl.check.questions.gain import GAIN, check_gain
 from phyradgs_cl.check.questions.offset import (
@@ -59,7 +60,7 @@ def check(
     scan = prepared(_usable(scan), InputOptions())
     asks_readout = scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0
     asks_exposure = scan.shutter.exposure_s > 0
-    names = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, GAIN]
+    names = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, DISTANCES, GAIN]
     names += [READOUT] * asks_readout + [EXPOSURE] * asks_exposure
     found: list[Finding] = []
 
@@ -97,6 +98,7 @@ def check(
     is_reversed, offset, centre = _turning(rt, quick, add, fits.sees_angles)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     quick = _under(quick, is_reversed, offset, centre)
+    add(check_distances(rt, quick) if fits.sees_angles else _looks_alike(DISTANCES))
     add(check_gain(rt, quick))
     if asks_readout:
         fine = _under(some_frames(coarse(scan, FINE), fits.kept), is_reversed, offset, centre)

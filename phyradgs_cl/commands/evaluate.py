@@ -18,12 +18,13 @@ def evaluate_command(
     as_json: AsJson = False,
     picture: Annotated[
         Path | None,
-        file_option("PNG of slices: result, truth, difference.", "--picture", default="VOLUME with .png"),
+        file_option("PNG of slices: result, truth, difference.", "--picture", default="v.png of v.h5, v.nii.png of v.nii"),
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    unpacked = volume.with_suffix("") if volume.suffix == ".gz" else volume
-    facts = run_evaluation(volume, reference, picture or unpacked.with_suffix(".png"))
+    is_ours = volume.suffix in ("", ".h5")
+    usual = volume.with_suffix(".png") if is_ours else volume.with_name(f"{volume.name}.png")
+    facts = run_evaluation(volume, reference, picture or usual)
     if as_json:
         say(json.dumps(facts))
     else:

@@ -50,5 +50,5 @@ def _numbers(help: str, metavar: str, *flags: str) -> Any:
 _SIZE = "Voxels of the volume, of a single number along its longest side; the box stays as it is."
 Size = Annotated[Any, _numbers(_SIZE, "N|Z,Y,X")]
 VoxelMm = Annotated[Any, _numbers("Sides of a voxel, mm; the box stays as it is, but for whole voxels.", "D|Z,Y,X")]
-_ROI = "Box of the volume, mm about the axis; the voxels stay as they are."
-RoiMm = Annotated[Any, _numbers(_ROI, "Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")]
+_ROI = "Box of the volume, mm about the axis, or sides about the middle of the scan's; the voxels stay as they are."
+RoiMm = Annotated[Any, _numbers(_ROI, "D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")]

@@ -1,8 +1,7 @@
 """reconstruct: a scan file to a volume file."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -67,7 +66,7 @@ def reconstruct_command(
             with finish_despite_interrupt():
                 report.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
-    how = f"{job.method}{_early_stop(result.facts)}, {result.facts['seconds']:.1f} s"
+    how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s"
     say(f"{written}: {how}{scores(metrics)}")
     if profile:
         say(profile_report(runtimes[-1], result))
@@ -75,12 +74,3 @@ def reconstruct_command(
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
         complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to go on")
         raise typer.Exit(signals.status())
-
-
-def _early_stop(facts: Mapping[str, Any]) -> str:
-    """Why a method ended before its last iteration by itself; nothing where it did not."""
-    asked = facts["options"].get("iterations")
-    reason = facts.get("stopped_by")
-    if reason in (None, "iterations", "interrupt") or facts.get("iterations") in (None, asked):
-        return ""
-    return f", stopped after {facts['iterations']} of {asked} iterations ({reason})"

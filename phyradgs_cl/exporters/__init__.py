@@ -13,9 +13,12 @@ from phyradgs_cl.exporters.npy import write_npy
 from phyradgs_cl.exporters.nrrd import write_nrrd
 from phyradgs_cl.exporters.placed import Placed, hounsfield, placed
 from phyradgs_cl.exporters.tiff import write_tiff
-from phyradgs_cl.io import read_volume
+from phyradgs_cl.io import StoredVolume, read_volume
 
-__all__ = ["CLOUDS", "EXPORTS", "Placed", "default_output", "export_volume", "format_of", "hounsfield", "placed"]
+__all__ = [
+    "CLOUDS", "EXPORTS", "Placed", "default_output", "export_stored", "export_volume", "foreign_suffix", "format_of",
+    "hounsfield", "placed",
+]  # fmt: skip
 
 VOXELS: dict[str, Callable[[Path, Placed], None]] = {
     "nii": write_nifti,
@@ -46,12 +49,24 @@ def export_volume(
     _check_name(target, to, path)
     if to in CLOUDS and mu_water_per_mm is not None:
         raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
-    stored = read_volume(path)
+    export_stored(read_volume(path), to, target, str(path), mu_water_per_mm)
+    return target
+
+
+def export_stored(
+    stored: StoredVolume, to: str, target: Path, culprit: str, mu_water_per_mm: float | None = None
+) -> None:
+    """Write a volume as ``export_volume`` does; ``culprit``: where it comes from."""
     if to in CLOUDS:
-        CLOUDS[to](target, gaussians_of(stored, str(path)))
+        CLOUDS[to](target, gaussians_of(stored, culprit))
     else:
         VOXELS[to](target, placed(stored, mu_water_per_mm))
-    return target
+
+
+def foreign_suffix(output: str | Path) -> str | None:
+    """The suffix of another program's format that a name ends in: what is written under it must not be HDF5."""
+    known = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
+    return next((suffix for suffix in known if Path(output).name.lower().endswith(suffix)), None)
 
 
 def default_output(path: Path, to: str) -> Path:
@@ -59,14 +74,15 @@ def default_output(path: Path, to: str) -> Path:
     return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
 
 
-def format_of(output: str | Path | None) -> str:
+def format_of(output: str | Path | None, culprit: str = "--to") -> str:
     """The one of ``EXPORTS`` whose suffix an output's name has; InputError, which lists them, for any other."""
     for to in EXPORTS:
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to
     known = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))
     found = "neither a format nor an output" if output is None else f"output {output}"
-    raise InputError("--to", found, f"a suffix of {known}", "name the output so, or say --to, for dicom always")
+    remedy = "name the output so, or say --to, for dicom always" if culprit == "--to" else "or .h5, which holds everything"
+    raise InputError(culprit, found, f"a suffix of {known}", remedy)
 
 
 def _suffixes(to: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
 
 ROWS = 11  # mean 3, scale 3, quaternion 4, density 1
 MEAN, SCALE, QUATERNION, DENSITY = slice(0, 3), slice(3, 6), slice(6, 10), 10
@@ -22,7 +23,8 @@ class Gaussians:
     """A cloud of G Gaussians.
 
     mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; quaternion (G, 4) w x y z,
-    unit; density (G,) attenuation per that length. Raises InputError for other shapes, and for what is no finite number.
+    unit; density (G,) attenuation per that length. Raises InputError for other shapes, for what is no finite number, and
+    for scales that are not above 0.
     """
 
     mean: np.ndarray
@@ -36,6 +38,8 @@ class Gaussians:
         for name, shape in shapes.items():
             checks.numbers(f"Gaussians' {name}", getattr(self, name), shape)
             object.__setattr__(self, name, np.asarray(getattr(self, name)))
+        if (self.scale <= 0).any():
+            raise InputError("Gaussians' scale", f"{self.scale.min():g}", "lengths above 0", "of logarithms: np.exp(scale)")
 
     def __repr__(self) -> str:
         return f"Gaussians({self.count} of them)"

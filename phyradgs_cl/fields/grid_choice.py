@@ -21,7 +21,8 @@ class GridChoice:
     """How a volume's grid is to differ from its scan's; None leaves it as it is there, or as the others imply.
 
     size: voxels (z, y, x), or one count: along the longest side, the others in proportion. voxel_mm: sides of a voxel
-    (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame.
+    (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame, or its sides (z, y, x), or one
+    length of all, about the middle of the scan's grid.
 
     Raises:
         InputError: what is no such numbers or out of range, a box that ends before it begins, or all three.
@@ -44,10 +45,11 @@ class GridChoice:
                 checks.within("--voxel-mm", side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
             object.__setattr__(self, "voxel_mm", sides_mm if len(sides_mm) == 3 else sides_mm * 3)
         if self.roi_mm is not None:
-            ends_mm = _numbers("--roi-mm", self.roi_mm, (6,), "-10,10,-20,20,-20,20 (Z0,Z1,Y0,Y1,X0,X1)")
+            ends_mm = _numbers("--roi-mm", self.roi_mm, (1, 3, 6), "40 (a cube) or -10,10,-20,20,-20,20 (Z0,Z1,Y0,Y1,X0,X1)")
+            ends_mm = ends_mm * 3 if len(ends_mm) == 1 else ends_mm
             for end_mm in ends_mm:
-                checks.within("--roi-mm", end_mm, -_LARGEST_MM, _LARGEST_MM)
-            if any(b - a < 1 / _LARGEST_MM for a, b in zip(ends_mm[::2], ends_mm[1::2], strict=True)):
+                checks.within("--roi-mm", end_mm, -_LARGEST_MM if len(ends_mm) == 6 else 1 / _LARGEST_MM, _LARGEST_MM)
+            if len(ends_mm) == 6 and any(b - a < 1 / _LARGEST_MM for a, b in zip(ends_mm[::2], ends_mm[1::2], strict=True)):
                 raise InputError("--roi-mm", checks.shown(self.roi_mm), "Z0 below Z1, Y0 below Y1, X0 below X1")
             object.__setattr__(self, "roi_mm", ends_mm)
         if self.size is not None and self.voxel_mm is not None and self.roi_mm is not None:
@@ -62,18 +64,30 @@ class GridChoice:
 
         Raises InputError for more voxels than anybody means.
         """
-        box_mm = grid.box_mm if self.roi_mm is None else np.reshape(self.roi_mm, (3, 2))
+        box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
         if self.size is not None:
             shape = self._counts(sides_mm / grid.voxel_size_mm)
         elif self.voxel_mm is not None:
             shape = np.maximum(np.ceil(sides_mm / self.voxel_mm - _ROUNDING), 1)
+            if shape.max() == 1 < max(grid.shape):
+                box = " × ".join(f"{side:.4g}" for side in sides_mm)
+                expected = f"several voxels in the box of {box} mm (z, y, x)"
+                raise InputError("--voxel-mm", checks.shown(self.voxel_mm), expected)
         elif self.roi_mm is not None:
             return self._cut(grid, box_mm)
         else:
             return grid
         voxel_mm = sides_mm / shape if self.voxel_mm is None else self.voxel_mm
         return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
+
+    def _box_mm(self, grid: Grid) -> np.ndarray:
+        """Where the voxels are to begin and end (3, 2): the box that is asked for, else that of ``grid``."""
+        if self.roi_mm is None:
+            return grid.box_mm
+        if len(self.roi_mm) == 6:
+            return np.reshape(self.roi_mm, (3, 2))
+        return np.array(grid.offset_mm)[:, None] + np.outer(self.roi_mm, (-0.5, 0.5))
 
     def _counts(self, proportion: np.ndarray) -> np.ndarray:
         if isinstance(self.size, tuple):
@@ -97,7 +111,9 @@ class GridChoice:
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
     """A number, or a sequence of numbers, as finite numbers of which there may be so many."""
+    value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # Grid.box_mm is (3, 2)
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    parts = [part.item() if isinstance(part, np.generic) else part for part in parts]
     fits = len(parts) in counts and all(isinstance(n, int | float) and not isinstance(n, bool) for n in parts)
     if not (fits and all(abs(n) < 1e300 for n in parts)):  # false for NaN too
         many = " or ".join(str(count) for count in counts)

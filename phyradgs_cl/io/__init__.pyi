@@ -21,6 +21,7 @@ from .volume import StoredVolume as StoredVolume
 from .volume import file_kind as file_kind
 from .volume import load_attenuation as load_attenuation
 from .volume import load_volume as load_volume
+from .volume import read_state as read_state
 from .volume import read_volume as read_volume
 from .volume import volume_summary as volume_summary
 from .volume import write_volume as write_volume

@@ -27,7 +27,7 @@ from phyradgs_cl.text import plain_text
 _DATA = "/entry/reconstruction"
 _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
 _AXES = ("z", "y", "x")
-_GAUSSIANS = "/entry/gaussians"
+_GAUSSIANS, _STATE = "/entry/gaussians", "/entry/state"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
 _AXIS_TOLERANCE = 1e-3  # of a voxel: what axes stored in float32 need
 log = logging.getLogger(__name__)
@@ -59,9 +59,11 @@ def write_volume(
     provenance: Mapping[str, object],
     gaussians: Gaussians | None = None,
     metrics: Mapping[str, object] | None = None,
+    state: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all: ``provenance`` and
-    ``metrics`` as JSON, plain values also as attributes; ``gaussians`` as float32. InputError: a volume that is not finite
+    ``metrics`` as JSON, plain values also as attributes; ``gaussians`` as float32; ``state``: how an interrupted run goes
+    on, arrays and texts. InputError: a volume that is not finite
     or does not fit its grid. OutputError: the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
@@ -78,6 +80,10 @@ def write_volume(
             group = new_group(entry, "gaussians", "NXcollection")
             for name in _CLOUD:
                 group.create_dataset(name, data=np.asarray(getattr(gaussians, name), np.float32))
+        if state is not None:
+            group = new_group(entry, "state", "NXcollection")
+            for name, values in state.items():
+                group[name] = str(values) if values.dtype.kind == "U" else values
 
 
 def read_volume(path: str | Path) -> StoredVolume:
@@ -86,6 +92,18 @@ def read_volume(path: str | Path) -> StoredVolume:
     with open_hdf5(path) as source:
         volume, grid = _read_voxels(source)
         return StoredVolume(volume, grid, read_provenance(source), _read_gaussians(source), _read_metrics(source))
+
+
+def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
+    """How the run goes on that was interrupted and left a volume file, if that says it; whoever goes on checks the arrays.
+    What is damaged is left out, with a warning: the volume is good without."""
+    with open_hdf5(path) as source:
+        try:
+            group = source.optional_group(_STATE)
+            return None if group is None else {name: _read_part(source, f"{_STATE}/{name}") for name in group}
+        except InputError as error:
+            log.warning("%s", error)
+            return None
 
 
 def load_volume(path: str | Path) -> LoadedVolume:
@@ -250,6 +268,12 @@ def _read_bare(source: Hdf5Source) -> np.ndarray:
     return volume
 
 
+def _read_part(source: Hdf5Source, address: str) -> np.ndarray:
+    dataset = source.dataset(address)
+    is_text = h5py.check_string_dtype(dataset.dtype) is not None
+    return np.array(read_word(source, address)) if is_text else read_values(source, address, dataset)
+
+
 def _read_facts(source: Hdf5Source, name: str, schema: Schema) -> dict[str, object] | None:
     address = f"/entry/{name}/json"
     if source.optional_group(f"/entry/{name}") is None:
@@ -279,4 +303,6 @@ def _read_gaussians(source: Hdf5Source) -> Gaussians | None:
         with np.errstate(over="ignore"):  # what float32 cannot hold is infinite for everybody who reads on
             arrays[name] = read_values(source, address, dataset).astype(np.float32)
         checks.finite(source.name(address), arrays[name])
+    if (arrays["scale"] <= 0).any():
+        raise source.error(f"{_GAUSSIANS}/scale", f"{arrays['scale'].min():g}", "lengths above 0")
     return Gaussians(**arrays)

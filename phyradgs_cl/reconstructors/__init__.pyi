@@ -2,6 +2,7 @@ from .method import Method as Method
 from .preprocess import InputOptions as InputOptions
 from .registry import DEFAULT_METHOD as DEFAULT_METHOD
 from .registry import METHODS as METHODS
+from .registry import input_names as input_names
 from .registry import input_options as input_options
 from .registry import method_name as method_name
 from .registry import method_of as method_of

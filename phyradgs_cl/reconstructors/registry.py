@@ -159,7 +159,13 @@ def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.n
     if not method_of(method).takes_initial:
         taking = ", ".join(name for name, one in METHODS.items() if one.takes_initial)
         raise InputError("--initial", f"--method {method_name(method)}", f"one of {taking}", "leave --initial out")
-    return volume if grid == onto else resampled(volume, grid, onto)[0]
+    if grid == onto:
+        return volume
+    first, share = resampled(volume, grid, onto)
+    if share == 0:
+        box_mm = np.round(grid.box_mm, 3).tolist()
+        raise InputError("--initial", f"a volume in {box_mm} mm (z, y, x)", "one that meets the scan's grid")
+    return first
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:
@@ -179,6 +185,12 @@ def _check_ranks(method: str, rt: Runtime) -> None:
 def input_options(changes: Mapping[str, Any]) -> InputOptions:
     """Input options by name, checked as the methods' own are."""
     return _changed(InputOptions(), changes, "reconstruct")
+
+
+def input_names(method: object, preset: str | None = None) -> list[str]:
+    """The names of the input options, but those that the method's own options have too, which go before them."""
+    own = {f.name for f in fields(method_options(method, preset))}
+    return [f.name for f in fields(InputOptions) if f.name not in own]
 
 
 def motions_of(method: object) -> tuple[str, ...]:
@@ -262,7 +274,9 @@ def _having(option: str) -> str:
 def _converted(current: Any, value: Any, culprit: str) -> Any:
     """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
     if current is None:  # the options check it themselves
-        return value
+        return value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
     if is_dataclass(current):
         if not isinstance(value, Mapping):
             raise InputError(culprit, checks.shown(value), "a table")

@@ -49,8 +49,18 @@ class Reconstruction:
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
         of = f" of {self.gaussians.count} Gaussians" if self.gaussians is not None else ""
         at = self.facts.get("interrupted_at")
-        way = f", interrupted at iteration {at}" if at is not None else ""
+        way = f", interrupted at iteration {at}" if at is not None else self.early_stop
         return f"Reconstruction({self.facts.get('method', 'a volume')}{of}, {voxels} voxels in {sides} mm{way})"
+
+    @property
+    def early_stop(self) -> str:
+        """Why the method ended before its last iteration by itself, for the end of a line; nothing where it did not."""
+        done, reason = self.facts.get("iterations"), self.facts.get("stopped_by")
+        options = self.facts.get("options")
+        asked = options.get("iterations") if isinstance(options, Mapping) else None
+        if reason in (None, "iterations", "interrupt") or done in (None, asked):
+            return ""
+        return f", stopped after {done} of {asked} iterations ({reason})"
 
     def plot(self, scan: Scan | None = None, *, frame: int = 0, device: str | Runtime | None = None) -> Figure:
         """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.

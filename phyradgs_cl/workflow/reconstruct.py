@@ -17,6 +17,7 @@ from phyradgs_cl import __version__, checks, importers, signals
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
+from phyradgs_cl.exporters import foreign_suffix
 from phyradgs_cl.io import (
     check_writable,
     checkpoint_path,
@@ -50,7 +51,6 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 
 log = logging.getLogger(__name__)
-_FOREIGN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".npy", ".npz", ".tif", ".tiff", ".dcm", ".ply", ".png")
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,7 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
 
 def _refuse_foreign_suffix(output: Path) -> None:
     """What is written is HDF5: under another format's suffix other programs would take it for that."""
-    ending = next((end for end in _FOREIGN if output.name.lower().endswith(end)), None)
-    if ending is not None:
+    if (ending := foreign_suffix(output)) is not None:
         remedy = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as volume.h5", remedy)
 

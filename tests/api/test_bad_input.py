@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl
 import pyopencl.array
 import pytest
+from scipy.sparse.linalg import cg, lsmr, lsqr
 
 from phyradgs_cl import api
 from phyradgs_cl.api import (
@@ -106,7 +107,18 @@ def on_device(other_context: bool = False) -> pyopencl.array.Array:
     return pyopencl.array.zeros(pyopencl.CommandQueue(context), rays().domain_shape, np.float32)
 
 
+def volume_there() -> pyopencl.array.Array:
+    return rays().to_device(np.zeros(rays().domain_shape))
+
+
+def cloud(**parts: Any) -> Gaussians:
+    """One Gaussian, with ``parts`` that are wrong."""
+    rows = {"mean": np.zeros((1, 3)), "scale": np.ones((1, 3)), "quaternion": np.ones((1, 4)), "density": ONE}
+    return Gaussians(**{**rows, **parts})
+
+
 VOLUME = Reconstruction(np.zeros((4, 4, 4), np.float32), Grid.cube(4, 2.0))
+ELSEWHERE = Reconstruction(VOLUME.volume, replace(VOLUME.grid, offset_mm=(0.0, 90.0, 0.0)))
 CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "fly_scan": [
         (lambda: fly(FRAMES[0]), r"frames: found shape \(6, 8\); expected shape \(any, 6, 8\)"),
@@ -134,11 +146,13 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: fly(detector_model="linear"), "detector_model: found 'linear'"),
         (lambda: fly(grid=16), "grid: found 16; expected a Grid"),
         (lambda: fly(pixel_mask=FRAMES[0]), "pixel_mask: .*write mask="),
+        (lambda: fly(FRAMES + 51), "frames: found values of up to 51 without flats; .*give flats="),
     ],
     "static_scan": [
         (lambda: static_scan(FRAMES, CONE, ANGLES[:2]), r"angles_deg: found shape \(2,\)"),
         (lambda: static_scan(FRAMES, CONE, ANGLES, exposure_deg=3.0), "exposure_deg: found no such option"),
         (lambda: static_scan(FRAMES, CONE, ANGLES, lag=2.0), "lag: found 2.0"),
+        (lambda: static_scan(FRAMES + 4e4, CONE, ANGLES), "frames: found values of up to 40000 without flats"),
     ],
     "Scan": [
         (lambda: replace(GOOD, projections=NAN), "projections: found 192 NaN or infinite values"),
@@ -152,6 +166,9 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: replace(GOOD, pixel_mask=np.ones(6)), r"pixel_mask: found shape \(6,\)"),
         (lambda: replace(GOOD, reference=np.ones((2, 2, 2))), r"reference: found shape \(2, 2, 2\)"),
         (lambda: Scan.from_poses(FRAMES, POSES, is_fly=True), "is_fly: found no such option"),
+        (lambda: Scan.from_poses(FRAMES.astype(np.uint16), POSES), "frames: found whole numbers .*−ln"),
+        (lambda: Scan.from_poses(FRAMES + 51, POSES), "frames: found values of up to 51"),
+        (lambda: Scan.from_astra(FRAMES.astype(int), POSES), "frames: found whole numbers"),
         (lambda: GOOD.plot(4), "frame: found 4; expected a number from 0 to 3"),
         (
             lambda: reconstruct(replace(GOOD, trajectory=Nowhere()), "fdk"),
@@ -164,6 +181,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
             "source_to_axis_mm: found '5'; expected numbers",
         ),
         (lambda: ConeGeometry(5.0, -7.0, (6, 8), (1.0, 1.0)), "source_to_detector_mm: found -7.0"),
+        (lambda: ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0)), "source_to_detector_mm: found 5; .*exchanged"),
         (
             lambda: ConeGeometry(5.0, 7.0, 6, (1.0, 1.0)),
             r"detector_shape: found shape \(\); expected shape \(2\)",
@@ -227,6 +245,8 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
             "quaternion: found shape",
         ),
         (lambda: Gaussians(np.zeros(3), ONE, ONE, ONE), "Gaussians' mean: found shape"),
+        (lambda: cloud(scale=np.full((1, 3), -2.0)), r"Gaussians' scale: found -2; .*np.exp\(scale\)"),
+        (lambda: cloud(density=np.array([np.inf])), "Gaussians' density: found 1 NaN or infinite"),
     ],
     "Reconstruction": [
         (lambda: Reconstruction(np.zeros((2, 2, 2)), VOLUME.grid), r"volume: found shape \(2, 2, 2\)"),
@@ -247,6 +267,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "reconstruct": [
         (lambda: reconstruct(GOOD, "sirt", initial=np.zeros((2, 3))), "initial: found shape"),
         (lambda: reconstruct(GOOD, "fdk", initial=VOLUME), "--initial: found --method fdk"),
+        (lambda: reconstruct(GOOD, "sirt", initial=ELSEWHERE), "--initial: found a volume in .*meets the scan's"),
         (
             lambda: reconstruct("scan.h5"),
             "scan: found 'scan.h5'; expected a Scan; read a file with load_scan",
@@ -286,6 +307,10 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
             lambda: api.save_volume("v.h5", VOLUME.volume),
             r"result: .*for an array, Reconstruction\(volume, grid\)",
         ),
+        (lambda: api.save_volume("v.png", VOLUME), "path: found output v.png; .*a suffix of .nii.*or .h5"),
+        (lambda: api.save_volume("v.ply", VOLUME), "result:/entry/gaussians: found nothing there"),
+        (lambda: api.save_volume("v.nii", VOLUME, {"psnr_db": 3.0}), "metrics: found some for v.nii"),
+        (lambda: api.save_volume("v.npy", replace(VOLUME, volume=VOLUME.volume * np.nan)), "volume: found 64 NaN"),
     ],
     "compare": [
         (lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3))), "shape"),
@@ -305,6 +330,9 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: splats()(FLAT * np.nan), "rows: found .*NaN"),
         (lambda: splats().frames([1]).T(FRAMES[:1]), "T: .*call the operator first"),
         (lambda: splats().intensity.of_densities(Gaussians.from_rows(FLAT + 1)), "of_densities: .*linear"),
+        (lambda: lsqr(splats(), FRAMES.ravel()), r"SplatProjection.* not linear in x; .*of_densities\(gaussians\)"),
+        (lambda: lsmr(splats(), FRAMES.ravel()), "SplatProjection.* not linear in x"),
+        (lambda: cg(splats().T @ splats(), ONE), "Operator.* not linear in x; .*vjp"),
     ],
     "voxel_operator": [
         (lambda: voxel_operator(GOOD.grid, cutoff_sigma=-1), "cutoff_sigma"),
@@ -330,6 +358,9 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: rays().intensity.intensity, "intensity: .*line integrals"),
         (lambda: splats().intensity.intensity, "intensity: .*line integrals"),
         (lambda: rays().to_device("x"), "values: found str"),
+        (lambda: rays().to_device(FRAMES[:, 0]), r"values: found shape \(4, 8\); expected \(8, 8, 8\) or \(4, 6, 8\)"),
+        (lambda: rays().to_device(FRAMES + 1j), "values: .*complex"),
+        (lambda: lsqr(rays().intensity, ONE), "Operator.* not linear in x"),
         (lambda: rays().T(FRAMES[:1]), r"frames: found shape \(1, 6, 8\)"),
     ],
     "LinearOperator": [
@@ -338,8 +369,8 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: rays()(np.zeros(rays().domain_shape, complex)), "volume: .*complex"),
         (lambda: rays()(on_device(other_context=True)), "volume: .*another OpenCL context.*to_device"),
         (lambda: rays()(on_device()), "volume: .*another queue"),
-        (lambda: rays()(rays().to_device(0).astype(float)), "volume: .*float64"),
-        (lambda: rays()(rays().to_device(np.zeros((8, 6, 4))).transpose((2, 1, 0))), "volume: .*C order"),
+        (lambda: rays()(volume_there().astype(float)), "volume: .*float64"),
+        (lambda: rays()(volume_there().transpose((2, 1, 0))), "volume: .*C order"),
     ],
     "as_torch": [(lambda: api.as_torch(3), "torch|operator")],
 }

@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -78,7 +79,7 @@ def pressing_at(iteration: int):
 
 
 @pytest.mark.parametrize("method", ["sart", "phyradgs"])
-def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, method) -> None:
+def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path, method) -> None:
     options = {"method": method, "iterations": 8 if method == "sart" else 120, "device": rt}
     with pytest.raises(KeyboardInterrupt) as stopped:
         reconstruct(scan, **options, report=pressing_at(2 if method == "sart" else 50))
@@ -87,9 +88,18 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, method) -
         partial
     ) and f"after iteration {partial.facts['interrupted_at']}" in str(stopped.value)
     whole = reconstruct(scan, **options, report=False)
-    np.testing.assert_array_equal(
-        reconstruct(scan, **options, resume=partial, report=False).volume, whole.volume
-    )
+    api.save_volume(tmp_path / "partial.h5", partial)
+    for so_far in (partial, api.load_volume(tmp_path / "partial.h5")):
+        went_on = reconstruct(scan, **options, resume=so_far, report=False)
+        np.testing.assert_array_equal(went_on.volume, whole.volume)
+    with h5py.File(tmp_path / "partial.h5", "a") as file:
+        file["entry/state/iteration"][...] = -1
+    with pytest.raises(api.InputError, match="checkpoint, array iteration: found -1"):
+        reconstruct(scan, **options, resume=api.load_volume(tmp_path / "partial.h5"))
+    with h5py.File(tmp_path / "partial.h5", "a") as file:
+        del file["entry/state/iteration"]
+        file.create_group("entry/state/iteration")
+    assert api.load_volume(tmp_path / "partial.h5").state is None  # the volume is good without
     with pytest.raises(api.InputError, match="resume: found another method, or other options"):
         reconstruct(scan, method, iterations=9, device=rt, resume=partial)
 
@@ -169,3 +179,11 @@ def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, screen, report, is_to
     if is_told:
         assert screen.text.endswith("\n") and screen.text.count("\n") == 1 and "ETA" in screen.text
         assert ("\x1b[K" in screen.text) == screen.is_terminal
+
+
+def test_a_method_that_ends_by_itself_says_so(rt, scan, monkeypatch) -> None:
+    screen = Screen(True)
+    monkeypatch.setattr(sys, "stderr", screen)
+    result = reconstruct(scan, "cgls", iterations=30, device=rt)
+    words = f"stopped after {result.facts['iterations']} of 30 iterations (residual as small as the noise)"
+    assert screen.text.endswith(f"\x1b[Kcgls, {words}\n") and words in repr(result)

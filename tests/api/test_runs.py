@@ -35,6 +35,18 @@ def test_a_reconstruction_goes_to_a_file_and_back(rt, scan, tmp_path, method) ->
         assert np.allclose(again.gaussians.rows(), result.gaussians.rows(), rtol=1e-6, atol=1e-7)
 
 
+def test_the_suffix_says_what_is_written(rt, scan, tmp_path) -> None:
+    result = api.reconstruct(scan, "r2", iterations=2, device=rt)
+    for suffix in (".nii", ".nii.gz", ".mha", ".nrrd", ".tif", ".tiff", ".npy", ".H5", ""):
+        api.save_volume(tmp_path / f"v{suffix}", result)
+        again = api.load_volume(tmp_path / f"v{suffix}")
+        np.testing.assert_array_equal(again.volume, result.volume, err_msg=suffix)
+        assert again.grid.is_close(result.grid), suffix
+    for suffix, start in {".ply": b"ply", ".npz": b"PK", ".NII": b"\x5c\x01"}.items():
+        api.save_volume(tmp_path / f"v{suffix}", result)
+        assert (tmp_path / f"v{suffix}").read_bytes().startswith(start), suffix
+
+
 def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
     result = api.reconstruct(
         scan, "sart", motion="per-row", sub_intervals=3, iterations=1, median_filter=3, device=rt

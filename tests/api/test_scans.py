@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
-from phyradgs_cl.api import ConeGeometry, fly_scan, load_scan, reconstruct, save_scan, simulate, static_scan
+from phyradgs_cl.api import (
+    ConeGeometry,
+    Grid,
+    PerRow,
+    fly_scan,
+    initial_gaussians,
+    load_scan,
+    load_volume,
+    reconstruct,
+    save_scan,
+    save_volume,
+    simulate,
+    static_scan,
+)
 
 LIGHT, DARK = 40_000.0, 200.0
 
@@ -39,6 +54,45 @@ def test_a_gantry_that_turns_clockwise_has_a_negative_exposure() -> None:
     assert np.rad2deg(first) == pytest.approx(-20.0) and np.rad2deg(last) == pytest.approx(-30.0)
     shuffled = fly_scan(frames, cone, [0, 200, 40, 240, 80], exposure_deg=5.0, readout_ratio=0.5)
     assert np.all(np.diff(shuffled.frame_start_s) > 0)
+
+
+def test_angles_that_look_like_radians_and_lines_that_open_while_they_are_open_are_said(caplog) -> None:
+    cone = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
+    frames, turn_deg = np.zeros((20, 6, 8), np.float32), 18.0 * np.arange(20)
+    cases = [
+        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=18.0), ""),
+        (lambda: fly_scan(frames, cone, np.deg2rad(turn_deg), exposure_deg=18.0), "20 frames within 5.969°: .* radians"),
+        (lambda: fly_scan(frames, cone, -np.deg2rad(turn_deg), exposure_deg=-0.3), "radians"),
+        (lambda: static_scan(frames, cone, np.deg2rad(turn_deg)), "radians"),
+        (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
+        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=36.0), "within 0.5 of an exposure: a line would open"),
+    ]
+    for number, (make, words) in enumerate(cases):
+        caplog.clear()
+        make()
+        assert len(caplog.messages) == bool(words) and re.search(words, "".join(caplog.messages)), number
+
+
+def test_numpy_numbers_are_numbers(rt, tmp_path) -> None:
+    """Counts and lengths that come out of arrays, wherever an int or a float may stand."""
+    whole, half = np.int64, np.float32(0.5)
+    scan = simulate("jaw", size=whole(8), detector=whole(12), views=whole(6), exposure_deg=np.float32(30), device=rt)
+    how = {"motion": "micro-views", "strips": whole(2), "sub_intervals": np.uint8(2), "seed": whole(3), "device": rt}
+    results = [
+        reconstruct(scan, "sirt", iterations=whole(2), relaxation=half, size=whole(6), **how),
+        reconstruct(scan, "sirt", iterations=whole(2), motion=PerRow(whole(2)), roi_mm=0.5 * scan.grid.box_mm, device=rt),
+        reconstruct(scan, "phyradgs", iterations=whole(2), gaussians=whole(50), control={"every": whole(5)}, device=rt),
+    ]
+    for result in results:
+        save_volume(tmp_path / "v.h5", result)
+        assert load_volume(tmp_path / "v.h5").facts["options"]["iterations"] == 2
+    assert results[0].grid.shape == (6, 6, 6) and initial_gaussians(scan, whole(20), device=rt).count <= 20
+    cone = ConeGeometry(np.float32(5), whole(7), np.array([6, 8]), (half, half))
+    frames = np.zeros((4, 6, 8), np.float32)
+    fly = fly_scan(frames, cone, range(0, 40, 10), exposure_deg=whole(10), readout_ratio=half, readout_direction=whole(1))
+    fly.plot(whole(1))
+    save_scan(tmp_path / "s.h5", fly)
+    assert Grid.cube(whole(4), np.float32(2)).shape == (4, 4, 4) and load_scan(tmp_path / "s.h5").frames == 4
 
 
 def test_counts_are_divided_and_bad_pixels_masked(tmp_path) -> None:

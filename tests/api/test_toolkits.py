@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable
-from phyradgs_cl.api import Gaussians, Scan, load_scan, reconstruct, save_scan, splat_operator
+from phyradgs_cl.api import (
+    ConeGeometry,
+    Gaussians,
+    Scan,
+    load_scan,
+    reconstruct,
+    save_scan,
+    splat_operator,
+    static_scan,
+)
 from phyradgs_cl.errors import InputError
 
 RNG = np.random.default_rng(5)
@@ -73,6 +82,26 @@ def test_points_fall_where_tigre_puts_them(rt, changes) -> None:
         and scan.grid.voxel_size_mm == (5.0, 4.5, 4.0)
         and scan.grid.offset_mm == (1, -2, 3)
     )
+
+
+def test_masked_pixels_may_hold_anything_whoever_says_the_geometry() -> None:
+    mask = np.zeros(PANEL, bool)
+    mask[:2] = True
+    frames = np.where(mask, np.nan, FRAMES)
+    frames[:, 1] = 1e9  # a broken line
+    cone = ConeGeometry(400.0, 700.0, PANEL, (4.0, 3.5))
+    makers = {
+        "from_poses": lambda values: Scan.from_poses(values, cone.pose(ANGLES), pixel_mask=mask),
+        "from_astra": lambda values: Scan.from_astra(values, astra_vectors(), pixel_mask=mask),
+        "from_tigre": lambda values: Scan.from_tigre(tigre(), ANGLES, values, pixel_mask=mask),
+        "static_scan": lambda values: static_scan(values, cone, np.rad2deg(ANGLES), mask=mask),
+    }
+    for name, make in makers.items():
+        scan = make(frames)
+        assert np.isfinite(scan.projections).all() and not scan.valid[:, :2].any() and scan.valid[:, 2:].all(), name
+        if name != "static_scan":  # which masks them itself
+            with pytest.raises(InputError, match="projections: found 4 NaN"):
+                make(np.where(np.arange(PANEL[0] * PANEL[1]).reshape(PANEL) == 99, np.nan, frames))
 
 
 def astra_vectors() -> np.ndarray:

@@ -43,14 +43,15 @@ def test_a_clean_scan_has_nothing_suspicious(rt, clean) -> None:
     assert found.suspicious == []
     assert verdicts(found)["sign of rotation"] == verdicts(found)["centre of rotation"] == OK
     assert verdicts(found)["gain drift"] == verdicts(found)["consistency"] == OK
-    assert seen == [(n, 11, question) for n, question in enumerate([*verdicts(found), ""])]
+    assert verdicts(found)["distances"] == OK
+    assert seen == [(n, 12, question) for n, question in enumerate([*verdicts(found), ""])]
 
 
 def test_the_wrong_sign_of_rotation_and_scans_at_rest(rt, clean) -> None:
     found = check(negative(clean), rt)
     assert suspected(found) == ["sign of rotation"]
     asked = verdicts(check(replace(clean, is_fly=False), rt))
-    assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 10
+    assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 11
 
 
 @pytest.mark.parametrize(
@@ -67,6 +68,7 @@ def test_strips_of_a_panel_raise_no_false_alarm(rt, scan_of, rows, columns, verd
 def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt, scan_of) -> None:
     narrow = ConeGeometry(500.0, 700.0, (32, 32), (0.125, 0.125))
     scan = scan_of(narrow, views=15, exposure_deg=24.0, readout_ratio=0.5)
+    assert verdicts(check(scan, rt))["distances"] == CANNOT_TELL  # only the fan shows them
     for one in (scan, negative(scan)):
         found = verdicts(check(one, rt))
         assert found["sign of rotation"] == found["sign of readout"] == CANNOT_TELL
@@ -175,11 +177,11 @@ def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     write_scan(path, clean)
     assert cli.run(["check", str(path)]) == 0
     text = capsys.readouterr().out
-    assert text.count("\n") >= 12 and "0 of 11 questions suspicious" in text
+    assert text.count("\n") >= 12 and "0 of 12 questions suspicious" in text
     write_scan(path, negative(clean))
     assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
     facts = json.loads(capsys.readouterr().out)
-    assert facts["suspicious"] == 1 and len(facts["findings"]) == 11
+    assert facts["suspicious"] == 1 and len(facts["findings"]) == 12
     assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(
         facts["findings"][0]
     )

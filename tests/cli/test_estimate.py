@@ -150,14 +150,14 @@ def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
     monkeypatch.setattr("phyradgs_cl.commands.estimate.estimate", fake)
     before = ["--detector-model", "intensity", "--median-filter", "3", "--ignore-lag"]
     for words in (["--strips", "2", "--sub-intervals", "1"], ["--segments", "2", "--time-error", "0.01"]):
-        cli.run(["estimate", str(scan), *words, *before])
+        cli.run(["estimate", str(scan), "--method", "phyradgs", *words, *before])
     for options, before in asked:
         assert options.detector_model == "intensity"
         assert (before.median_filter, before.ignore_lag) == (3, True)
     micro, exact = (options.motion for options, _ in asked)
     assert (micro.name, micro.strips, micro.sub_intervals) == ("micro-views", 2, 1)
     assert (exact.name, exact.segments, exact.time_error) == ("exact", 2, 0.01)
-    refused(["estimate", scan, "--motion", "per-row"], "--motion")
+    refused(["estimate", scan, "--method", "phyradgs", "--motion", "per-row"], "--motion")
 
 
 def test_durations_for_people() -> None:
@@ -166,7 +166,8 @@ def test_durations_for_people() -> None:
 
 
 def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
-    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v"), "--motion", "static", "--iterations", "5"]
+    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v"), "--method", "phyradgs", "--motion", "static"]
+    command += ["--iterations", "5"]
     assert cli.run([*command, "--profile"]) == 0
     text = capsys.readouterr().out
     assert re.search(r"^splat_forward_rows +5 ", text, re.M) and re.search(r"^splat_backward_rows +5 ", text, re.M)

@@ -25,6 +25,9 @@ BOX = (-2.0, 2.0, -4.0, 4.0, 0.0, 4.0)
         ({"size": 20, "voxel_mm": 1}, (5, 10, 20), (1, 1, 1), (1, 2, 3)),
         ({"roi_mm": (-2, 2, -3.5, 4, 0, 4)}, (4, 8, 3), (1, 1, 2), (0, 0, 2)),  # the grid's own voxels: x −1 to 5
         ({"roi_mm": (-6, 2, -4, 4, 0.5, 0.6)}, (8, 8, 1), (1, 1, 2), (-2, 0, 0)),  # and beyond it
+        ({"roi_mm": 8}, (8, 8, 4), (1, 1, 2), (1, 2, 3)),  # a cube about the grid's middle
+        ({"roi_mm": (4, 8, 5)}, (4, 8, 4), (1, 1, 2), (1, 2, 3)),
+        ({"roi_mm": 6, "voxel_mm": 1.5}, (4, 4, 4), (1.5, 1.5, 1.5), (1, 2, 3)),
         ({"roi_mm": BOX, "voxel_mm": 1.5}, (3, 6, 3), (1.5, 1.5, 1.5), (0, 0, 2)),
         ({"roi_mm": BOX, "size": 4}, (2, 4, 1), (2, 2, 4), (0, 0, 2)),
         ({"roi_mm": BOX, "size": (8, 8, 8)}, (8, 8, 8), (0.5, 1, 0.5), (0, 0, 2)),
@@ -48,7 +51,8 @@ def test_what_is_chosen(choice, shape, voxel_mm, offset_mm) -> None:
         ({"voxel_mm": 0}, "--voxel-mm: found 0.0"), ({"voxel_mm": (1, -1, 1)}, "--voxel-mm: found -1.0"),
         ({"voxel_mm": float("inf")}, "--voxel-mm: found inf"),
         ({"voxel_mm": 1e-8}, "--voxel-mm: found a grid of"),
-        ({"roi_mm": BOX[:5]}, "--roi-mm: found .*6 finite numbers"), ({"roi_mm": 3}, "--roi-mm"),
+        ({"roi_mm": BOX[:5]}, "--roi-mm: found .*6 finite numbers"), ({"roi_mm": -3}, "--roi-mm: found -3.0"),
+        ({"voxel_mm": 100}, r"--voxel-mm: .*several voxels in the box of 10 × 20 × 80 mm"),
         ({"roi_mm": (2, -2, -4, 4, 0, 4)}, "--roi-mm: found .*Z0 below Z1"),
         ({"roi_mm": (0, 0, -4, 4, 0, 4)}, "--roi-mm"),
         ({"roi_mm": (-1e12, 2, -4, 4, 0, 4)}, "--roi-mm: found -1000000000000.0"),

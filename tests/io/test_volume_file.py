@@ -96,6 +96,7 @@ DAMAGE = {
     "facts a list": (_set("entry/provenance/json", "[1]"), "entry/provenance/json"),
     "gaussians": (_set(f"{GAUSSIANS}/density", [1, 2, 3, 4, np.inf]), f"{GAUSSIANS}/density"),
     "other gaussians": (_set(f"{GAUSSIANS}/scale", np.ones((4, 3))), f"{GAUSSIANS}/scale"),
+    "a negative scale": (_set(f"{GAUSSIANS}/scale", -np.ones((5, 3))), f"{GAUSSIANS}/scale"),
     "no mean": (lambda f: f.pop(f"{GAUSSIANS}/mean"), f"{GAUSSIANS}/mean"),
     "elsewhere": (_set(GAUSSIANS, h5py.ExternalLink("o.h5", "/")), GAUSSIANS),
 }  # fmt: skip

@@ -36,6 +36,7 @@ from phyradgs_cl.api import Motion, Static, ray_operator
 class Options:
     motion: Motion = Static()
     gain: float = 0.25
+    steps: int = 3
 
 
 def back(scan, options: Options, rt):
@@ -157,13 +158,20 @@ def test_the_command_line_takes_it_wherever_it_takes_a_method(cli, simulated, mo
         and facts["options"]["gain"] == 0.5
         and facts["options"]["motion"]["name"] == "per-row"
     )
+    both = ["--set", "steps=7", "--set", "median_filter=3"]  # its own goes before the frames' steps
+    assert cli.run(["reconstruct", str(scan), *run, *both, "-o", "v.h5"]) == 0
+    facts = load_volume("v.h5").facts
+    assert facts["options"]["steps"] == 7 and facts["input"] == {"ignore_lag": False, "median_filter": 3}
+    assert cli.run(["reconstruct", str(scan), *run, "--steps", "sparks", "-o", "v.h5"]) == 0
+    facts = load_volume("v.h5").facts
+    assert facts["options"]["steps"] == 3 and facts["input"]["steps"] == "sparks"
     assert cli.run(["estimate", str(scan), *run]) == 0
     assert cli.run(["info", "v.h5"]) == 0 and cli.run(["report", "v.h5", "-o", "page.html"]) == 0
     (module / "c.toml").write_text(f'method = "{name}"\ngain = 0.125\n')
     assert cli.run(["reconstruct", str(scan), "--config", "c.toml", "-o", "w.h5"]) == 0
     np.testing.assert_allclose(load_volume("w.h5").facts["options"]["gain"], 0.125)
     (module / "g.toml").write_text(
-        f'scans = ["{scan}"]\n[options]\nmethod = "{name}"\n[[grid]]\ngain = [0.1, 0.2]\n'
+        f'scans = ["{scan}"]\n[options]\nmethod = "{name}"\n[[grid]]\ngain = [0.1, 0.2]\nsteps = [5]\n'
     )
     capsys.readouterr()
     assert cli.run(["sweep", "g.toml", "-o", "swept"]) == 0

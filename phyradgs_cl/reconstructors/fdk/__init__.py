@@ -63,12 +63,12 @@ def fdk(
 ) -> Reconstruction:
     """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing."""
     started = time.perf_counter()
-    poses = [options.motion.cells(scan, f).still().line_poses() for f in range(scan.frames)]
+    frames, numbers = _seen_frames(scan)
+    poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
-    frames, axis = unmasked_frames(scan), scan.shutter.axis
     how = {"window": options.window, "extrapolate": options.extrapolate}
-    volume = fdk_volume(rt, frames, pose, scan.grid, axis=axis, **how)
+    volume = fdk_volume(rt, frames, pose, scan.grid, axis=scan.shutter.axis, **how)
     facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
@@ -140,5 +140,15 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 
 def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
     """FDK (z, y, x) in 1/mm at the mid-window poses: what other methods start from, or measure themselves by."""
-    pose = np.concatenate([Static().cells(scan, f).pose for f in range(scan.frames)])
-    return fdk_volume(rt, unmasked_frames(scan), pose, scan.grid)
+    frames, numbers = _seen_frames(scan)
+    pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
+    return fdk_volume(rt, frames, pose, scan.grid)
+
+
+def _seen_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (F, v, u) with masked pixels filled in, and their numbers: those that are masked whole are left out, as the
+    views beside them then stand for the angle between."""
+    frames, seen = unmasked_frames(scan), np.arange(scan.frames)
+    if np.asarray(scan.pixel_mask).ndim == 3:
+        seen = np.flatnonzero(scan.valid.any(axis=(1, 2)))
+    return (frames, np.arange(scan.frames)) if len(seen) in (0, scan.frames) else (frames[seen], seen)

@@ -4,7 +4,7 @@ import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
-    InputOptions,
+    input_names,
     input_options,
     method_name,
     method_options,
@@ -196,7 +196,7 @@ def _checked(values: dict[str, Any]) -> Setting:
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
-    before = {f.name: changes.pop(f.name) for f in fields(InputOptions) if f.name in changes}
+    before = {name: changes.pop(name) for name in input_names(method, preset) if name in changes}
     input_options(before)
     nested = _nested(iter(changes.items()))
     method_options(method, preset, nested)
