@@ -97,6 +97,7 @@ def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monke
 def test_a_loss_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch) -> None:
     value = ImageLoss.value
     monkeypatch.setattr(ImageLoss, "value", lambda self: value(self) * np.float32("nan"))
-    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", "phyradgs", "--iterations", "60", "--gaussians", "20") == 3
+    splats = ["--method", "phyradgs", "--iterations", "60", "--gaussians", "20"]
+    assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *splats) == 3
     assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: loss: found nan at iteration 3;")
     assert kit.names(tmp_path) == []

@@ -70,7 +70,8 @@ def test_the_same_volume_on_1_to_4_ranks(made: Made, size: int) -> None:
 
 
 def command(size: int, scan: Path, output: Path, *more: str) -> list[str]:
-    options = ["--method", "phyradgs", "--iterations", "400", "--batch", "4", "--gaussians", "300", "--checkpoint-every", "0.05"]
+    options = ["--method", "phyradgs", "--iterations", "400", "--batch", "4", "--gaussians", "300"]
+    options += ["--checkpoint-every", "0.05"]
     return [MPIEXEC, "-n", str(size), *PHYRADGS, "reconstruct", str(scan), "-o", str(output), *options, *more]
 
 

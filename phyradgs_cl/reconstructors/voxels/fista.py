@@ -1,7 +1,7 @@
 """FISTA with a prior, over subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes a grid.
 
-The volume that is asked for is a mean over each of its voxels; a ray through large voxels sees their corners too. So
-the last third of the passes is on a grid of smaller voxels, where there is room for it, and its means are the result.
+The volume that is asked for is a mean over each of its voxels, which large voxels cannot follow an edge with. So the last
+passes are on a grid of smaller ones, where there is room for it, and the result is mostly of their means.
 
 Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183) whose gradients are those of ordered
 subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
@@ -39,6 +39,8 @@ from phyradgs_cl.runtime import Runtime
 _GROWTH = 1.2  # of the residual from pass to pass: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time
+# of the passes, the result and the prior's weight: what is the smaller voxels' (docs/results/settings.md)
+_FINE_PASSES, _FINE_SHARE, _FINE_WEIGHT = 3 / 7, np.float32(2 / 3), 2 / 3
 
 
 @dataclass(frozen=True)
@@ -46,13 +48,13 @@ class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or ``package.module:function`` of one's own: (volume (nz, ny, nx) in 1/mm, noise in 1/mm) to
     a volume. prior_weight: its strength, relative to the noise of the frames as it reaches a voxel.
 
-    subvoxels: parts of a voxel's side in the last third of the passes; 0: 2 where the device has room for them, else 1.
+    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 where the device has room for them, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
     motion: Motion = PerRow()
-    iterations: int = 30
+    iterations: int = 35
     prior: str = "dct"
     prior_weight: float = 0.45
     subvoxels: int = 0
@@ -91,9 +93,9 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
-    """All passes on the scan's own grid, or two thirds of them and the rest on one of smaller voxels."""
+    """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels."""
     parts = options.subvoxels or (2 if _has_room(scan.grid, 2, rt) else 1)
-    first = options.iterations - options.iterations // 3 if parts > 1 else options.iterations
+    first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
         return _run(scan, replace(options, iterations=first), rt, report, resume, before)
@@ -102,14 +104,19 @@ def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
         assert before is not None
         grid = finer(scan.grid, parts)
         start = before.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
-        # the same threshold in 1/mm: less than the same prior, as blurred edges of small voxels are no error of the mean
-        weight = options.prior_weight / parts
+        weight = _FINE_WEIGHT * options.prior_weight
         small = replace(options, iterations=options.iterations - first, prior_weight=weight)
         return _run(replace(scan, grid=grid, reference=None), small, rt, report, resume, start)
 
     if parts == 1:
         return [Stage("voxels", first, voxels)]
-    rest = Stage("subvoxels", options.iterations - first, parted, lambda volume, before: block_means(volume, parts))
+
+    def mixed(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+        assert before is not None
+        mean: np.ndarray = before + _FINE_SHARE * (block_means(volume, parts) - before)
+        return mean
+
+    rest = Stage("subvoxels", options.iterations - first, parted, mixed)
     return [Stage("voxels", first, voxels), rest]
 
 
