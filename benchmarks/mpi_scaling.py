@@ -16,8 +16,6 @@ the parts by least squares from the strong runs, and the sum is 13 rows x 8 byte
 2 log2(R) latencies and 2 (R - 1) / R times the bytes over the network's rate. The rate of this machine is measured.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -39,11 +39,11 @@ class TimeCells:
     time_s: np.ndarray
     line_start: np.ndarray
     line_stop: np.ndarray
-    weight: NDArray[np.float64]
+    weight: "NDArray[np.float64]"
     lines: int
     axis: str = "rows"
     end_poses: np.ndarray | None = None
-    line_times: NDArray[np.float64] | None = None
+    line_times: "NDArray[np.float64] | None" = None
 
     @property
     def count(self) -> int:

@@ -1,7 +1,5 @@
 """Scans and volumes: read, written, simulated, reconstructed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace

@@ -5,8 +5,6 @@ Two estimates of about the same error whose errors correlate by ρ have a mean t
 sure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """A scan's own reconstruction and reprojection, for steps that compare frames with what they say of the object."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is made of tables of time cells: layers without two cells of a line, finer panels, segments that lines overhang."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where source, detector and pixels stand, against formulas written out element by element."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a scan sees, and its grid replaced."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

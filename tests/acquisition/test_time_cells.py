@@ -1,7 +1,5 @@
 """Time cells of every motion model: weights, times (Eq. 2 of the paper), lines and poses."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

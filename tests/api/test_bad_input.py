@@ -1,7 +1,5 @@
 """Bad input at every name of the API: one line with culprit and remedy, an InputError, and nothing half done."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

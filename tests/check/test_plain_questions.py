@@ -1,7 +1,5 @@
 """The questions that need no reconstruction: each finds what is planted for it and is silent without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

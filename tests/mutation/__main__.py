@@ -5,8 +5,6 @@ mutant on standard output; docs/results/mutants.md has a verdict on those that l
 process that has imported everything else already.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

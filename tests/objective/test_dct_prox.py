@@ -1,7 +1,5 @@
 """Shrinkage of block cosine transforms: kernel against twin, twin against what defines it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT32, FLOAT64

@@ -10,8 +10,6 @@ lane, so that builds with vectors cannot be run on it. Its check for unwritten m
 "freeze", so that it is left out where kernels have them; bounds and races are checked in all.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

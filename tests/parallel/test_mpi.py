@@ -1,7 +1,5 @@
 """Under real MPI: `make test-mpi`. The same volumes on 1 to 4 ranks, and one end for all, whoever dies."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """FDK in absolute units: uniform bodies come out at their own attenuation, whatever the size of the scanner."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FDK_MEAN, FDK_SCALE, FDK_SHEPP_LOGAN, FLOAT32

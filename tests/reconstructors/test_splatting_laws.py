@@ -1,7 +1,5 @@
 """Whole reconstructions of a tiny scan: repeatable, independent of units and exposure, stoppable."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022.
 """
 
-from __future__ import annotations
-
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.neural import NeuralOptions
 from phyradgs_cl.reconstructors.method import Method

@@ -3,8 +3,6 @@
 The one place where the scan, the field and its training meet; PyTorch is imported when a run begins.
 """
 
-from __future__ import annotations
-
 import time
 from typing import TYPE_CHECKING
 
@@ -84,7 +82,7 @@ class _Passes:
 
     quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
 
-    def __init__(self, trainer: Trainer, iterations: int) -> None:
+    def __init__(self, trainer: "Trainer", iterations: int) -> None:
         self.trainer, self.iterations = trainer, iterations
 
     @property

@@ -3,8 +3,6 @@
 Y. Cai, J. Wang, A. Yuille, Z. Zhou, A. Wang, "Structure-Aware Sparse-View X-ray 3D Reconstruction", CVPR 2024.
 """
 
-from __future__ import annotations
-
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.neural import LineOptions
 from phyradgs_cl.reconstructors.method import Method

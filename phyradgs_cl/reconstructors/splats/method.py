@@ -5,8 +5,6 @@ volume's longest side and densities by a reference (FDK's 99.9th percentile), so
 constants mean the same for every scan; both are undone on the way out.
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """PhyRadGS: exact radiative splats that know the gantry's motion (the paper's method)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan

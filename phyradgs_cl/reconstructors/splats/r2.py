@@ -1,7 +1,5 @@
 """R2-Gaussian (Zha et al. 2024): affine radiative splats with the published constants, static by default."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """CGLS: conjugate gradients on the normal equations (Hestenes and Stiefel, J. Res. NBS 49 (1952) 409)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@ Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009)
 subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

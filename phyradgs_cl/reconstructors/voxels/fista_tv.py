@@ -4,8 +4,6 @@ Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183 and IEEE Trans. Image Proce
 O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

@@ -3,8 +3,6 @@
 A method is a class with ``system``, ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

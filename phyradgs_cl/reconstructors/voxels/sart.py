@@ -3,8 +3,6 @@
 Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """SIRT: every iteration corrects for all frames at once (Gilbert, J. Theor. Biol. 36 (1972) 105)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
