@@ -29,6 +29,7 @@ from phyradgs_cl.acquisition.cells import (
     segments_for,
     static_cells,
 )
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -73,6 +74,8 @@ def test_a_line_s_pose_is_that_of_the_middle_of_its_exposure() -> None:
     strips = micro_view_cells(*where, 2, 3)
     expected = np.repeat(strips.pose[[1, 4]], LINES // 2, axis=0)
     np.testing.assert_array_equal(strips.line_poses(), expected)
+    uneven = replace(micro_view_cells(*where, 1, 2), weight=np.array([0.4, 0.6]))
+    np.testing.assert_array_equal(uneven.line_poses(), np.tile(uneven.pose[1], (LINES, 1)))
     assert static_cells(*where).line_poses().shape == (1, 12)
     with pytest.raises(InputError, match="a line without a time cell"):
         replace(strips, line_stop=strips.line_start + 1).line_poses()
@@ -95,6 +98,10 @@ def test_cells_with_motion_are_for_splats() -> None:
         moving.still()
     far = moving.scaled(50.0)
     np.testing.assert_array_equal(far.end_poses, 50.0 * moving.end_poses)
+    np.testing.assert_array_equal(far.pose, 50.0 * moving.pose)
+    table = micro_views(2, 3)
+    assert table.still() is table and table.readout == Readout("rows")
+    assert table.averages is True and micro_views(3, 1).averages is False
 
 
 @pytest.mark.parametrize("factor", [2, 3])
