@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from mutation.mutants import Mutant, mutants  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
-NEEDED = ("phyradgs_cl", "cl", "data", "tests", "cli.py", "pyproject.toml")
+NEEDED = ("phyradgs_cl", "cl", "data", "docs", "tests", "cli.py", "pyproject.toml")
 IMPORTED = [
     "numpy", "scipy.ndimage", "scipy.spatial", "h5py", "skimage.metrics", "pyopencl", "hypothesis", "pytest",
 ]
