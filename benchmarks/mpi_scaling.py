@@ -128,7 +128,7 @@ def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
         return summing(*arguments)
 
     splat_ranks.exact_sum = together  # type: ignore[assignment]
-    for name in ("add", "largest"):
+    for name in ("allreduce_sum", "allreduce_max"):
         setattr(ranks, name, clock.part(getattr(ranks, name), "sending"))
     rows = [clock.step(run) for _ in range(WARM)]
     before = ranks.sent_bytes
