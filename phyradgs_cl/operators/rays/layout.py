@@ -75,9 +75,6 @@ class RayLayout:
         self.inside(flat)[...] = volume
         return flat
 
-    def unpad_volume(self, flat: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(self.inside(flat))
-
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
         """The kernels' arguments about shapes: voxels, the first of them, pitch, voxel size, lines, width, pitch."""
         nz, ny, nx = self.brick.shape
