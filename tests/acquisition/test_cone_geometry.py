@@ -28,9 +28,12 @@ def test_source_and_pixel_centres_by_hand(angle_rad) -> None:
 
 
 def test_the_nearest_circle_of_a_circle_is_itself() -> None:
-    found = plain_geometry(GEOMETRY.pose(np.array(ANGLES_RAD)), GEOMETRY.detector_shape)
-    for name, expected in asdict(GEOMETRY).items():
-        np.testing.assert_allclose(getattr(found, name), expected, atol=TOLERANCE_MM, err_msg=name)
+    poses = GEOMETRY.pose(np.array(ANGLES_RAD))
+    for height_mm in (0.0, 40.0):
+        poses[:, [2, 5]] += height_mm
+        found = plain_geometry(poses, GEOMETRY.detector_shape)
+        for name, expected in asdict(GEOMETRY).items():
+            np.testing.assert_allclose(getattr(found, name), expected, atol=TOLERANCE_MM, err_msg=name)
 
 
 def test_middle_pixels_and_many_angles_at_once() -> None:

@@ -243,6 +243,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: api.prepare(GOOD, "rings", rings={"windo": 3}), "windo"),
     ],
     "reconstruct": [
+        (lambda: reconstruct(GOOD, "sirt", initial="volume.h5"), "initial: found .volume.h5."),
         (lambda: reconstruct(GOOD, "sirt", initial=np.zeros((2, 3))), "initial: found shape"),
         (lambda: reconstruct(GOOD, "fdk", initial=VOLUME), "--initial: found --method fdk"),
         (
