@@ -206,13 +206,14 @@ def test_geometry_and_timing_are_values() -> None:
 
 def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
     assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
-    for model, name, lowest, highest in (
-        (MicroViews, "strips", 1, 10_000), (MicroViews, "sub_intervals", 1, 10_000),
-        (PerRow, "sub_intervals", 1, 10_000), (Exact, "segments", 0, 1000), (Exact, "time_error", 1e-6, 1),
+    for model, name, ends, beyond in (
+        (MicroViews, "strips", (1, 10_000), (0, 10_001)), (MicroViews, "sub_intervals", (1, 10_000), (0, 10_001)),
+        (PerRow, "sub_intervals", (1, 10_000), (0, 10_001)), (Exact, "segments", (0, 1000), (-1, 1001)),
+        (Exact, "time_error", (1e-6, 1), (9e-7, 1.001)),
     ):
-        for inside in (lowest, highest):
+        for inside in ends:
             assert getattr(model(**{name: inside}), name) == inside
-        for outside in (lowest * 0.9 - 1e-9, highest * 1.001):
+        for outside in beyond:
             with pytest.raises(InputError):
                 model(**{name: outside})
     assert ConeGeometry(50.0, 70.0, (1, 1), (0.6, 0.5)).detector_shape == (1, 1)
