@@ -29,6 +29,8 @@ from phyradgs_cl.acquisition.cells import (
 )
 from phyradgs_cl.acquisition.motion import (
     MODELS,
+    MOTIONS,
+    STILL,
     check_own_motion,
     motion_facts,
     motion_from_facts,
@@ -146,6 +148,7 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
         assert START_S <= first_s <= last_s <= START_S + 1.1
     with pytest.raises(InputError, match="micro-views"):
         motion_of("micro-view")
+    assert [motion_of(name).name for name in MOTIONS] == list(MOTIONS) and motion_of(STILL[2]) is STILL[2]
     for model in MODELS:  # a name is no field that anybody sets
         assert "name" not in repr(model())
         with pytest.raises(TypeError, match="name"):
@@ -168,7 +171,7 @@ class Own:
         self.made = made
 
     def cells(self, scan: Scan, frame: int) -> object:
-        return self.made
+        return self.made if frame == 0 else None
 
 
 def test_cells_of_ones_own_have_to_fit_the_scan() -> None:
@@ -181,6 +184,7 @@ def test_cells_of_ones_own_have_to_fit_the_scan() -> None:
         (replace(good, axis="rows"), "cells for 10 rows"), (replace(good, pose=good.pose[:, :9]), "pose"),
         (replace(good, time_s=good.time_s[:3]), "time_s"), (replace(good, weight=0.5 * good.weight), "sum to 0.5"),
         (replace(good, weight=1.0015 * good.weight), "sum to 1.0015"),
+        (replace(good, line_stop=good.line_stop + (np.arange(12) < 3)), "sum to 2"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"motion Own.*{told}"):
             check_own_motion(Own(made), fly)
