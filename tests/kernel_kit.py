@@ -1,7 +1,5 @@
 """What tests of kernels share: a frame's cells, splats of it and their gradients, the kernels launched, how near is near."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

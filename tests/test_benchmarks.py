@@ -1,7 +1,5 @@
 """Benchmarks run, at their smallest; no figure of theirs is looked at but for being there."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Whether a device can be trusted: every kernel is asked, and one that is wrong is named."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A frame is a sum over cells: pixel lines [line_start, line_stop) of the merged f
 projection from the cell's pose. Weights of a line sum to 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,11 +39,11 @@ class TimeCells:
     time_s: np.ndarray
     line_start: np.ndarray
     line_stop: np.ndarray
-    weight: NDArray[np.float64]
+    weight: "NDArray[np.float64]"
     lines: int
     axis: str = "rows"
     end_poses: np.ndarray | None = None
-    line_times: NDArray[np.float64] | None = None
+    line_times: "NDArray[np.float64] | None" = None
 
     @property
     def count(self) -> int:

@@ -1,7 +1,5 @@
 """Scans and volumes: read, written, simulated, reconstructed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

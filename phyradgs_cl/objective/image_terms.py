@@ -6,8 +6,6 @@ Eq. 4 prints "+ SSIM"; what is minimised, there and here, is 1 − SSIM. SSIM is
 Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01², C2 = 0.03².
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 

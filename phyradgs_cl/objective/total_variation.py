@@ -3,8 +3,6 @@
 Anisotropic: the mean absolute difference between neighbouring voxels along z, y and x, added up.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, Runtime

@@ -5,8 +5,6 @@ Two estimates of about the same error whose errors correlate by ρ have a mean t
 sure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -28,9 +26,10 @@ from phyradgs_cl.reconstructors.result import (
     option_facts,
     state_arrays,
 )
+from phyradgs_cl.reconstructors.splats import phyradgs
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
-from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista
+from phyradgs_cl.reconstructors.voxels import fista
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions
 from phyradgs_cl.runtime import Runtime
 
 _VOXELS = "voxels"  # the finished volume in the state of a run that is at its splats
@@ -97,7 +96,7 @@ def fused(
         first = Reconstruction(volume, scan.grid)
     else:
         told = _part(report, 0, total, lambda state: state, lambda volume: volume)
-        first = fista(scan, options.voxels(), rt, seed=seed, report=told, resume=resume, initial=initial)
+        first = fista.METHOD.run(scan, options.voxels(), rt, seed=seed, report=told, resume=resume, initial=initial)
         if first.state is not None:  # interrupted
             return replace(first, facts=_facts(options, first, None, first.facts["interrupted_at"]))
 
@@ -107,7 +106,7 @@ def fused(
 
     told = _part(report, before, total, lambda state: {**state, _VOXELS: first.volume}, both)
     left = None if not at_splats or resume is None else {name: a for name, a in resume.items() if name != _VOXELS}
-    second = phyradgs(
+    second = phyradgs.METHOD.run(
         scan, options.splats(), rt, seed=seed, report=told, resume=left, initial=np.maximum(first.volume, 0)
     )
     at = second.facts["interrupted_at"]

@@ -1,7 +1,5 @@
 """A runtime: one device, one in-order queue, the programs built for it, and its buffers."""
 
-from __future__ import annotations
-
 import logging
 import time
 import warnings
@@ -82,7 +80,7 @@ class Runtime:
         key = (program, name, self._options(defines))
         return self._kernels.setdefault(key, Kernel(*key))
 
-    def compile(self, kernel: Kernel) -> cl.Kernel:
+    def compile(self, kernel: Kernel) -> "cl.Kernel":
         """What OpenCL launches; a program is built once for all its kernels."""
         if kernel.built is None:
             key = (kernel.program, kernel.options)
@@ -101,7 +99,7 @@ class Runtime:
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         return ("-cl-std=CL1.2", "-cl-mad-enable", *flags)
 
-    def _build(self, program: str, options: tuple[str, ...]) -> cl.Program:
+    def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
         started = time.perf_counter()
         try:
             with warnings.catch_warnings():
@@ -224,7 +222,7 @@ class Runtime:
         self._record("copy", event, 2 * count)
 
     @staticmethod
-    def local(nbytes: int) -> cl.LocalMemory:
+    def local(nbytes: int) -> "cl.LocalMemory":
         """Local memory of a work-group, as an argument of a launch."""
         return cl.LocalMemory(nbytes)
 
@@ -269,7 +267,7 @@ class Runtime:
 
     # --- profile ------------------------------------------------------------------------------------
 
-    def _record(self, name: str, event: cl.Event, nbytes: int) -> None:
+    def _record(self, name: str, event: "cl.Event", nbytes: int) -> None:
         if self.profile:
             self._profile.add(name, event, nbytes)
 

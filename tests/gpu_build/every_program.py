@@ -6,8 +6,6 @@ What can be asked for is recorded, not listed: all methods and operators run on 
 shape, on whatever device there is, with float64 and without. Exit status 1 where a compiler refuses or a kernel spills.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """What three compilers for GPUs say of a kernel that spills is read as that."""
 
-from __future__ import annotations
-
 import pytest
 from gpu_build.compilers import KernelCost, Refused, amdgcn_costs, ocloc_costs, ptxas_costs
 

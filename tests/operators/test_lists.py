@@ -1,7 +1,5 @@
 """Lists of splats per tile that outgrow their memory: nobody waits, nothing is lost, and the next ones fit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import frame_cells

@@ -1,7 +1,5 @@
 """A scan's projector and its adjoint in one launch each: twins, ⟨Ax, y⟩ = ⟨x, Aᵀy⟩, subsets, repeatable bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

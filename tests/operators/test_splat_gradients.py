@@ -1,7 +1,5 @@
 """The splat's adjoint against central differences of its float64 twin, a class of parameters at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

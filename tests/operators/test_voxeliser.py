@@ -1,7 +1,5 @@
 """The voxeliser and its adjoint against direct evaluation of the field in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import assert_between, assert_classes, assert_near, by_gaussian

@@ -1,7 +1,5 @@
 """Methods as a GPU runs them, one work-item per pixel in groups the size of a sub-group, give what vectors of lanes give."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Launches of the ray-driven projector (Joseph) and its matched adjoint: cells of many frames, one launch per operator."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

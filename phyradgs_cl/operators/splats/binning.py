@@ -1,7 +1,5 @@
 """Lists of splats per tile, by a stable counting sort on the device."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime

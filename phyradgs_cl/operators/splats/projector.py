@@ -7,8 +7,6 @@ accumulation and strip concatenation (Eq. 3) straight into the merged frame, ``s
 needs the cells of a line one by one: they are drawn into a few layers then, which ``Layers`` merges.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +49,7 @@ class _Kernels:
     chain: Kernel
 
     @classmethod
-    def declare(cls, rt: Runtime, **options: bool) -> _Kernels:
+    def declare(cls, rt: Runtime, **options: bool) -> "_Kernels":
         by_pixel = rt.pixel_items
         defines = {"IMAGE_GUARD": GUARD, **options}
         forward = "splat_forward_pixels" if by_pixel else "splat_forward_rows"

@@ -1,7 +1,5 @@
 """Voxeliser: Gaussians to a voxel grid, and its adjoint."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.fields import Grid

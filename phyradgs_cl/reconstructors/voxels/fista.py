@@ -4,29 +4,18 @@ Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009)
 subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import noise_level
-from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Prior, prior_of
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, Setting, voxel_method
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime
 
 _GROWTH = 1.2  # of the residual from pass to pass: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
@@ -55,28 +44,15 @@ class FistaOptions(IterativeOptions):
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
-def fista(
-    scan: Scan,
-    options: FistaOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
+def _started(system: System, options: FistaOptions, setting: Setting) -> "Fista":
+    scan = setting.scan
     valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
     noise = noise_level(np.asarray(scan.projections, np.float32), valid)
-
-    def make(system: System) -> Fista:
-        prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations)
-        return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
-
-    return run_iterations("fista", make, scan, options, rt, report, resume, initial, volumes=16, frames=3)
+    prior = prior_of(options.prior, setting.rt, scan.grid, options.tv_iterations)
+    return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
 
 
-METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
+METHOD = voxel_method("fista", FistaOptions(), _started, volumes=16, frames=3)
 
 
 class Fista:
