@@ -39,7 +39,7 @@ def test_lists_that_do_not_fit_give_the_same_bits(any_rt, make_cloud, make_geome
 
 @pytest.mark.parametrize("many", [binning._MANY_COUNTS, 1], ids=["short chunks", "long chunks"])
 def test_a_gpus_lists_are_a_cpus(monkeypatch, many) -> None:
-    """Clouds of less and more than a group, all in one tile or everywhere; more chunks, and more tiles, than a group scans."""
+    """Clouds of less and more than a group, all in one tile or everywhere; more chunks and tiles than one scan takes."""
     monkeypatch.setattr(binning, "_MANY_COUNTS", many)
     shapes, rng = (Runtime(), Runtime(lanes=1, pixel_items=True)), np.random.default_rng(3)
     for count, tiles, largest in ((0, (3, 2, 1), 1), (1, (1, 1, 1), 1), (65, (9, 8, 2), 5), (9000, (5, 3, 1), 40)):
