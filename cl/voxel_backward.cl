@@ -68,7 +68,12 @@ __kernel void voxel_backward(
     const vf all[SUM_COUNT] = {w_, x_, y_, z_, xx, xy, xz, yy, yz, zz};
 #if GROUP > 1
     __local float tree[SUM_COUNT * GROUP];
-    group_sums(all, SUM_COUNT, tree, out);
+    if (whole[VOX_HI + 2] >= whole[VOX_LO + 2]) { /* most Gaussians are nowhere near a small volume */
+        group_sums(all, SUM_COUNT, tree, out);
+        return;
+    }
+    for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)
+        out[f] = 0.0f;
 #else
     for (int f = 0; f < SUM_COUNT; ++f)
         out[f] = v_sum(all[f]);
