@@ -4,7 +4,7 @@
 
 No GPU is needed and none is asked: the figures are a model's. Oclgrind (``make test-oclgrind`` unpacks it; OCLGRIND names
 the Python that has it) runs every kernel of an iteration in a GPU's launch shape on a small part of the problem and counts
-what its work-items execute. A stated law takes that to the full problem, whose pairs, footprints, lists and cells are counted
+what its work-items execute. A stated law takes that to the full problem, whose pairs, footprints, lists, cells are counted
 there by running what prepares them. Bytes are each array once, at what of it is touched. A kernel takes the longer of
 instructions over issue rate and bytes over bandwidth; launches, waiting for memory and lanes that idle are not in it.
 """

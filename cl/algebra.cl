@@ -129,7 +129,8 @@ static inline float share_of(const float2 step, const sum_t squares)
             if (item < reach)                                                              \
                 scratch[item] = combined(scratch[item], scratch[item + reach]);            \
         }                                                                                  \
-        own = scratch[0];                                                                  \
+        if (item == 0)                                                                     \
+            own = scratch[0];                                                              \
     }
 
 /* of each group: sum of x y. An item takes the vectors at first_by k, then every `step`, within `span` */

@@ -56,6 +56,18 @@ def filled_by_copy(self: Runtime, array: DeviceArray, value: float) -> None:
     self.write(array, np.full(array.size, value, array.dtype))
 
 
+def copied_by_host(
+    self: Runtime, source: DeviceArray, target: DeviceArray, *,
+    nbytes: int | None = None, source_offset: int = 0, target_offset: int = 0,
+) -> None:
+    """Nor memory that was copied on the device: the host takes it there."""
+    count = source.nbytes if nbytes is None else nbytes
+    values = self.download(target)
+    taken = self.download(source).reshape(-1).view(np.uint8)[source_offset : source_offset + count]
+    values.reshape(-1).view(np.uint8)[target_offset : target_offset + count] = taken
+    self.write(target, values)
+
+
 def cloud(count: int) -> np.ndarray:
     rng = np.random.default_rng(count)
     quaternion = rng.normal(size=(4, count))
@@ -154,6 +166,7 @@ def run_one(build: str, case: str) -> int:
         launch(self, kernel, *args, **options)  # type: ignore[arg-type]
 
     Runtime.launch, Runtime.fill = noted, filled_by_copy  # type: ignore[method-assign,assignment]
+    Runtime.copy = copied_by_host  # type: ignore[method-assign]
     cases()[case](Runtime("oclgrind", **BUILDS[build]))  # type: ignore[arg-type]
     print(" ".join(sorted(launched)))
     return 0
