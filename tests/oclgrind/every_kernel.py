@@ -44,7 +44,7 @@ GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
-VECTORS_OR_FREEZES = ("asd-pocs", "fista", "phyradgs", "r2", "nothing", "operators")
+VECTORS_OR_FREEZES = ("asd-pocs", "fista", "fused", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
@@ -137,6 +137,7 @@ def method(rt: Runtime, name: str, motion: str) -> None:
         changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
     elif name != "fdk":
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
+        changes |= {"voxel_iterations": 1} if name == "fused" else {}
     reconstruct(scan, name, rt, method_options(name, None, changes))
 
 
