@@ -30,6 +30,7 @@ from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cel
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser
+from phyradgs_cl.operators.splats.binning import _SCANNED
 from phyradgs_cl.operators.splats.projector import RECORD_FLOATS
 from phyradgs_cl.optim import DeviceAdam
 from phyradgs_cl.reconstructors import method_options, reconstruct
@@ -45,7 +46,7 @@ PEAKS = {"RTX 4090": (82.6e12, 1.008e12), "H200": (67e12, 4.8e12)}
 TILE = (32, 8)  # of NVIDIA's, whose preferred multiple is 32
 LINES, COUNT, STRIPS, TIMES, TV_EDGE = 512, 50_000, 8, 5, 32
 CROP = LINES // STRIPS  # lines and pixels that Oclgrind sees: one strip
-FEW = 8  # Oclgrind sees one Gaussian in so many
+FEW_SEEN, FEW = 48, 8  # Oclgrind sees one Gaussian in so many: of those that the crop sees, and of all
 MOTIONS = ("static", "8x5", "exact")
 VOXELS, VIEWS, FEW_VIEWS = 256, 25, 3  # of FISTA-TV, on a panel of 512²
 EDGES = (12, 24)  # of its volumes that Oclgrind sees, on panels of twice as many pixels
@@ -54,7 +55,7 @@ FREE = ("phi", "bitcast", "alloca", "ret", "getelementptr", "load private", "sto
 UNIT = {
     "splat_prepare": "gaussian_cells", "splat_chain": "footprints", "splat_forward_pixels": "pairs",
     "splat_backward_group": "pairs", "bin_count_group": "entries", "bin_fill_group": "entries",
-    "bin_within_group": "counts", "bin_starts_group": "tiles",
+    "bin_within_group": "scans", "bin_starts_group": "tiles",
 }  # fmt: skip
 """What a kernel's instructions grow with; "pixels" where nothing is said."""
 
@@ -137,16 +138,17 @@ def drawn(
         "footprints": work.footprints, "pairs": work.pairs, "pixels": pixels**2, "tiles": projector.lists.total,
         "entries": int(rt.read_item(projector.lists.starts, projector.lists.total)),
         "counts": projector.lists._counts.size,
+        "scans": projector.lists.total * -(-projector.lists._counts.size // (projector.lists.total * _SCANNED)),
     }  # fmt: skip
     return projector, gaussians, cells, {name: float(count) for name, count in counts.items()}
 
 
 def seen_by_crop(motion: str) -> np.ndarray:
-    """One in ``FEW`` of the Gaussians that the middle of the panel sees, parameter rows (11, G)."""
+    """One in ``FEW_SEEN`` of the Gaussians that the middle of the panel sees, parameter rows (11, G)."""
     rt, rows = Runtime(lanes=1, pixel_items=True), cloud(COUNT, LINES, np.random.default_rng(0))
     projector, gaussians, *_ = drawn(rt, motion, CROP, rows)
     extents = rt.download(projector._extents)[: 6 * gaussians.stride].reshape(6, -1)
-    return rows[:, extents[1, :COUNT] >= extents[0, :COUNT]][:, ::FEW]
+    return rows[:, extents[1, :COUNT] >= extents[0, :COUNT]][:, ::FEW_SEEN]
 
 
 def splat_case(rt: Runtime, motion: str) -> Counts:
