@@ -49,7 +49,7 @@ CROP = LINES // STRIPS  # lines and pixels that Oclgrind sees: one strip
 FEW_SEEN, FEW = 48, 8  # Oclgrind sees one Gaussian in so many: of those that the crop sees, and of all
 MOTIONS = ("static", "8x5", "exact")
 VOXELS, VIEWS, FEW_VIEWS = 256, 25, 3  # of FISTA-TV, on a panel of 512²
-EDGES = (12, 24)  # of its volumes that Oclgrind sees, on panels of twice as many pixels
+EDGES = (6, 12)  # of its volumes that Oclgrind sees, on panels of twice as many pixels
 FREE = ("phi", "bitcast", "alloca", "ret", "getelementptr", "load private", "store private", "zext", "sext", "trunc")
 """What is no instruction of a GPU: registers, and the widening of indices, which addresses have built in."""
 UNIT = {
