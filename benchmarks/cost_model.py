@@ -49,7 +49,7 @@ CROP = LINES // STRIPS  # lines and pixels that Oclgrind sees: one strip
 FEW_SEEN, FEW = 48, 8  # Oclgrind sees one Gaussian in so many: of those that the crop sees, and of all
 MOTIONS = ("static", "8x5", "exact")
 VOXELS, VIEWS, FEW_VIEWS = 256, 25, 3  # of FISTA-TV, on a panel of 512²
-EDGES = (6, 12)  # of its volumes that Oclgrind sees, on panels of twice as many pixels
+EDGE = 12  # of its volume that Oclgrind sees, on a panel of twice as many pixels
 FREE = ("phi", "bitcast", "alloca", "ret", "getelementptr", "load private", "store private", "zext", "sext", "trunc")
 """What is no instruction of a GPU: registers, and the widening of indices, which addresses have built in."""
 UNIT = {
@@ -246,18 +246,14 @@ def iteration_of(edge: int) -> Costs:
 
 
 def fista_costs() -> Costs:
-    """Element-wise kernels grow with voxels and pixels, which grow alike; a ray with the volume's edge. The adjoint's voxels
-    have a share that grows with a frame's lines, whose cells they search: two small sizes tell both.
+    """Element-wise kernels and the adjoint grow with voxels and pixels, which grow alike; a ray with the volume's edge. How
+    the adjoint's groups look for their cells grows with the lines of a frame as well, which is left out: at least so much.
     """
-    few, more = (iteration_of(edge) for edge in EDGES)
-    grown = (VOXELS / EDGES[1]) ** 3
-    costs = {name: (count * grown, nbytes * grown) for name, (count, nbytes) in more.items()}
+    part, grown = iteration_of(EDGE), (VOXELS / EDGE) ** 3
+    costs = {name: (count * grown, nbytes * grown) for name, (count, nbytes) in part.items()}
     views, volume_bytes, frames_bytes = VIEWS / FEW_VIEWS, 4 * VOXELS**3, 4 * VIEWS * (2 * VOXELS) ** 2
-    costs["rays_forward"] = more["rays_forward"][0] * grown * views, VIEWS * volume_bytes + frames_bytes
-    each = [part["rays_adjoint"][0] / edge**3 for part, edge in ((few, EDGES[0]), (more, EDGES[1]))]
-    slope = (each[1] - each[0]) / (EDGES[1] - EDGES[0])
-    per_voxel = each[1] + slope * (VOXELS - EDGES[1])
-    costs["rays_adjoint"] = per_voxel * VOXELS**3 * views, 2 * volume_bytes + frames_bytes
+    costs["rays_forward"] = costs["rays_forward"][0] * views, VIEWS * volume_bytes + frames_bytes
+    costs["rays_adjoint"] = costs["rays_adjoint"][0] * views, 2 * volume_bytes + frames_bytes
     return costs
 
 
