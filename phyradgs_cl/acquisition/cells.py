@@ -74,12 +74,12 @@ class TimeCells:
         """Whether a line has more than one cell."""
         return bool(self.layer_numbers.any())
 
-    def scaled(self, factor: float) -> TimeCells:
+    def scaled(self, factor: float) -> "TimeCells":
         """The same cells with all lengths multiplied by ``factor``."""
         ends = None if self.end_poses is None else self.end_poses * factor
         return replace(self, pose=self.pose * factor, end_poses=ends)
 
-    def finer(self, factor: int) -> TimeCells:
+    def finer(self, factor: int) -> "TimeCells":
         """The same still cells for a panel with pixels cut into ``factor`` by ``factor``; cut lines share their times."""
         pose = self.pose.copy()
         pose[:, 6:] /= factor
@@ -87,7 +87,7 @@ class TimeCells:
         lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
         return replace(self, pose=pose, **lines)
 
-    def still(self) -> TimeCells:
+    def still(self) -> "TimeCells":
         """These cells, for operators without motion within a cell; InputError where there is some."""
         if self.is_moving:
             remedy = "take --motion per-row"

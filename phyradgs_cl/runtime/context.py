@@ -1,6 +1,7 @@
 """A runtime: one device, one in-order queue, the programs built for it, and its buffers."""
 
 import logging
+import math
 import time
 import warnings
 import weakref
@@ -259,6 +260,14 @@ class Runtime:
             width = min(max(int(asked), 16), 64)
             self._tile = width, max(min(_TILE_ITEMS, handle.max_work_group_size) // width, 1)
         return self._tile
+
+    def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
+        """Work-items, group and number of groups of kernels that step along lines of ``width`` pixels: an item takes a
+        line on a CPU, and a pixel on a GPU.
+        """
+        items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
+        sides = (*group, *([1] * (len(rows) - 1)))
+        return items, group, math.prod(-(-n // side) for n, side in zip(items, sides, strict=True))
 
     @naming_failures("the work before")
     def finish(self) -> None:

@@ -15,7 +15,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from phyradgs_cl.operators import (
     voxelise,
 )
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
-from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Runtime
+from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
 KERNELS = Path(__file__).resolve().parents[2] / "cl"
@@ -54,9 +54,16 @@ def filled_by_copy(self: Runtime, array: DeviceArray, value: float) -> None:
     self.write(array, np.full(array.size, value, array.dtype))
 
 
-def taken_by_host(self: DeviceSpace, x: DeviceArray, chosen: Sequence[int]) -> DeviceArray:
-    """Nor what is copied from a place within one array to a place within another."""
-    return self.array(self.numpy(x)[list(chosen)])
+def copied_by_host(
+    self: Runtime, source: DeviceArray, target: DeviceArray, *,
+    nbytes: int | None = None, source_offset: int = 0, target_offset: int = 0,
+) -> None:
+    """Nor memory that was copied on the device: the host takes it there."""
+    count = source.nbytes if nbytes is None else nbytes
+    values = self.download(target)
+    taken = self.download(source).reshape(-1).view(np.uint8)[source_offset : source_offset + count]
+    values.reshape(-1).view(np.uint8)[target_offset : target_offset + count] = taken
+    self.write(target, values)
 
 
 def cloud(count: int) -> np.ndarray:
@@ -128,6 +135,7 @@ def method(rt: Runtime, name: str, motion: str) -> None:
         changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
     elif name != "fdk":
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
+        changes |= {"voxel_iterations": 1} if name == "fused" else {}
     reconstruct(scan, name, rt, method_options(name, None, changes))
 
 
@@ -157,7 +165,7 @@ def run_one(build: str, case: str) -> int:
         launch(self, kernel, *args, **options)  # type: ignore[arg-type]
 
     Runtime.launch, Runtime.fill = noted, filled_by_copy  # type: ignore[method-assign,assignment]
-    DeviceSpace.take = taken_by_host  # type: ignore[method-assign]
+    Runtime.copy = copied_by_host  # type: ignore[method-assign]
     cases()[case](Runtime("oclgrind", **BUILDS[build]))  # type: ignore[arg-type]
     print(" ".join(sorted(launched)))
     return 0

@@ -24,7 +24,14 @@ DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
 DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
 PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
 _BAND_LINES = 8
-_BACKWARD_GROUP = 32
+GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
+"""How many work-items a Gaussian's adjoint takes, and how many of them along a line; by whether items are pixels."""
+
+
+def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Work-items and group of kernels in which Gaussians gather what is under them, as ``GROUP_DEFINES`` has it."""
+    items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
+    return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
@@ -57,7 +64,7 @@ class _Kernels:
         return cls(
             prepare=rt.kernel("splat_prepare", "splat_prepare", **defines),
             forward=rt.kernel("splat_forward", forward, BLOCK_PIXEL=by_pixel, **defines),
-            backward=rt.kernel("splat_backward", backward, GROUP=_BACKWARD_GROUP if by_pixel else 1, **defines),
+            backward=rt.kernel("splat_backward", backward, **GROUP_DEFINES[by_pixel], **defines),
             chain=rt.kernel("splat_chain", "splat_chain", **defines),
         )
 
@@ -157,12 +164,12 @@ class SplatProjector:
         Uses what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells.
         """
         rt = self.rt
-        group = _BACKWARD_GROUP if self.by_pixel else 1
+        items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
         kernels = self._kernels[cells.moving]
         rt.launch(
             kernels.backward,
-            gaussians.count * group,
+            items,
             self._records,
             self._seen,
             cells.cells,
@@ -176,7 +183,7 @@ class SplatProjector:
             np.int32(self.pitch),
             self.cutoff2,
             self._sums,
-            group=group if group > 1 else 16,
+            group=group,
         )
         rt.launch(
             kernels.chain,
