@@ -40,7 +40,7 @@ class Operator:
         rt: Runtime,
         domain: tuple[str, Shape],
         range_: tuple[str, Shape],
-        at: Callable[[Values], tuple[Values, Map]],
+        at: "Callable[[Values], tuple[Values, Map]]",
         *,
         frames: Callable[[list[int]], Any] | None = None,
         intensity: "Callable[[], Operator] | None" = None,

@@ -147,14 +147,14 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
 
 def reconstruct(
     scan: Scan,
-    method: str | Callable[..., Reconstruction | np.ndarray] = "phyradgs",
+    method: "str | Callable[..., Reconstruction | np.ndarray]" = "phyradgs",
     *,
     preset: str | None = None,
     grid: Grid | None = None,
     seed: int = 0,
-    report: ProgressReport | bool = True,
+    report: "ProgressReport | bool" = True,
     resume: Reconstruction | None = None,
-    initial: Reconstruction | np.ndarray | None = None,
+    initial: "Reconstruction | np.ndarray | None" = None,
     on_interrupt: str = "raise",
     device: Device = None,
     **options: Any,

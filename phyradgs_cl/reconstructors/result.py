@@ -102,8 +102,8 @@ class Progress:
     gaussians: int
     seconds: float
     quantity: str = "loss"
-    state: Callable[[], State] | None = None
-    volume: Callable[[], tuple[np.ndarray, Grid]] | None = None
+    state: "Callable[[], State] | None" = None
+    volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
 
 
 ProgressReport = Callable[[Progress], None]
