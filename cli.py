@@ -1,7 +1,5 @@
 """The command line: the commands put together. Every error is one line on stderr and an exit status of its kind."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any

@@ -8,8 +8,6 @@ largest difference: of images and volumes relative to the largest number, of gra
 the norm, worst of place, scale, rotation and density.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable, Iterator

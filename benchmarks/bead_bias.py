@@ -5,8 +5,6 @@ averaged over an exposure in place of intensities, where the forward model is ex
 over the true one, less 1; that of the total is of the whole volume.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import dataclass, field

@@ -14,8 +14,6 @@ wide as the volume; the volume is fista-tv's, every line at its own times. Cases
     wobble     0.3° and 1 pixel (RMS) per view
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections import Counter

@@ -7,8 +7,6 @@ FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifes
 is planted, which questions may rightly be suspicious (``right``), and, where nothing can tell it, why (``undecidable``).
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path

@@ -9,8 +9,6 @@ that twice the exposure fits the timing and only the frames can tell, and `narro
 where a wrong sign of rotation leaves no trace and `cannot tell` is the right answer.
 """
 
-from __future__ import annotations
-
 import argparse
 import platform
 import time

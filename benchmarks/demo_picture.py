@@ -5,8 +5,6 @@
 Two orthogonal slices through the middle, all at the truth's grey scale, PSNR in the titles.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The table that `make demo` ends with: python benchmarks/demo_table.py LABEL=EVALUATION.json ..."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

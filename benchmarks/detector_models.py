@@ -13,8 +13,6 @@ ignored: the beam is always on), lag (0.1 and 0.3; ignored: not undone), low-dos
 weighted by their transmission), pixel-area (a pixel is 4 by 4 rays; modelled: splats have a pixel's footprint).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable, Iterator

@@ -8,8 +8,6 @@ device buffers.
 On a CPU the resident memory has the buffers in it. --estimates no measures the runs alone: memory by method.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

@@ -6,8 +6,6 @@ One results file and one table, both with the device's name. A part that fails i
 driven in a GPU's launch shape, so that what will run there can be tried anywhere (with --quick: smaller).
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

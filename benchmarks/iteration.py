@@ -7,8 +7,6 @@ the mean iteration. "gaps" is what an iteration takes beyond its kernels: launch
 round of it, on the host, and counts with a hundredth per iteration (control.every).
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -9,8 +9,6 @@ buffers of more than 8 GiB, ``--voxels 1300`` has more than 2^31 of them as a wh
 32-bit ones.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """What the benchmarks share: where they ran, medians, exponents, children in processes of their own, results as JSON."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -11,8 +11,6 @@ control left out, on one scan of the foot phantom: the median over rounds in whi
 is what benchmarks/time_exact.py writes: errors of one frame.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

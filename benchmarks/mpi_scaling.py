@@ -16,8 +16,6 @@ the parts by least squares from the strong runs, and the sum is 13 rows x 8 byte
 2 log2(R) latencies and 2 (R - 1) / R times the bytes over the network's rate. The rate of this machine is measured.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -130,7 +128,7 @@ def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
         return summing(*arguments)
 
     splat_ranks.exact_sum = together  # type: ignore[assignment]
-    for name in ("add", "largest"):
+    for name in ("allreduce_sum", "allreduce_max"):
         setattr(ranks, name, clock.part(getattr(ranks, name), "sending"))
     rows = [clock.step(run) for _ in range(WARM)]
     before = ranks.sent_bytes

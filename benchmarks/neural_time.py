@@ -9,8 +9,6 @@ with --threads 1, the default, what a core that does nothing else would take, al
 call: FDK and kernel builds are in them. A run is in the file once it is done; what the file has is not run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import platform

@@ -6,8 +6,6 @@ A line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on
 ``prepared``, dB. docs/prepare.md has the table, and the figure that --figure docs/images/prepare.png draws.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import dataclass, field

@@ -11,8 +11,6 @@ threads, tells more than wall time where the machine is not quiet. Motion models
 rolling shutter that exposes and reads for a whole view.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

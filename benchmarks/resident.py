@@ -8,8 +8,6 @@ an iteration over all threads (the first one, which builds kernels, and the set-
 median of the ratios pair by pair, which a busy machine spoils less than seconds.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

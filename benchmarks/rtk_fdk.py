@@ -10,8 +10,6 @@ pair sees), against the phantom at the voxels' centres; and as RTK's tests count
 outside that field of view.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

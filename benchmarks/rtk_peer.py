@@ -7,8 +7,6 @@ a cube of `voxels` and `spacing_mm`. The result has the volume in RTK's own axes
 run, the version.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import sys
 import time

@@ -7,8 +7,6 @@ axes. Every line of standard input, ``forward`` or ``adjoint``, runs that operat
 FOLDER/NAME.npy and answers with a line of JSON: wall and processor seconds of the operator itself.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import sys

@@ -8,8 +8,6 @@ cost ~ size^p are fitted to sizes of which a launch takes more than its own over
 numbers of pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

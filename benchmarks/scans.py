@@ -1,7 +1,5 @@
 """What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of one line of JSON per run."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -6,8 +6,6 @@
 of the cutoff ellipses, "useful" ones inside the ellipses (pi/4 of the box).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

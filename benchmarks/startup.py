@@ -7,8 +7,6 @@ take most of it. "wall" and "CPU" include the process that looks at an HDF5 file
 last row is what `info` takes without it. The budget is 0.5 s on a quiet machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

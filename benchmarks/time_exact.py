@@ -10,8 +10,6 @@ kernels forward and backward: on CPUs processor time, which other programs distu
 are pairs over those of pixels that an ellipse covers at any time of their line, which blur itself asks for.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -9,8 +9,6 @@ Each run is a line of JSON; what is there already is not run again. Scans as in
 benchmarks/scans.py: rapid, rows, TIGRE's noise.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from argparse import Namespace

@@ -119,7 +119,7 @@ static inline float share_of(const float2 step, const sum_t squares)
 }
 #endif
 
-/* a group's results to one, in a tree; groups of one have nothing to do */
+/* a group's results to one, item 0's, in a tree; groups of one have nothing to do */
 #define TREE(scratch, own, combined)                                                       \
     if (get_local_size(0) > 1) {                                                           \
         const int item = (int)get_local_id(0);                                             \
@@ -129,7 +129,8 @@ static inline float share_of(const float2 step, const sum_t squares)
             if (item < reach)                                                              \
                 scratch[item] = combined(scratch[item], scratch[item + reach]);            \
         }                                                                                  \
-        own = scratch[0];                                                                  \
+        if (item == 0)                                                                     \
+            own = scratch[0];                                                              \
     }
 
 /* of each group: sum of x y. An item takes the vectors at first_by k, then every `step`, within `span` */

@@ -1,6 +1,9 @@
 /* Which splats touch which tile: a stable counting sort without atomics. Chunks of splats are counted per
    tile, the counts are summed up, then every chunk writes its entries; the order in a list is the order of
-   the splats, so sums over a list always run the same way. */
+   the splats, so sums over a list always run the same way.
+   bin_count, bin_within, bin_starts, bin_fill: a work-item per chunk, per tile, one alone, per chunk (CPUs).
+   The same with _group: a work-item per splat and a group per chunk, a group per tile, one alone, as the first (GPUs). */
+#include "common/group_sums.h"
 
 __kernel void bin_count(
     __global const int *extents, /* (6, stride): lo and hi along x, y, z; empty when hi < lo */
@@ -82,5 +85,116 @@ __kernel void bin_fill(
                     if (position < capacity)
                         entries[position] = g;
                 }
+    }
+}
+
+/* lowest and highest tile of the item's splat along x, y, z into `boxes` (6, items), none without a splat */
+ALWAYS_INLINE void share_box(
+    __global const int *extents, const int stride, const int count, const int g, const int4 tile, __local int *boxes)
+{
+    const int item = GROUP_ITEM, items = GROUP_ITEMS;
+    const int size[3] = {tile.x, tile.y, tile.z};
+    const int is_drawn = g < count && extents[stride + g] >= extents[g];
+    for (int side = 0; side < 6; ++side)
+        boxes[side * items + item] = is_drawn ? extents[(size_t)side * stride + g] / size[side / 2] : -(side & 1);
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+/* how many of the items first..stop-1 have a tile in their boxes */
+ALWAYS_INLINE int having(__local const int *boxes, const int first, const int stop, const int x, const int y, const int z)
+{
+    const int items = GROUP_ITEMS;
+    int sum = 0;
+    for (int k = first; k < stop; ++k)
+        sum += x >= boxes[k] && x <= boxes[items + k] && y >= boxes[2 * items + k] && y <= boxes[3 * items + k] &&
+               z >= boxes[4 * items + k] && z <= boxes[5 * items + k];
+    return sum;
+}
+
+#define FOR_TILES_OF(item, boxes, tiles, x, y, z, t)                                                       \
+    for (int items_ = GROUP_ITEMS, z = boxes[4 * items_ + item]; z <= boxes[5 * items_ + item]; ++z)       \
+        for (int y = boxes[2 * items_ + item]; y <= boxes[3 * items_ + item]; ++y)                         \
+            for (int x = boxes[item], t = (z * tiles.y + y) * tiles.x + x; x <= boxes[items_ + item]; ++x, ++t)
+
+__kernel void bin_count_group(
+    __global const int *extents,
+    const int stride, const int count, const int chunk, const int chunks,
+    const int4 tile, const int4 tiles,
+    __global int *counts,            /* (tiles, chunks), zero */
+    __local int *boxes)              /* (6, chunk) */
+{
+    const int item = GROUP_ITEM, k = (int)get_group_id(0);
+    share_box(extents, stride, count, k * chunk + item, tile, boxes);
+    FOR_TILES_OF(item, boxes, tiles, x, y, z, t)
+        if (having(boxes, 0, item, x, y, z) == 0) /* the first of the chunk that has the tile */
+            counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
+}
+
+/* the sum of what the items before this one give; `whole`: of all items */
+ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *whole)
+{
+    const int item = GROUP_ITEM, items = GROUP_ITEMS;
+    scratch[item] = own;
+    for (int reach = 1; reach < items; reach *= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        const long before = item >= reach ? scratch[item - reach] : 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        scratch[item] += before;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    *whole = scratch[items - 1];
+    const long sum = scratch[item] - own;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    return sum;
+}
+
+__kernel void bin_within_group(
+    const int total, const int chunks, __global int *counts, __global int *starts, __local long *scratch)
+{
+    const int t = (int)get_group_id(0);
+    if (t >= total)
+        return;
+    __global int *own = counts + (size_t)t * chunks;
+    long sum = 0, whole;
+    for (int first = 0; first < chunks; first += GROUP_ITEMS) {
+        const int k = first + GROUP_ITEM;
+        const long before = group_scan(k < chunks ? own[k] : 0, scratch, &whole);
+        if (k < chunks)
+            own[k] = (int)(sum + before);
+        sum += whole;
+    }
+    if (GROUP_ITEM == 0)
+        starts[t + 1] = (int)sum;
+}
+
+__kernel void bin_starts_group(const int total, __global int *starts, __local long *scratch)
+{
+    long sum = 0, whole;
+    for (int first = 0; first < total; first += GROUP_ITEMS) {
+        const int t = first + GROUP_ITEM;
+        const long here = t < total ? starts[t + 1] : 0;
+        const long before = group_scan(here, scratch, &whole);
+        if (t < total)
+            starts[t + 1] = (int)min(sum + before + here, (long)INT_MAX);
+        sum += whole;
+    }
+    if (GROUP_ITEM == 0)
+        starts[0] = 0;
+}
+
+__kernel void bin_fill_group(
+    __global const int *extents,
+    const int stride, const int count, const int chunk, const int chunks,
+    const int4 tile, const int4 tiles,
+    __global const int *counts, __global const int *starts,
+    __global int *entries, const int capacity,
+    __local int *boxes)
+{
+    const int item = GROUP_ITEM, k = (int)get_group_id(0), g = k * chunk + item;
+    share_box(extents, stride, count, g, tile, boxes);
+    FOR_TILES_OF(item, boxes, tiles, x, y, z, t) {
+        const int position = starts[t] + counts[(size_t)t * chunks + k] + having(boxes, 0, item, x, y, z);
+        if (position < capacity)
+            entries[position] = g;
     }
 }

@@ -1,7 +1,9 @@
 /* L1 + transmission-weighted squares + D-SSIM of one frame and its gradient, as separable passes over images with zero padding:
    guard floats, then (lines, pitch), pitch at least width + guard and everything past width zero, so that
-   a window may reach past either end of a line. Twin: objective/image_terms.py. */
+   a window may reach past either end of a line. A work-item takes every get_global_size(0)-th vector of a line: all of them
+   on a CPU, one pixel on a GPU. Twin: objective/image_terms.py. */
 #include "common/lanes.h"
+#include "common/group_sums.h"
 
 #define RADIUS 5
 
@@ -38,7 +40,7 @@ __kernel void ssim_moments(
     V_STORE(xy, moments + 4 * image + row);
 }
 
-/* columns pass, the SSIM map, its derivatives by mean(x), mean(xx), mean(xy), and the sums of a line */
+/* columns pass, the SSIM map, its derivatives by mean(x), mean(xx), mean(xy), and the sums of a group's pixels */
 __kernel void ssim_map(
     __global const float *moments, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,
@@ -46,14 +48,13 @@ __kernel void ssim_map(
     __global const float *transmission, /* read only if use_transmission */
     const int use_transmission,
     __global float *partials,        /* 3 images */
-    __global float *line_sums)       /* (lines, 4): ssim, |x - y|, masked pixels, transmission (x - y)^2 */
+    __local float *tree,             /* (4, group's items) */
+    __global float *sums)            /* (groups, 4): ssim, |x - y|, masked pixels, transmission (x - y)^2 */
 {
-    const int v = (int)get_global_id(0);
-    if (v >= lines)
-        return;
+    const int v = (int)get_global_id(1), stop = v < lines ? width : 0;
     const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
     vf ssim_sum = (vf)(0.0f), l1_sum = ssim_sum, pixels = ssim_sum, squares = ssim_sum;
-    for (int u = 0; u < width; u += LANES) {
+    for (int u = (int)get_global_id(0) * LANES; u < stop; u += (int)get_global_size(0) * LANES) {
         const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
         vf m[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
         for (int k = max(-RADIUS, -v); k <= min(RADIUS, lines - 1 - v); ++k) {
@@ -81,10 +82,8 @@ __kernel void ssim_map(
             squares += weight * V_LOAD(transmission + at) * difference * difference;
         pixels += weight;
     }
-    line_sums[4 * v] = v_sum(ssim_sum);
-    line_sums[4 * v + 1] = v_sum(l1_sum);
-    line_sums[4 * v + 2] = v_sum(pixels);
-    line_sums[4 * v + 3] = v_sum(squares);
+    const float own[4] = {v_sum(ssim_sum), v_sum(l1_sum), v_sum(pixels), v_sum(squares)};
+    group_sums(own, 4, tree, sums + 4 * (get_group_id(1) * get_num_groups(0) + get_group_id(0)));
 }
 
 /* rows pass of the three derivative images */
@@ -113,11 +112,11 @@ __kernel void image_gradient(
     const float poisson_weight,
     __global float *gradient)        /* guard, then (lines, pitch) */
 {
-    const int v = (int)get_global_id(0);
+    const int v = (int)get_global_id(1);
     if (v >= lines)
         return;
     const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
-    for (int u = 0; u < pitch; u += LANES) {
+    for (int u = (int)get_global_id(0) * LANES; u < pitch; u += (int)get_global_size(0) * LANES) {
         const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
         if (u >= width) {
             V_STORE((vf)(0.0f), gradient + at);

@@ -1,6 +1,7 @@
 /* Ray-driven projector by Joseph's method and its exactly matched adjoint, over all time cells of many frames in
-   one launch each. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample per plane of the ray's main
-   axis. Frames are padded rows, volumes too, with a border of zeros in y and z. Twin: operators/twins/rays.py. */
+   as few launches as may last. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192: one bilinear sample per plane of the ray's main
+   axis. Frames are padded rows, volumes too, with a border of zeros in y and z. AVERAGE: of a line's cells, in the forward
+   kernel. Twin: operators/twins/rays.py. */
 #include "common/intensity.h"
 #include "common/ray.h"
 #include "common/ray_window.h"
@@ -18,11 +19,11 @@ __kernel void rays_forward(
     const int4 shape, const int4 origin, /* voxels of the volume, and the first of them in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int average,                /* of a line's cells: AVERAGE_... */
+    const int frame_first,            /* in the list */
     const int add,                    /* onto the image: the log average of one more brick */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
-    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = frame_first + (int)get_global_id(2);
     if (u >= width)
         return;
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
@@ -62,7 +63,7 @@ __kernel void rays_forward(
             }
         }
         p *= r.step_mm;
-        if (average == AVERAGE_LOG) {
+        if (AVERAGE == AVERAGE_LOG) {
             total += cell[RAY_WEIGHT] * p;
             continue;
         }
@@ -71,8 +72,8 @@ __kernel void rays_forward(
         any = 1;
         intensity_add(&sum, cell[RAY_WEIGHT], p);
     }
-    if (average != AVERAGE_LOG && any)
-        total = average == AVERAGE_GAP ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
+    if (AVERAGE != AVERAGE_LOG && any)
+        total = AVERAGE == AVERAGE_GAP ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
     __global float *pixels = image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u;
     if (add)
         total += V_LOAD(pixels);
@@ -132,7 +133,7 @@ __kernel void rays_adjoint(
     __global const float *matrices,   /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
     const int matrix_stride,
     __global const int *frame_cells,  /* (F + 1,): where a frame's cells begin */
-    __global const int *frame_list, const int frame_count,
+    __global const int *frame_list, const int frame_first, const int frame_stop,
     const int4 shape, const int4 origin, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
@@ -153,7 +154,7 @@ __kernel void rays_adjoint(
             for (int y = 0; y < size.y; ++y)
                 for (int x = 0; x < size.x; ++x)
                     tile[((z + 1) * TILE_Y + y + 1) * TILE_X + x + 1] = voxels[z * sz + y * sy + x];
-    for (int n = 0; n < frame_count; ++n) {
+    for (int n = frame_first; n < frame_stop; ++n) {
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
         const int stop = frame_cells[frame_list[n] + 1];
         for (int c = frame_cells[frame_list[n]]; c < stop; c += LANES) {
@@ -202,7 +203,7 @@ static inline float ray_weight(const rays_t r, __global const float *cell, const
 __kernel void rays_adjoint(
     __global const float *image, __global const float *cells, __global const int *cell_lines,
     __global const float *matrices, const int matrix_stride,
-    __global const int *frame_cells, __global const int *frame_list, const int frame_count,
+    __global const int *frame_cells, __global const int *frame_list, const int frame_first, const int frame_stop,
     const int4 shape, const int4 origin, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
@@ -218,7 +219,7 @@ __kernel void rays_adjoint(
     __global float *to = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
     const float4 around = (float4)(0.5f * (BLOCK + 1)), middle = convert_float4(corner) + 0.5f * (BLOCK - 1);
     float sum = inside && add ? *to : 0.0f;
-    for (int n = 0; n < frame_count; ++n) {
+    for (int n = frame_first; n < frame_stop; ++n) {
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
         int first = frame_cells[frame_list[n]], stop = frame_cells[frame_list[n] + 1];
         window_t w;

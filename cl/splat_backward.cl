@@ -1,11 +1,12 @@
 /* Adjoint of the splat, first pass: a Gaussian walks its own footprint in every time cell and keeps the
    sums that the chain rule needs. Gathers only, no atomics: results repeat bit for bit.
    splat_backward_rows: one work-item per Gaussian, vectors along its lines (CPUs).
-   splat_backward_group: GROUP work-items share the pixels of a Gaussian (GPUs). */
+   splat_backward_group: a group per Gaussian, ACROSS items along a line and as many lines as fit (GPUs). */
 #if GROUP > 1
 #define SPLAT_SPACE __local
 #endif
 #include "common/footprint.h"
+#include "common/group_sums.h"
 #include "common/splat_sums.h"
 
 typedef struct { vf of[SUM_COUNT]; } splat_sums;
@@ -127,11 +128,10 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_group_id(0), item = (int)get_local_id(0);
+    const int g = (int)get_group_id(0), item = GROUP_ITEM;
     __local float tree[SUM_COUNT * GROUP], rec[RECORD], cell[CELL];
     __local const int *whole = (__local const int *)rec;
-    if (g >= count)
-        return;
+    const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int c = 0; c < cell_count; ++c) {
         const size_t at = (size_t)g * cell_count + c;
         if (!seen[at])
@@ -142,32 +142,15 @@ __kernel void splat_backward_group(ARGUMENTS)
             cell[f] = cells[c * CELL + f];
         barrier(CLK_LOCAL_MEM_FENCE);
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
-        __global const float *image = images + LAYER_AT(cell, lines, pitch);
-        const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
-        const int span = whole[REC_U_HI] - whole[REC_U_LO] + 1;
-        const int pixels = span * (whole[REC_V_HI] - whole[REC_V_LO] + 1);
+        __global const float *image = images + LAYER_AT(cell, lines, pitch) + IMAGE_GUARD;
         splat_sums mine = no_sums();
-        for (int k = item; k < pixels; k += GROUP) {
-            const int v = whole[REC_V_LO] + k / span, u = whole[REC_U_LO] + k % span;
-#if MOVING
-            if (times[TIME_WEIGHT * time_pitch + v] <= 0.0f)
-                continue;
-#endif
-            const footprint_line line = footprint_alone(rec, cell, times, time_pitch, v, path_limits);
-            gather(&mine, line, u, limit, image[IMAGE_GUARD + (size_t)v * pitch + u]);
+        for (int v = whole[REC_V_LO] + (int)get_local_id(1); v <= whole[REC_V_HI]; v += GROUP / ACROSS) {
+            const footprint_line line = footprint_within(rec, cell, times, time_pitch, v, path_limits, cutoff2);
+            for (int u = line.u_lo + (int)get_local_id(0); u <= line.u_hi; u += ACROSS)
+                gather(&mine, line, u, limit, image[(size_t)v * pitch + u]);
         }
-        for (int f = 0; f < SUM_COUNT; ++f)
-            tree[f * GROUP + item] = mine.of[f];
-        for (int reach = GROUP / 2; reach > 0; reach /= 2) {
-            barrier(CLK_LOCAL_MEM_FENCE);
-            if (item < reach)
-                for (int f = 0; f < SUM_COUNT; ++f)
-                    tree[f * GROUP + item] += tree[f * GROUP + item + reach];
-        }
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (int f = item; f < SUM_COUNT; f += GROUP)
-            sums[at * SUMS + f] = tree[f * GROUP];
-        barrier(CLK_LOCAL_MEM_FENCE);
+        group_sums(mine.of, SUM_COUNT, tree, sums + at * SUMS);
+        barrier(CLK_LOCAL_MEM_FENCE); /* all have read what the next cell writes */
     }
 }
 #endif

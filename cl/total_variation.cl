@@ -1,6 +1,8 @@
 /* Anisotropic total variation of a small volume (guard, then (z, y, pitch)): the mean absolute difference
-   between neighbours along each axis, and its gradient. A work-item takes one row of x. */
+   between neighbours along each axis, and its gradient. A work-item takes every get_global_size(0)-th vector of a row: all
+   of them on a CPU, one voxel on a GPU. */
 #include "common/lanes.h"
+#include "common/group_sums.h"
 
 static inline vf sign_of(vf d)
 {
@@ -10,15 +12,15 @@ static inline vf sign_of(vf d)
 __kernel void total_variation(
     __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* per axis x y z */
     __global float *gradient,
-    __global float *row_sums)        /* (z, y) */
+    __local float *tree,             /* (group's items) */
+    __global float *sums)            /* (groups) */
 {
-    const int y = (int)get_global_id(0), z = (int)get_global_id(1);
-    if (y >= shape.y || z >= shape.z)
-        return;
+    const int y = (int)get_global_id(1), z = (int)get_global_id(2);
+    const int stop = y < shape.y ? pitch : 0;
     const size_t row = IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
     const size_t slice = (size_t)shape.y * pitch;
     vf sum = (vf)(0.0f);
-    for (int x = 0; x < pitch; x += LANES) {
+    for (int x = (int)get_global_id(0) * LANES; x < stop; x += (int)get_global_size(0) * LANES) {
         const size_t at = row + x;
         if (x >= shape.x) {
             V_STORE((vf)(0.0f), gradient + at);
@@ -48,5 +50,6 @@ __kernel void total_variation(
         sum += V_PICK(0.0f, total, inside);
         V_STORE(V_PICK(0.0f, slope, inside), gradient + at);
     }
-    row_sums[(size_t)z * shape.y + y] = v_sum(sum);
+    const float own = v_sum(sum);
+    group_sums(&own, 1, tree, sums + (get_group_id(2) * get_num_groups(1) + get_group_id(1)) * get_num_groups(0) + get_group_id(0));
 }

@@ -1,16 +1,40 @@
 /* Adjoint of the voxeliser: each Gaussian gathers the moments of dL/dvolume under it, then chains them to
-   its parameters. */
+   its parameters. One work-item per Gaussian, vectors along its rows (CPUs), or a group of GROUP, of which ACROSS along
+   a row (GPUs). */
 #include "common/gradient.h"
+#include "common/group_sums.h"
 #include "common/voxel.h"
 
 #define SUMS 16
+#define SUM_COUNT 10
+
+#if GROUP > 1
+#define ROW_OF_GROUP ((int)get_local_id(1))
+#define PLACE_IN_ROW ((int)get_local_id(0))
+#else
+#define ROW_OF_GROUP 0
+#define PLACE_IN_ROW 0
+#endif
+
+/* the voxels of a row that are walked: of the box, and where a row costs its lanes anything, those within the cutoff */
+ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, const float limit)
+{
+#if GROUP > 1
+    const float per = 1.0f / r.u11, reach = fabs(sqrt(max(limit - r.k, 0.0f)) * per), far = 4e6f;
+    const float middle = r.x_rest - r.a0 * per;
+    return (int2)(max(lo, r.x_whole + convert_int(ceil(clamp(middle - reach - 0.01f, -far, far)))),
+                  min(hi, r.x_whole + convert_int(floor(clamp(middle + reach + 0.01f, -far, far)))));
+#else
+    return (int2)(lo, hi);
+#endif
+}
 
 __kernel void voxel_backward(
     __global const float *records, __global const float *by_volume, /* guard, then (z, y, pitch) */
     const int4 shape, const int pitch, const int count, const float cutoff2,
     __global float *sums)            /* (stride, SUMS): w, w x y z, w xx xy xz yy yz zz in voxels */
 {
-    const int g = (int)get_global_id(0);
+    const int g = (int)get_global_id(0) / ACROSS;
     if (g >= count)
         return;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
@@ -19,12 +43,13 @@ __kernel void voxel_backward(
     __global float *out = sums + (size_t)g * SUMS;
     vf w_ = (vf)(0.0f), x_ = w_, y_ = w_, z_ = w_, xx = w_, xy = w_, xz = w_, yy = w_, yz = w_, zz = w_;
     for (int z = whole[VOX_LO + 2]; z <= whole[VOX_HI + 2]; ++z)
-        for (int y = whole[VOX_LO + 1]; y <= whole[VOX_HI + 1]; ++y) {
+        for (int y = whole[VOX_LO + 1] + ROW_OF_GROUP; y <= whole[VOX_HI + 1]; y += GROUP / ACROSS) {
             const voxel_row r = voxel_row_at(rec, y, z);
             if (r.k > limit) /* a corner of the box */
                 continue;
+            const int2 span = voxel_span(r, whole[VOX_LO], whole[VOX_HI], limit);
             __global const float *row = by_volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
-            for (int x = whole[VOX_LO]; x <= whole[VOX_HI]; x += LANES) {
+            for (int x = span.x + PLACE_IN_ROW; x <= span.y; x += LANES * ACROSS) {
                 const vf dx = voxel_dx(r, x);
                 const vf w = voxel_value(r, dx, V_LOAD(row + x), limit);
                 const vf wx = w * dx;
@@ -40,16 +65,19 @@ __kernel void voxel_backward(
                 zz += w * (r.dz * r.dz);
             }
         }
-    out[0] = v_sum(w_);
-    out[1] = v_sum(x_);
-    out[2] = v_sum(y_);
-    out[3] = v_sum(z_);
-    out[4] = v_sum(xx);
-    out[5] = v_sum(xy);
-    out[6] = v_sum(xz);
-    out[7] = v_sum(yy);
-    out[8] = v_sum(yz);
-    out[9] = v_sum(zz);
+    const vf all[SUM_COUNT] = {w_, x_, y_, z_, xx, xy, xz, yy, yz, zz};
+#if GROUP > 1
+    __local float tree[SUM_COUNT * GROUP];
+    if (whole[VOX_HI + 2] >= whole[VOX_LO + 2]) { /* most Gaussians are nowhere near a small volume */
+        group_sums(all, SUM_COUNT, tree, out);
+        return;
+    }
+    for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)
+        out[f] = 0.0f;
+#else
+    for (int f = 0; f < SUM_COUNT; ++f)
+        out[f] = v_sum(all[f]);
+#endif
 }
 
 __kernel void voxel_chain(
@@ -60,8 +88,8 @@ __kernel void voxel_chain(
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
-    float fields[10 * LANES];
-    gather_sums(sums + (size_t)first * SUMS, SUMS, 10, fields);
+    float fields[SUM_COUNT * LANES];
+    gather_sums(sums + (size_t)first * SUMS, SUMS, SUM_COUNT, fields);
     const gaussian g = gaussian_load(gaussians, first, stride);
     const v3 scale = g.scale, inv = g.inv_scale;
     const frame3 axes = g.axes;

@@ -10,8 +10,6 @@ result_plot.png    what ``result.plot`` draws
 The first three are computed on the spot in float64 and need no OpenCL device.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

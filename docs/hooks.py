@@ -1,7 +1,5 @@
 """What mkdocs needs to know of these pages: formulas become MathML, which browsers draw without scripts or network."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 from xml.etree.ElementTree import Element

@@ -3,8 +3,6 @@
 tests/test_docs.py fails when what is committed is not what this writes.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Iterator
@@ -72,7 +70,8 @@ def examples_page() -> str:
 def _entry(name: str, thing: object, heading: str) -> Iterator[str]:
     yield f"{heading}{name}\n"
     signature = str(inspect.signature(thing)).replace("'", "")  # type: ignore[arg-type]
-    signature = re.sub(r"\bphyradgs_cl\.[a-z_.]*", "", signature).replace("numpy.", "np.")  # as the code writes them
+    signature = re.sub(r"\b(phyradgs_cl|collections|pathlib|typing)\.[a-z_.]*", "", signature)  # as the code writes them
+    signature = signature.replace("numpy.", "np.")
     signature = re.sub(r"<function (\w+) at 0x\w+>", r"\1", signature)  # where it lies changes from run to run
     yield f"```python\n{name}{signature}\n```\n"
     yield f"```text\n{inspect.getdoc(thing) or ''}\n```\n"

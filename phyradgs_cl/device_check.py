@@ -4,8 +4,6 @@ Gradients are held against central differences of the twins. Limits are several 
 that rounds as OpenCL asks, and far below what a wrong kernel does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial

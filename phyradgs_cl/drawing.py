@@ -3,8 +3,6 @@
 matplotlib is imported when something is drawn.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import sys
@@ -21,23 +19,20 @@ EXPOSED, EDGE, CURVE, RESTING = "#f3d37a", "#8a6d1a", "#b3261e", "#2b5c8a"
 _BAR = 0.3  # of a picture's width, at most
 
 
-def new_figure(width_inch: float, height_inch: float) -> Figure:
+def new_figure(width_inch: float, height_inch: float) -> "Figure":
     """An empty figure: pyplot's where somebody has imported that, so that ``show()`` finds it; else one by itself."""
     if "ipykernel" in sys.modules:
         with suppress(ImportError):  # a cell shows what it ends with, once
             importlib.import_module("matplotlib_inline.backend_inline")
     elif "matplotlib.pyplot" in sys.modules:
-        figure: Figure = sys.modules["matplotlib.pyplot"].figure(
-            figsize=(width_inch, height_inch), layout="constrained"
-        )
-        return figure
+        return sys.modules["matplotlib.pyplot"].figure(figsize=(width_inch, height_inch), layout="constrained")
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_inch, height_inch), layout="constrained")
 
 
 def draw_image(
-    axes: Axes, image: np.ndarray, title: str, *, size_mm: tuple[float, float] | None = None, **how: Any
+    axes: "Axes", image: np.ndarray, title: str, *, size_mm: tuple[float, float] | None = None, **how: Any
 ) -> None:
     """An image (rows, columns), row 0 below, with a bar of its values, and of its length where ``size_mm`` (v, u) is known.
 

@@ -1,7 +1,5 @@
 """Runtimes and random clouds for all rooms; ``tolerances`` and the benchmarks' ``tables`` can be imported."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

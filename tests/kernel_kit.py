@@ -1,7 +1,5 @@
 """What tests of kernels share: a frame's cells, splats of it and their gradients, the kernels launched, how near is near."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -27,6 +25,10 @@ CELLS = {
     "per-row": (per_line_cells, (3,)),
 }  # fmt: skip
 ROLLING = Shutter(0.8, 0.6)
+CPU_ONLY = {
+    "backproject_upright", "bin_count", "bin_fill", "bin_starts", "bin_within", "rays_upright", "splat_backward_rows",
+    "splat_forward_rows", "turn_upright",
+}  # fmt: skip
 
 
 def frame_cells(

@@ -1,7 +1,5 @@
 """Little memory, and memory that is refused, for the tests of operators that work in bricks."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """What `make test` runs: rooms, files and single tests, by how their names begin. `make test-all` runs the others too."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent

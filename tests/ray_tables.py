@@ -1,7 +1,5 @@
 """Time cells of a few frames, and noise, for the tests of ray-driven operators."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter

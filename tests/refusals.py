@@ -1,7 +1,5 @@
 """Many wrong arguments, one loop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import pytest

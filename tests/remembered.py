@@ -1,7 +1,5 @@
 """Twins that are asked once: what they give does not depend on how a kernel was built, of which there are four ways."""
 
-from __future__ import annotations
-
 import hashlib
 import pickle
 from collections.abc import Callable

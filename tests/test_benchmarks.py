@@ -1,13 +1,12 @@
 """Benchmarks run, at their smallest; no figure of theirs is looked at but for being there."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cost_model
 import h5py
 import numpy as np
 import pytest
@@ -101,3 +100,15 @@ def test_startup(tmp_path) -> None:
     rows = json.loads((tmp_path / "facts.json").read_text())["rows"]
     assert len(rows) == 6 and all(f"| `{row['command']}` |" in told for row in rows)
     assert all(row["import_s"] > 0 and row["cpu_s"] > 0 for row in rows)
+
+
+def test_a_model_of_cost_reads_what_oclgrind_counts() -> None:
+    """Registers are no instructions; the longer of both bounds is taken, in milliseconds."""
+    counts = "  1,000 - load global (4 bytes)\n  30 - fmul\n  7 - phi\n  5 - load private (20 bytes)\n".replace(",", "")
+    report = "".join(f"Instructions executed for kernel '{name}':\n{counts}\n" for name in ("one", "two"))
+    assert cost_model.instructions(report) == [("one", 1030), ("two", 1030)]
+    costs = {"one": (41.3e9, 1.008e9), "two": (41.3e6, 2.016e9)}
+    assert cost_model.times_ms(costs)["RTX 4090"] == {
+        "one": (pytest.approx(1), "instructions"), "two": (pytest.approx(2), "bytes")
+    }  # fmt: skip
+    assert "| all | | | **3** |" in cost_model.table("both", costs)

@@ -1,11 +1,10 @@
 """Whether a device can be trusted: every kernel is asked, and one that is wrong is named."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
 import pytest
+from kernel_kit import CPU_ONLY
 
 from phyradgs_cl import device_check
 from phyradgs_cl.device_check import check_device
@@ -13,13 +12,9 @@ from phyradgs_cl.runtime import context
 from phyradgs_cl.runtime.source import kernel_source
 
 KERNELS = Path(__file__).resolve().parent.parent / "cl"
-SHAPES = {
-    "CPU": ({"pixel_items": False}, {"splat_forward_pixels", "splat_backward_group"}),
-    "GPU": (
-        {"lanes": 1, "pixel_items": True},
-        {"splat_forward_rows", "splat_backward_rows", "backproject_upright", "turn_upright", "rays_upright"},
-    ),
-}
+GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}
+GPU_ONLY |= {"bin_count_group", "bin_within_group", "bin_starts_group", "bin_fill_group"}
+SHAPES = {"CPU": ({"pixel_items": False}, GPU_ONLY), "GPU": ({"lanes": 1, "pixel_items": True}, CPU_ONLY)}
 
 
 @pytest.mark.parametrize(("launch_shape", "others"), SHAPES.values(), ids=SHAPES)

@@ -1,7 +1,5 @@
 """The documentation keeps up with the code: every option is there, and the worked example works."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

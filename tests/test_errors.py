@@ -1,7 +1,5 @@
 """Errors say everything on one line; checks raise exactly where they should."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

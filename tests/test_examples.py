@@ -1,7 +1,5 @@
 """The scripts in examples/: short, run as they stand, and shown in the documentation as they are."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

@@ -4,8 +4,6 @@ Rooms on one floor do not see each other. Which room is on which floor says the 
 has to have a room there before the tests pass.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter

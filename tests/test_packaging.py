@@ -1,7 +1,5 @@
 """What an installation needs travels with it: kernels, data and command line, in a wheel as in a checkout."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

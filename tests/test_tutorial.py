@@ -1,7 +1,5 @@
 """The tutorial runs from top to bottom as it stands, but on small scans: every command, script and file of it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

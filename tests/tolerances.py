@@ -3,8 +3,6 @@
 Relative errors of images are to the peak of the image, of gradients the norm of the difference over the norm.
 """
 
-from __future__ import annotations
-
 # --- rounding ------------------------------------------------------------------------------------------------
 FLOAT64 = 1e-9  # two float64 ways to one number of order 1, or its relative error
 SUMS = 1e-12  # sums of float32 products in float64, or in pairs of float32, over the norms (5e-14)

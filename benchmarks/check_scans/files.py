@@ -1,7 +1,5 @@
 """Writes scans by the documented formats: NXtomo by h5py, or TIFF folders and RTK stacks for `phyradgs import`."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

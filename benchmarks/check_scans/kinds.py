@@ -1,7 +1,5 @@
 """The scans: what was really done, what the file states, and whose alarm is right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

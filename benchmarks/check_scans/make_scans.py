@@ -13,8 +13,6 @@ file, group, kind, object, what was planted, which questions are right to alarm,
 a fault cannot be decided. A scan that is in the manifest is not made again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """Objects to scan: densities (z, y, x) of any scale on a cube of SIZE^3 voxels, SIDE_MM wide."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 World axes as docs/mathematics.md has them: RTK's (X, Y, Z) are (y, z, x) here, gantry angles are the same.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import itk

@@ -1,7 +1,5 @@
 """Cases: one object scanned by one protocol with one seed, on a moving and on a gantry at rest, and how to score it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol as Interface

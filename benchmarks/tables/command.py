@@ -1,7 +1,5 @@
 """The command line: methods compared on volumes, as in the paper's tables."""
 
-from __future__ import annotations
-
 from enum import Enum
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Slices of every run, kept small beside the results, and figures that put the rows of a table side by side."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

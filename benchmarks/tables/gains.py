@@ -1,7 +1,5 @@
 """What a model of the motion gives a method: its runs less the static ones of the same volumes and seeds."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

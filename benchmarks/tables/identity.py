@@ -1,7 +1,5 @@
 """One name, one object: results of a volume are not mixed with those of another that has its name."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path

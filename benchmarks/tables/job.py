@@ -1,7 +1,5 @@
 """What a benchmark is told to do, and the runs that follow from it, checked before any work."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -99,7 +97,7 @@ class BenchJob:
         )
         return "_".join(part for part in parts if part)
 
-    def with_all(self, lines: Sequence[Line]) -> BenchJob:
+    def with_all(self, lines: Sequence[Line]) -> "BenchJob":
         """The job whose table has everything of its kind and size that the lines hold, whatever is to be run now.
 
         Rows of the kind are always there, others where they have results or are asked for.

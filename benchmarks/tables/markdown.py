@@ -1,7 +1,5 @@
 """The Markdown of a benchmark's tables: means of every row, what a model of the motion gives, volumes one by one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from tables.case import FLY, STILL

@@ -4,8 +4,6 @@
 phantom is known here as well, and the beads give roundness, edge sharpness and bias.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

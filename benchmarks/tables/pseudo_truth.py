@@ -1,7 +1,5 @@
 """The reference of the phantom study: made once for a size and seed, kept beside the results."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 

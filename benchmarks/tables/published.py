@@ -3,8 +3,6 @@
 PhyRadGS, Tables 1 and 2: PSNR in dB, SSIM and minutes on an RTX 4090.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,7 +1,5 @@
 """What a flat panel delivers: 16-bit counts, with flat and dark frames beside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The results file: which runs it holds."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path

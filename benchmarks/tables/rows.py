@@ -1,7 +1,5 @@
 """Rows of the tables: a label, and the method with the motion model behind it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
@@ -40,7 +38,7 @@ class Row:
         counts = f"{self.strips}x{self.sub_intervals}" if self.motion == "micro-views" else ""
         return " ".join(part for part in (self.method, self.motion, counts, self.variant) if part)
 
-    def static(self) -> Row:
+    def static(self) -> "Row":
         """The row of the same method with a static model, for a gantry at rest."""
         return Row(self.still or self.label, self.method, variant=self.variant, changes=self.changes)
 

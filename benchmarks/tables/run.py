@@ -1,7 +1,5 @@
 """Runs a benchmark: whatever the results file lacks, one line per run, and then the tables."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -66,7 +64,7 @@ def run_bench(
     return complete_bench(job, here)
 
 
-def complete_bench(job: BenchJob, make: Callable[[Work], None]) -> list[Path]:
+def complete_bench(job: BenchJob, make: "Callable[[Work], None]") -> list[Path]:
     """Checks the job, has ``make`` make what its results file lacks, if anything, and writes tables and figures."""
     plan = plan_runs(job)
     _name_rows_left_out(job)

@@ -1,7 +1,5 @@
 """Sizes of a benchmark: voxels and pixels along a side, and iterations of the splatting methods."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from phyradgs_cl import checks

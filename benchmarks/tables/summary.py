@@ -1,7 +1,5 @@
 """Means over volumes and spreads over seeds of the lines that belong to a table."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tables of a benchmark in Markdown and CSV, from the lines of its results file."""
 
-from __future__ import annotations
-
 import csv
 import io
 import logging

@@ -1,7 +1,5 @@
 """Which volumes a folder holds, and which of several resolutions is projected."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

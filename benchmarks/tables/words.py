@@ -1,7 +1,5 @@
 """Lists on the command line, and results as lines for people."""
 
-from __future__ import annotations
-
 from phyradgs_cl.errors import InputError
 from tables.job import BenchProgress
 

@@ -1,7 +1,5 @@
 """A benchmark's runs at the workers of a cluster: the same lines in the same file, and the same tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

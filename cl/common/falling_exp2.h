@@ -3,12 +3,6 @@
 
 #define MINUS_HALF_LOG2E (-0.72134752044f)
 
-#ifdef __clang__
-#define ALWAYS_INLINE static inline __attribute__((always_inline))
-#else
-#define ALWAYS_INLINE static inline
-#endif
-
 /* 2^x for x <= 0 to 2e-7. PoCL's exp2 has ranges and roundings that do not occur here, and takes half the time of a
    splat's pixel or voxel; a GPU has an instruction. Below 2^-126 the result is that, not 0. */
 ALWAYS_INLINE vf falling_exp2(const vf x)

@@ -60,3 +60,31 @@ ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 {
     return ((float)(u - line.u_whole) + V_IOTA) - line.u_rest;
 }
+
+#if GROUP > 1
+/* the same, and only the pixels within the cutoff: with t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
+   quadratic in t that does not know how far the line is from the centre, so that needles keep their digits */
+ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell,
+                                              __global const float *times, const int time_pitch, const int v,
+                                              const float4 path_limits, const float cutoff2)
+{
+    footprint_line line = footprint_alone(rec, cell, times, time_pitch, v, path_limits);
+#if MOVING
+    moving_span(rec, line.dv, line.middle, line.half_time, times[TIME_WEIGHT * time_pitch + v], cutoff2 > 0.0f,
+                &line.u_lo, &line.u_hi);
+#else
+    if (cutoff2 > 0.0f) {
+        const float per = 1.0f / line.s.l11, beta = line.s.b1 * per, gamma = line.s.b0 - beta * line.s.t0;
+        const float shrink = 1.0f - cutoff2 * line.s.inv_kappa, a = shrink - cutoff2 * beta * beta; /* both positive */
+        const float left = shrink * (cutoff2 * gamma * gamma - line.s.k * a);
+        const float middle = cutoff2 * beta * gamma / a, reach = sqrt(max(left, 0.0f)) / a;
+        const float centre = line.u_rest - line.s.t0 * per, far = 4e6f;
+        line.u_lo = max(line.u_lo, line.u_whole + convert_int(ceil(clamp(centre + (middle - reach) * per - 0.01f, -far, far))));
+        line.u_hi = min(line.u_hi, line.u_whole + convert_int(floor(clamp(centre + (middle + reach) * per + 0.01f, -far, far))));
+        if (left < 0.0f) /* the line passes beside it */
+            line.u_hi = line.u_lo - 1;
+    }
+#endif
+    return line;
+}
+#endif

@@ -4,6 +4,12 @@
 #error "build with -DLANES=1, 4, 8 or 16"
 #endif
 
+#ifdef __clang__
+#define ALWAYS_INLINE static inline __attribute__((always_inline))
+#else
+#define ALWAYS_INLINE static inline
+#endif
+
 #if LANES == 1
 typedef float vf;
 typedef int vi;

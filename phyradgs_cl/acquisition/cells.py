@@ -4,8 +4,6 @@ A frame is a sum over cells: pixel lines [line_start, line_stop) of the merged f
 projection from the cell's pose. Weights of a line sum to 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,11 +39,11 @@ class TimeCells:
     time_s: np.ndarray
     line_start: np.ndarray
     line_stop: np.ndarray
-    weight: NDArray[np.float64]
+    weight: "NDArray[np.float64]"
     lines: int
     axis: str = "rows"
     end_poses: np.ndarray | None = None
-    line_times: NDArray[np.float64] | None = None
+    line_times: "NDArray[np.float64] | None" = None
 
     @property
     def count(self) -> int:
@@ -76,12 +74,12 @@ class TimeCells:
         """Whether a line has more than one cell."""
         return bool(self.layer_numbers.any())
 
-    def scaled(self, factor: float) -> TimeCells:
+    def scaled(self, factor: float) -> "TimeCells":
         """The same cells with all lengths multiplied by ``factor``."""
         ends = None if self.end_poses is None else self.end_poses * factor
         return replace(self, pose=self.pose * factor, end_poses=ends)
 
-    def finer(self, factor: int) -> TimeCells:
+    def finer(self, factor: int) -> "TimeCells":
         """The same still cells for a panel with pixels cut into ``factor`` by ``factor``; cut lines share their times."""
         pose = self.pose.copy()
         pose[:, 6:] /= factor
@@ -89,7 +87,7 @@ class TimeCells:
         lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
         return replace(self, pose=pose, **lines)
 
-    def still(self) -> TimeCells:
+    def still(self) -> "TimeCells":
         """These cells, for operators without motion within a cell; InputError where there is some."""
         if self.is_moving:
             remedy = "take --motion per-row"

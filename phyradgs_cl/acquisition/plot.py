@@ -1,7 +1,5 @@
 """A frame of a scan, and when its lines are open."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +15,7 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 
-def plot_frame(scan: Scan, frame: int) -> Figure:
+def plot_frame(scan: "Scan", frame: int) -> "Figure":
     """One frame (rows, columns) of line integrals in mm on the panel, and the windows of its lines in s."""
     checks.whole("frame", frame, 0, scan.frames - 1)
     figure = new_figure(10, 4.2)
@@ -44,7 +42,7 @@ def plot_frame(scan: Scan, frame: int) -> Figure:
     return figure
 
 
-def draw_windows(axes: Axes, shutter: Shutter, lines: int) -> None:
+def draw_windows(axes: "Axes", shutter: Shutter, lines: int) -> None:
     """When each of ``lines`` lines opens and closes, in s after the frame's start; what a pulse lights is coloured."""
     line = np.arange(lines)
     opening = shutter.delay_s(lines)
@@ -64,7 +62,7 @@ def draw_windows(axes: Axes, shutter: Shutter, lines: int) -> None:
     axes.legend(fontsize=7, loc="upper left" if shutter.direction > 0 else "lower left")
 
 
-def _turned_deg(scan: Scan, frame: int) -> tuple[float, float]:
+def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
     """The source's azimuth as a frame's first line opens, and as its last one closes."""
     times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
     pose = scan.trajectory.pose(frame, times_s)

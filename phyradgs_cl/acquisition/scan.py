@@ -1,7 +1,5 @@
 """A scan: what was measured, where the gantry was, and the grid that is asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -100,7 +98,7 @@ class Scan:
         return f"Scan({self.title!r}, {self.frames} frames of {rows} × {columns}, {taken}, grid {voxels} in {sides} mm)"
 
     @classmethod
-    def from_poses(cls, frames: ArrayLike, poses: ArrayLike, grid: Grid | None = None, **others: Any) -> Scan:
+    def from_poses(cls, frames: "ArrayLike", poses: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
         """A stop-and-shoot scan with a pose of its own for every frame.
 
         frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next
@@ -122,7 +120,7 @@ class Scan:
         return cls(values, geometry, trajectory, shutter, start_s, grid or default_grid(geometry), False, **others)
 
     @classmethod
-    def from_astra(cls, frames: ArrayLike, vectors: ArrayLike, grid: Grid | None = None, **others: Any) -> Scan:
+    def from_astra(cls, frames: "ArrayLike", vectors: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
         """A stop-and-shoot scan with the vectors of an ASTRA geometry ``cone_vec``.
 
         frames (F, rows, columns): line integrals; ASTRA's own order is (rows, F, columns), so ``sinogram.swapaxes(0, 1)``.
@@ -138,7 +136,7 @@ class Scan:
         return cls.from_poses(values, poses_of_astra(table, (values.shape[1], values.shape[2])), grid, **others)
 
     @classmethod
-    def from_tigre(cls, geo: Any, angles: ArrayLike, frames: ArrayLike, **others: Any) -> Scan:
+    def from_tigre(cls, geo: Any, angles: "ArrayLike", frames: "ArrayLike", **others: Any) -> "Scan":
         """A stop-and-shoot scan with a TIGRE geometry; TIGRE itself is not needed.
 
         geo: anything with TIGRE's attributes in mm: DSD, DSO, nDetector, dDetector (v, u), nVoxel, dVoxel (z, y, x), and
@@ -160,7 +158,7 @@ class Scan:
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)
 
-    def plot(self, frame: int = 0) -> Figure:
+    def plot(self, frame: int = 0) -> "Figure":
         """A figure of one frame (rows, columns) and of when its lines open and close, in degrees of the gantry too.
 
         Raises InputError for a frame that there is not.
@@ -193,7 +191,7 @@ class Scan:
         """Lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
 
-    def on_grid(self, grid: Grid) -> Scan:
+    def on_grid(self, grid: Grid) -> "Scan":
         """The same scan with another grid; a reference stays where the grid is a part of its own, else it is left out."""
         if grid == self.grid:
             return self
@@ -204,7 +202,7 @@ class Scan:
             reference = None if parts is None else reference[tuple(parts)]
         return replace(self, grid=grid, reference=reference)
 
-    def with_grid(self, choice: GridChoice) -> Scan:
+    def with_grid(self, choice: GridChoice) -> "Scan":
         """The same scan with the grid that is chosen. Raises InputError for one that no ray of an orbit meets."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):

@@ -1,7 +1,5 @@
 """Kinematics: the gantry angle θ(t), or whole poses, at any time of a frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from typing import Protocol
 
@@ -85,7 +83,7 @@ class EncoderTable:
     """
 
     time_s: np.ndarray
-    angle_rad_table: NDArray[np.float64]
+    angle_rad_table: "NDArray[np.float64]"
     culprit: str = "encoder table"
 
     __repr__ = short_repr

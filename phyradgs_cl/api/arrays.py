@@ -1,7 +1,5 @@
 """What operators take and give: arrays of the host, or of the device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

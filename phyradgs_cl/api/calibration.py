@@ -1,7 +1,5 @@
 """A scan's true geometry and timing, from the scan itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from phyradgs_cl.acquisition import Scan

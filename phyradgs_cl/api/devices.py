@@ -1,7 +1,5 @@
 """The device that a call is given: a wish, or a Runtime that is already there."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 from phyradgs_cl.runtime import Runtime

@@ -1,7 +1,5 @@
 """One interface for everything that projects: values, transposes, frames, and what SciPy asks for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
@@ -42,10 +40,10 @@ class Operator:
         rt: Runtime,
         domain: tuple[str, Shape],
         range_: tuple[str, Shape],
-        at: Callable[[Values], tuple[Values, Map]],
+        at: "Callable[[Values], tuple[Values, Map]]",
         *,
         frames: Callable[[list[int]], Any] | None = None,
-        intensity: Callable[[], Operator] | None = None,
+        intensity: "Callable[[], Operator] | None" = None,
     ) -> None:
         self.rt = rt
         self._domain, self._range = domain, range_
@@ -101,7 +99,7 @@ class Operator:
         return given_back(self.rt, y), lambda by_y: given_back(self.rt, back(self._entered(self._range, by_y)))
 
     @property
-    def T(self) -> Operator:  # noqa: N802
+    def T(self) -> "Operator":  # noqa: N802
         """The transpose of the derivative at the last x, ``range_shape`` to ``domain_shape``; InputError before that."""
         return Operator(self.rt, self._range, self._domain, self._at_last)
 
@@ -122,7 +120,7 @@ class Operator:
         return self._frames([int(f) for f in numbers])
 
     @cached_property
-    def intensity(self) -> Operator:
+    def intensity(self) -> "Operator":
         """The same under a detector that averages photons over an exposure: −ln Σ w exp(−p) of a line's times, not Σ w p.
 
         Its transpose is that of the derivative at its last x. InputError where it is not known (transposes, voxels).
@@ -174,7 +172,7 @@ class LinearOperator(Operator, ScipyOperator):
     __matmul__ = ScipyOperator.__matmul__
 
     @property
-    def T(self) -> LinearOperator:  # noqa: N802
+    def T(self) -> "LinearOperator":  # noqa: N802
         """The exact transpose: frames (F, rows, columns) to x, by the forward weights."""
         return LinearOperator(self.rt, self._range, self._domain, *self._pair[::-1])
 
@@ -184,7 +182,7 @@ class LinearOperator(Operator, ScipyOperator):
     def _rmatvec(self, y: np.ndarray) -> np.ndarray:
         return self.T(np.reshape(y, self.range_shape)).ravel()
 
-    def _transpose(self) -> LinearOperator:
+    def _transpose(self) -> "LinearOperator":
         return self.T
 
     _adjoint = _transpose  # of real numbers

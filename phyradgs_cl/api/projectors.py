@@ -1,7 +1,5 @@
 """Operators of whole scans: voxels or Gaussians to frames, and Gaussians to voxels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
@@ -92,7 +90,7 @@ def splat_operator(
     cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
     pixel_footprint: bool = False,
     device: Device = None,
-) -> SplatProjection:
+) -> "SplatProjection":
     """The paper's projector Φ of a scan: ``Gaussians``, or their parameter rows (11, G), to frames (F, rows, columns).
 
     Rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: any model of

@@ -1,7 +1,5 @@
 """Scans and volumes: read, written, simulated, reconstructed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -150,14 +148,14 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
 
 def reconstruct(
     scan: Scan,
-    method: str | Callable[..., Reconstruction | np.ndarray] = DEFAULT_METHOD,
+    method: "str | Callable[..., Reconstruction | np.ndarray]" = DEFAULT_METHOD,
     *,
     preset: str | None = None,
     grid: Grid | None = None,
     seed: int = 0,
-    report: ProgressReport | bool = True,
+    report: "ProgressReport | bool" = True,
     resume: Reconstruction | None = None,
-    initial: Reconstruction | np.ndarray | None = None,
+    initial: "Reconstruction | np.ndarray | None" = None,
     on_interrupt: str = "raise",
     device: Device = None,
     **options: Any,

@@ -1,7 +1,5 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from typing import Any
@@ -28,18 +26,18 @@ _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the g
 
 
 def fly_scan(
-    frames: ArrayLike,
+    frames: "ArrayLike",
     geometry: ConeGeometry,
-    angles_deg: ArrayLike,
+    angles_deg: "ArrayLike",
     *,
     exposure_deg: float,
     readout_ratio: float = 0.0,
     readout: str = "rows",
     readout_direction: int = 1,
     exposure_s: float = 1.0,
-    flats: ArrayLike | None = None,
-    darks: ArrayLike | None = None,
-    mask: ArrayLike | None = None,
+    flats: "ArrayLike | None" = None,
+    darks: "ArrayLike | None" = None,
+    mask: "ArrayLike | None" = None,
     quantity: str | None = None,
     grid: Grid | None = None,
     **others: Any,
@@ -91,13 +89,13 @@ def fly_scan(
 
 
 def static_scan(
-    frames: ArrayLike,
+    frames: "ArrayLike",
     geometry: ConeGeometry,
-    angles_deg: ArrayLike,
+    angles_deg: "ArrayLike",
     *,
-    flats: ArrayLike | None = None,
-    darks: ArrayLike | None = None,
-    mask: ArrayLike | None = None,
+    flats: "ArrayLike | None" = None,
+    darks: "ArrayLike | None" = None,
+    mask: "ArrayLike | None" = None,
     quantity: str | None = None,
     grid: Grid | None = None,
     **others: Any,
@@ -129,11 +127,11 @@ def _warn_of_angles(angle_deg: np.ndarray, least_step: float = np.inf) -> None:
 
 
 def _pixels(
-    frames: ArrayLike,
+    frames: "ArrayLike",
     geometry: object,
-    flats: ArrayLike | None,
-    darks: ArrayLike | None,
-    mask: ArrayLike | None,
+    flats: "ArrayLike | None",
+    darks: "ArrayLike | None",
+    mask: "ArrayLike | None",
     quantity: str | None,
 ) -> LineIntegrals:
     """Frames of any quantity as line integrals, with the pixels not to be used."""
@@ -178,7 +176,7 @@ def _scan(
     return Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
 
 
-def _stack(name: str, frames: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
+def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
     """Frames (n, rows, columns) of real numbers."""
     stack = checks.real_array(name, frames)
     checks.shape(name, stack, (None, *panel))

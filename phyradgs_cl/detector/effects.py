@@ -1,7 +1,5 @@
 """What panels and tubes do beyond noise: gains that the flats miss, sparks, light that drifts, scatter. All from a seed."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 from numpy.typing import NDArray

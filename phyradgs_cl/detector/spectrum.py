@@ -4,8 +4,6 @@ Kramers' law (Phil. Mag. 46 (1923) 836) behind aluminium; attenuation from NIST'
 interpolated in the logarithms. Both materials attenuate as stated in the thinnest layer; thicker ones less and less.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

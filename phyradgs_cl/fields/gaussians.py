@@ -3,8 +3,6 @@
 Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,16 +57,16 @@ class Gaussians:
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
     @classmethod
-    def from_rows(cls, rows: np.ndarray) -> Gaussians:
+    def from_rows(cls, rows: np.ndarray) -> "Gaussians":
         """From (11, G) rows; InputError for another shape."""
         checks.shape("rows", rows, (11, None))
         return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
 
-    def scaled(self, length: float, density: float) -> Gaussians:
+    def scaled(self, length: float, density: float) -> "Gaussians":
         """The same cloud with lengths multiplied by ``length`` and densities by ``density``."""
         return Gaussians(self.mean * length, self.scale * length, self.quaternion, self.density * density)
 
-    def averaged(self, box: tuple[float, float, float]) -> Gaussians:
+    def averaged(self, box: tuple[float, float, float]) -> "Gaussians":
         """The cloud blurred by a box with sides x y z: its variance is added to every Gaussian's, mass kept.
 
         Sampled at the centres of voxels of that size this is, to the Gaussians' second moments, the mean over a voxel.

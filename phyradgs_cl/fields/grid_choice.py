@@ -1,7 +1,5 @@
 """Which voxels a volume is made on, where a scan's own are not what is wanted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A regular voxel grid in world coordinates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -51,7 +49,7 @@ class Grid:
         object.__setattr__(self, "offset_mm", tuple(float(d) for d in self.offset_mm))
 
     @classmethod
-    def cube(cls, count: int, side_mm: float) -> Grid:
+    def cube(cls, count: int, side_mm: float) -> "Grid":
         """A centred cube of ``count``³ voxels with a side of ``side_mm``. Raises InputError for numbers that are not
         above 0.
         """
@@ -93,13 +91,13 @@ class Grid:
         )
         return z, y, x
 
-    def is_close(self, other: Grid) -> bool:
+    def is_close(self, other: "Grid") -> bool:
         """Whether two grids are one but for what files round off."""
         near_mm = 1e-5 * max(self.size_mm)
         same_voxels = np.allclose(self.voxel_size_mm, other.voxel_size_mm, rtol=1e-5)
         return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
 
-    def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
+    def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> "Grid":
         """The voxels [start, start + shape) (z, y, x) as a grid of their own."""
         z, y, x = (
             first + (s + (n - 1) / 2) * d
@@ -107,7 +105,7 @@ class Grid:
         )
         return Grid(shape, self.voxel_size_mm, (z, y, x))
 
-    def start_in(self, whole: Grid) -> tuple[int, int, int] | None:
+    def start_in(self, whole: "Grid") -> tuple[int, int, int] | None:
         """The first voxel (z, y, x) of a grid that is a part of ``whole``; None for one that is not."""
         if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
             return None
@@ -118,7 +116,7 @@ class Grid:
         z, y, x = (int(n) for n in start)
         return z, y, x
 
-    def scaled(self, factor: float) -> Grid:
+    def scaled(self, factor: float) -> "Grid":
         """The same voxels with every length multiplied by ``factor``."""
         dz, dy, dx = (d * factor for d in self.voxel_size_mm)
         oz, oy, ox = (o * factor for o in self.offset_mm)

@@ -3,8 +3,6 @@
 PyTorch is an optional package: this module and ``options`` load without it, the others need it.
 """
 
-from __future__ import annotations
-
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 from phyradgs_cl.neural.requirement import has_accelerator, has_torch, require_torch
 

@@ -1,7 +1,5 @@
 """NumPy arrays to tensors and back by DLPack, since the two packages need not know each other's versions."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

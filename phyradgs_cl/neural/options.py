@@ -1,7 +1,5 @@
 """What the neural methods can be told; constants and ranges, without PyTorch."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Whether PyTorch is there, and what to say where it is not."""
 
-from __future__ import annotations
-
 import importlib.util
 
 from phyradgs_cl.errors import InputError

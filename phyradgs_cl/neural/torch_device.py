@@ -1,7 +1,5 @@
 """The device that PyTorch works on, and repeatable arithmetic there."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """One step after the other of fitting a field to a scan's rays, and the state between two of them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

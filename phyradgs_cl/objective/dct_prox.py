@@ -5,8 +5,6 @@ blocks (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT:
 (2007) 3020). A block's mean is not shrunk. Near faces the average is over the blocks that lie in the volume.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import cast
 

@@ -6,7 +6,7 @@ Eq. 4 prints "+ SSIM"; what is minimised, there and here, is 1 − SSIM. SSIM is
 Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01², C2 = 0.03².
 """
 
-from __future__ import annotations
+import math
 
 import numpy as np
 import scipy
@@ -41,7 +41,7 @@ class ImageLoss:
         self._partials = rt.zeros(3 * image + GUARD)
         self._spread = rt.zeros(3 * image + GUARD)
         self._window = rt.upload(WINDOW, np.float32)
-        self._line_sums = rt.zeros((lines, 4))
+        self._sums = rt.zeros((rt.shape_of_lines(width, lines)[2], 4))
         self.gradient = rt.zeros(image + GUARD)
 
     def evaluate(
@@ -62,12 +62,13 @@ class ImageLoss:
         vectors = -(-self.width // rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
+        items, tile, _ = rt.shape_of_lines(self.width, self.lines)
 
         images = (rendered, measured, mask, self._window)
         rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
             self._kernels["ssim_map"],
-            self.lines,
+            items,
             self._moments,
             *images,
             *size,
@@ -76,8 +77,9 @@ class ImageLoss:
             weights,
             np.int32(poisson != 0),
             self._partials,
-            self._line_sums,
-            group=group,
+            rt.local(16 * math.prod(tile)),
+            self._sums,
+            group=tile,
         )
         rt.launch(
             self._kernels["ssim_spread"],
@@ -90,7 +92,7 @@ class ImageLoss:
         )
         rt.launch(
             self._kernels["image_gradient"],
-            self.lines,
+            rt.shape_of_lines(self.pitch, self.lines)[0],
             self._spread,
             *images,
             *size,
@@ -99,13 +101,13 @@ class ImageLoss:
             weights,
             np.float32(poisson / max(pixels, 1.0)),
             self.gradient,
-            group=group,
+            group=tile,
         )
         return self.gradient
 
     def value(self) -> float:
         """The loss at the last ``evaluate``; waits for the device."""
-        ssim, l1, pixels, squares = self.rt.download(self._line_sums).astype(np.float64).sum(axis=0)
+        ssim, l1, pixels, squares = self.rt.download(self._sums).astype(np.float64).sum(axis=0)
         data = (self.l1_weight * l1 + 0.5 * self.poisson_weight * squares) / max(pixels, 1.0)
         return float(data + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
 

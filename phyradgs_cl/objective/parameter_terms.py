@@ -1,7 +1,5 @@
 """Terms of the objective that need no image: density L1 (paper, L_reg) and the released code's shape term."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

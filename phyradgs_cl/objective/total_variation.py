@@ -3,7 +3,7 @@
 Anisotropic: the mean absolute difference between neighbouring voxels along z, y and x, added up.
 """
 
-from __future__ import annotations
+import math
 
 import numpy as np
 
@@ -20,28 +20,30 @@ class TotalVariation:
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._weight4 = np.array([*_axis_weights(shape)[::-1], 0], np.float32)
         self._kernel = rt.kernel("total_variation", "total_variation", IMAGE_GUARD=GUARD)
-        self._row_sums = rt.zeros(nz * ny)
+        self._sums = rt.zeros(rt.shape_of_lines(pitch, ny, nz)[2])
         self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
     def evaluate(self, volume: DeviceArray) -> DeviceArray:
         """dTV/dvolume, until the next call."""
         nz, ny, _ = self.shape
+        items, tile, _ = self.rt.shape_of_lines(self.pitch, ny, nz)
         self.rt.launch(
             self._kernel,
-            (ny, nz),
+            items,
             volume,
             self._shape4,
             np.int32(self.pitch),
             self._weight4,
             self.gradient,
-            self._row_sums,
-            group=self.rt.group(),
+            self.rt.local(4 * math.prod(tile)),
+            self._sums,
+            group=tile,
         )
         return self.gradient
 
     def value(self) -> float:
         """TV at the last ``evaluate``; waits for the device."""
-        return float(self.rt.download(self._row_sums).astype(np.float64).sum())
+        return float(self.rt.download(self._sums).astype(np.float64).sum())
 
 
 def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:

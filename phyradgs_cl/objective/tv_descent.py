@@ -3,8 +3,6 @@
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777; backward differences and their floor as in TIGRE.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import cast
 

@@ -4,8 +4,6 @@ Fast gradient projection on the dual (Beck and Teboulle, IEEE Trans. Image Proce
 an axis may be weighted, for voxels that are not cubes.
 """
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np

@@ -3,8 +3,6 @@
 Where memory is short the volume is made brick by brick, and views go to the device in smaller parts; neither changes a bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import cast

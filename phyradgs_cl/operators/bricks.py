@@ -1,7 +1,5 @@
 """Volumes cut into bricks that fit a device: rows of x stay whole, z is cut first, then y."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Adam (Kingma and Ba 2015) on the raw parameters of all Gaussians at once, with a rate per parameter row."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.fields import Activation

@@ -4,8 +4,6 @@ After Kerbl et al. 2023 in R2-Gaussian's radiative form: the statistic is the me
 projected centre in normalised detector units; both halves of a clone or split keep half the density.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +71,7 @@ class Population:
     def count(self) -> int:
         return int(self.raw.shape[1])
 
-    def take(self, index: np.ndarray) -> Population:
+    def take(self, index: np.ndarray) -> "Population":
         return Population(self.raw[:, index], self.moments[:, :, index])
 
 

@@ -1,7 +1,5 @@
 """Learning rates that decay exponentially from a first to a last value over the run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

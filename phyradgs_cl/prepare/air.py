@@ -1,8 +1,6 @@
 """Light that drifts: every frame's own value of air, from its pixels beside the object (as in nabu and algotom's ROI
 normalisation), in place of what the flats say of another time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The steps by name, in physical order, and a scan through those that are chosen."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace

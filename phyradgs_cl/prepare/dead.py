@@ -1,7 +1,5 @@
 """Dead and hot pixels and lines: those that say the same in every frame, or always something other than their neighbours."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

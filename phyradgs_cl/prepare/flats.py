@@ -5,8 +5,6 @@ combination of their principal components that leaves the least total variation,
 Express 23 (2015) 27975. What they cannot see, one number per frame, is the step ``air``'s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ line integrals grow with the path through the segmented volume says the polynomi
 (2008) 242).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Masked pixels filled in from their neighbours, for methods and steps that cannot leave pixels out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

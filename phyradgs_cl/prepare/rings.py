@@ -6,8 +6,6 @@ fly-scans. ``many``: the sorting of Vo, Atwood and Drakopoulos, Opt. Express 26 
 neighbouring pixels see much the same values, in another order.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for
 negative, that explains best the light that the panel sees beside the object beyond that of the flats.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

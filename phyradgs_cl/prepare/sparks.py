@@ -4,8 +4,6 @@ As for cosmic rays on astronomers' panels, what is sharper than the optics allow
 Publ. Astron. Soc. Pac. 113 (2001) 1420.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What every step has in common: a scan in, a scan out, and numbers that say what was done."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

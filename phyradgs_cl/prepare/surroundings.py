@@ -4,8 +4,6 @@ discarded.
 Ziegler, Nielsen and Grass, Med. Phys. 35 (2008) 1317. For methods that explain frames by what is in the box alone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

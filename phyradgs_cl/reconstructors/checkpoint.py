@@ -1,7 +1,5 @@
 """States from files: what a checkpoint may not do to a run that goes on from it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import TypeVar

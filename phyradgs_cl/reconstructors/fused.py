@@ -5,8 +5,6 @@ Two estimates of about the same error whose errors correlate by ρ have a mean t
 sure.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -24,8 +22,8 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
     option_facts,
 )
+from phyradgs_cl.reconstructors.splats import phyradgs
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
 from phyradgs_cl.reconstructors.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.runtime import Runtime
@@ -91,7 +89,7 @@ def fused(
     def splats(before: np.ndarray | None, told: ProgressReport, left: State | None) -> Reconstruction:
         assert before is not None
         start = np.maximum(before, 0)
-        return phyradgs(scan, options.splats(), rt, seed=seed, report=told, resume=left, initial=start)
+        return phyradgs.METHOD.run(scan, options.splats(), rt, seed=seed, report=told, resume=left, initial=start)
 
     def both(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
         assert before is not None

@@ -4,8 +4,6 @@ What is kept is always whole. Signals that somebody wants ignored stay ignored, 
 elsewhere nothing here does anything.
 """
 
-from __future__ import annotations
-
 import math
 import signal
 import threading

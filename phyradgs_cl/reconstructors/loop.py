@@ -3,8 +3,6 @@
 A method is a class with ``Stepwise``'s attributes; ``Loop`` runs it, on one process or on ranks that do the same.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Protocol as Interface

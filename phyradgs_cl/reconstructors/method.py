@@ -5,8 +5,6 @@ are then what ``--set`` and ``reconstruct`` take. It gives a ``Reconstruction``,
 scan's grid.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import operator

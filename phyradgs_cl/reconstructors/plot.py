@@ -1,7 +1,5 @@
 """A result as a figure: slices, convergence, and a frame beside what the volume gives for it."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from phyradgs_cl import checks
@@ -24,8 +22,8 @@ _ROW_INCH, _SLICE_INCH, _SIDE_INCH = 3.2, 3.6, 4.4
 
 
 def plot_result(
-    result: Reconstruction, scan: Scan | None, frame: int, device: str | Runtime | None
-) -> Figure:
+    result: "Reconstruction", scan: Scan | None, frame: int, device: str | Runtime | None
+) -> "Figure":
     """The three middle slices; beside them the record over iterations and, of a scan, a frame and its residual."""
     pair, truth = None, None
     if scan is not None:
@@ -50,7 +48,7 @@ def plot_result(
     return figure
 
 
-def _convergence(axes: Axes, record: list[dict[str, float]]) -> None:
+def _convergence(axes: "Axes", record: list[dict[str, float]]) -> None:
     """What the record says of how far the run is from its goal."""
     name = next((key for key in ("residual", "loss") if record and key in record[-1]), None)
     if name is None or len(record) < 2:
@@ -66,7 +64,7 @@ def _convergence(axes: Axes, record: list[dict[str, float]]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _residual(measured: Axes, residual: Axes, pair: FramePair | None, scan: Scan | None) -> None:
+def _residual(measured: "Axes", residual: "Axes", pair: FramePair | None, scan: Scan | None) -> None:
     """A measured frame, and measured less computed."""
     if pair is None or scan is None:
         measured.set_axis_off()

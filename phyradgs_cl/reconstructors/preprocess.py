@@ -1,7 +1,5 @@
 """What happens to a scan before any method sees it: another grid, lag undone, the steps of ``prepare``, a median filter."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The methods by name, and those of one's own. Adding one is a file that says its METHOD, and a line in METHODS."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import fields, is_dataclass, replace

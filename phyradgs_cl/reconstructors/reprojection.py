@@ -1,7 +1,5 @@
 """A scan's own reconstruction and reprojection, for steps that compare frames with what they say of the object."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,7 @@ from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.prepare import Model
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
-from phyradgs_cl.reconstructors.voxels.sart import OS_SART, sart
+from phyradgs_cl.reconstructors.voxels.sart import OS_METHOD, OS_SART
 from phyradgs_cl.runtime import Runtime
 
 _ITERATIONS = 5
@@ -28,6 +26,6 @@ def reprojection(rt: Runtime, scan: Scan) -> Model:
 
     def fitted() -> np.ndarray:
         times = replace(OS_SART, motion=PerRow(sub_intervals=1), iterations=_ITERATIONS)
-        return sart(scan, times, rt).volume
+        return OS_METHOD.run(scan, times, rt).volume
 
     return Model(volume, operator.forward, fitted)

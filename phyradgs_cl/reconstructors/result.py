@@ -1,7 +1,5 @@
 """What every method returns, and how it reports on the way."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -62,7 +60,7 @@ class Reconstruction:
             return ""
         return f", stopped after {done} of {asked} iterations ({reason})"
 
-    def plot(self, scan: Scan | None = None, *, frame: int = 0, device: str | Runtime | None = None) -> Figure:
+    def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
         """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.
 
         scan: the result's; then also a frame, its residual and, where the scan has a reference (nz, ny, nx) in 1/mm, the
@@ -104,8 +102,8 @@ class Progress:
     gaussians: int
     seconds: float
     quantity: str = "loss"
-    state: Callable[[], State] | None = None
-    volume: Callable[[], tuple[np.ndarray, Grid]] | None = None
+    state: "Callable[[], State] | None" = None
+    volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
 
 
 ProgressReport = Callable[[Progress], None]

@@ -1,7 +1,5 @@
 """A run of several stages, each a run of its own that starts from the volume of the one before."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

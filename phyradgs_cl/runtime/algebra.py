@@ -4,8 +4,6 @@ A method is written once, over a ``Space``. Every function gives a new array, or
 from a device. Sums are deterministic: the same arrays on the same device give the same bits.
 """
 
-from __future__ import annotations
-
 import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence

@@ -1,8 +1,7 @@
 """A runtime: one device, one in-order queue, the programs built for it, and its buffers."""
 
-from __future__ import annotations
-
 import logging
+import math
 import time
 import warnings
 import weakref
@@ -82,7 +81,7 @@ class Runtime:
         key = (program, name, self._options(defines))
         return self._kernels.setdefault(key, Kernel(*key))
 
-    def compile(self, kernel: Kernel) -> cl.Kernel:
+    def compile(self, kernel: Kernel) -> "cl.Kernel":
         """What OpenCL launches; a program is built once for all its kernels."""
         if kernel.built is None:
             key = (kernel.program, kernel.options)
@@ -101,7 +100,7 @@ class Runtime:
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         return ("-cl-std=CL1.2", "-cl-mad-enable", *flags)
 
-    def _build(self, program: str, options: tuple[str, ...]) -> cl.Program:
+    def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
         started = time.perf_counter()
         try:
             with warnings.catch_warnings():
@@ -224,7 +223,7 @@ class Runtime:
         self._record("copy", event, 2 * count)
 
     @staticmethod
-    def local(nbytes: int) -> cl.LocalMemory:
+    def local(nbytes: int) -> "cl.LocalMemory":
         """Local memory of a work-group, as an argument of a launch."""
         return cl.LocalMemory(nbytes)
 
@@ -262,6 +261,14 @@ class Runtime:
             self._tile = width, max(min(_TILE_ITEMS, handle.max_work_group_size) // width, 1)
         return self._tile
 
+    def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
+        """Work-items, group and number of groups of kernels that step along lines of ``width`` pixels: an item takes a
+        line on a CPU, and a pixel on a GPU.
+        """
+        items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
+        sides = (*group, *([1] * (len(rows) - 1)))
+        return items, group, math.prod(-(-n // side) for n, side in zip(items, sides, strict=True))
+
     @naming_failures("the work before")
     def finish(self) -> None:
         self.queue.finish()
@@ -269,7 +276,7 @@ class Runtime:
 
     # --- profile ------------------------------------------------------------------------------------
 
-    def _record(self, name: str, event: cl.Event, nbytes: int) -> None:
+    def _record(self, name: str, event: "cl.Event", nbytes: int) -> None:
         if self.profile:
             self._profile.add(name, event, nbytes)
 

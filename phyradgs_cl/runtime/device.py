@@ -1,7 +1,5 @@
 """Which OpenCL devices there are, and which one is taken and why."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 
@@ -29,7 +27,7 @@ class DeviceInfo:
     vector_width: int
     has_fp64: bool
     by_default: bool
-    handle: cl.Device
+    handle: "cl.Device"
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
@@ -115,7 +113,7 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
     return max(matching, key=lambda d: d.rank), f"asked for by {source}={wish}"
 
 
-def _describe(index: int, platform: cl.Platform, device: cl.Device) -> DeviceInfo:
+def _describe(index: int, platform: "cl.Platform", device: "cl.Device") -> DeviceInfo:
     is_pocl = "portable computing language" in platform.name.lower()
     kind = _kind(device)
     if is_pocl:
@@ -140,7 +138,7 @@ def _describe(index: int, platform: cl.Platform, device: cl.Device) -> DeviceInf
     )
 
 
-def _kind(device: cl.Device) -> str:
+def _kind(device: "cl.Device") -> str:
     # device types are bit fields: PoCL answers ALL | CPU
     if device.type & cl.device_type.CPU:
         return "cpu"

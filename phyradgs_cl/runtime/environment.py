@@ -1,7 +1,5 @@
 """What a result depends on besides its options."""
 
-from __future__ import annotations
-
 import os
 import platform
 from datetime import datetime, timezone

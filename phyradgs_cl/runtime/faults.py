@@ -4,8 +4,6 @@ Drivers queue work: a launch may be refused, or accepted and reported as failed 
 that enqueues or waits is therefore translated, and says what it was about.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar
@@ -20,14 +18,14 @@ R = TypeVar("R")
 _MEMORY_CODES = (-4, -5, -6, -61)
 
 
-def exhausted(error: cl.Error) -> bool:
+def exhausted(error: "cl.Error") -> bool:
     """Whether a driver's error says that memory ran out; some say so only at a launch, or when it is waited for."""
     if isinstance(error, cl.MemoryError):
         return True
     return _code(error) in _MEMORY_CODES
 
 
-def translated(error: cl.Error, ledger: MemoryLedger, work: str) -> DeviceError:
+def translated(error: "cl.Error", ledger: MemoryLedger, work: str) -> DeviceError:
     """An OpenCL error as one of ours; ``work`` is what was being done: a kernel's name, or "a copy"."""
     if exhausted(error):
         return ledger.refused(work, error)
@@ -58,7 +56,7 @@ def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Calla
     return decorate
 
 
-def _code(error: cl.Error) -> int:
+def _code(error: "cl.Error") -> int:
     try:
         return int(error.code)
     except AttributeError:  # raised with a text, as pyopencl does for a build

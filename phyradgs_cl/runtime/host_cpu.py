@@ -1,7 +1,5 @@
 """The host's processor, as Linux describes it."""
 
-from __future__ import annotations
-
 import contextlib
 import platform
 from pathlib import Path

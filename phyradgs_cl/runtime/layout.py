@@ -4,8 +4,6 @@ GUARD floats, then (rows, pitch), where every row ends in at least GUARD zeros. 
 outside a row without a test. Kernels know it as ``IMAGE_GUARD``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,7 +26,7 @@ class Strides:
     row: int
 
     @classmethod
-    def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> Strides:
+    def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> "Strides":
         """Of C-contiguous (nz, ny, nx), from element ``first`` on."""
         _, ny, nx = shape
         return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)

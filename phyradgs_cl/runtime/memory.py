@@ -1,7 +1,5 @@
 """Device memory: how much of it may be taken, how much is, and what happens when there is too little."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re
@@ -35,7 +33,7 @@ class MemoryShortage(OutOfMemoryError):
 class DeviceArray:
     """A typed, shaped piece of device memory."""
 
-    buffer: cl.Buffer
+    buffer: "cl.Buffer"
     shape: tuple[int, ...]
     dtype: np.dtype
 
@@ -53,7 +51,7 @@ class LaterItem:
     """A number that is on its way from the device."""
 
     _values: np.ndarray
-    _event: cl.Event
+    _event: "cl.Event"
 
     @property
     def is_here(self) -> bool:
@@ -96,7 +94,7 @@ class Room:
         """Whether buffers of these sizes fit beside each other."""
         return sum(sizes_bytes) <= self.free_bytes and max(sizes_bytes, default=0) <= self.largest_bytes
 
-    def scaled(self, share: float) -> Room:
+    def scaled(self, share: float) -> "Room":
         return Room(int(share * self.free_bytes), int(share * self.largest_bytes))
 
 
@@ -188,7 +186,7 @@ def is_cl_array(value: object) -> bool:
     return module is not None and isinstance(value, module.Array)
 
 
-def adopted(name: str, array: Any, queue: cl.CommandQueue) -> DeviceArray:
+def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
     """A float32 Array of pyopencl (C order) as a DeviceArray on its own memory; a part of another is copied on the device.
 
     Raises InputError for one of another context, queue or type, of which ``name`` is the culprit.
@@ -205,7 +203,7 @@ def adopted(name: str, array: Any, queue: cl.CommandQueue) -> DeviceArray:
     return DeviceArray(whole.base_data, tuple(array.shape), array.dtype)
 
 
-def lent(array: DeviceArray, queue: cl.CommandQueue) -> Any:
+def lent(array: DeviceArray, queue: "cl.CommandQueue") -> Any:
     """A DeviceArray as an Array of pyopencl on the same memory, which the ledger counts for as long as the Array lives."""
     import pyopencl.array
 

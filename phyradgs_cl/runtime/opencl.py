@@ -1,7 +1,5 @@
 """pyopencl, loaded when something of it is first used: a command that needs no device does not wait for it."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import TYPE_CHECKING, Any
 

@@ -9,8 +9,6 @@ record that holds a pointer to that name; here the pointer is turned to the name
 the same instruction sets. The record is only read until exactly one of the wrong names has been found in it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import logging

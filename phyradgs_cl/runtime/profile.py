@@ -4,8 +4,6 @@ Times are OpenCL events. Bytes are those of a launch's buffers, each counted onc
 touches all of them. The best is measured on the spot: copies by the driver, multiply-adds by a kernel of ours.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 
@@ -35,7 +33,7 @@ class Profile:
         self._events: list[tuple[str, cl.Event, int]] = []
         self._uses: dict[str, KernelUse] = defaultdict(KernelUse)
 
-    def add(self, name: str, event: cl.Event, nbytes: int) -> None:
+    def add(self, name: str, event: "cl.Event", nbytes: int) -> None:
         self._events.append((name, event, nbytes))
         if len(self._events) >= _FOLD_AT:
             self._fold()
@@ -104,7 +102,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs:
 
 
 def measure_rates(
-    queue: cl.CommandQueue, multiply_add: cl.Kernel, lanes: int, units: int, group: int
+    queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
     """Both rates, the best of a few runs; ``queue`` needs profiling."""
     context = queue.context
@@ -121,5 +119,5 @@ def measure_rates(
     return Rates(2 * _COPY_BYTES / best_copy_s, 16.0 * lanes * steps * items / best_sum_s)
 
 
-def _seconds(event: cl.Event) -> float:
+def _seconds(event: "cl.Event") -> float:
     return max((event.profile.end - event.profile.start) * 1e-9, 1e-9)

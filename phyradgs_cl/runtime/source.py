@@ -4,8 +4,6 @@ An include path would fail on a folder whose name has a space, so headers are pa
 marks, and the compiler's messages keep naming file and line.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -23,7 +21,7 @@ class Kernel:
     program: str
     function_name: str
     options: tuple[str, ...]
-    built: cl.Kernel | None = None
+    built: "cl.Kernel | None" = None
 
 
 @cache

@@ -1,7 +1,5 @@
 """What is made of tables of time cells: layers without two cells of a line, finer panels, segments that lines overhang."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, fields, replace
 
 import numpy as np
@@ -31,6 +29,7 @@ from phyradgs_cl.acquisition.cells import (
     segments_for,
     static_cells,
 )
+from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -75,6 +74,8 @@ def test_a_line_s_pose_is_that_of_the_middle_of_its_exposure() -> None:
     strips = micro_view_cells(*where, 2, 3)
     expected = np.repeat(strips.pose[[1, 4]], LINES // 2, axis=0)
     np.testing.assert_array_equal(strips.line_poses(), expected)
+    uneven = replace(micro_view_cells(*where, 1, 2), weight=np.array([0.4, 0.6]))
+    np.testing.assert_array_equal(uneven.line_poses(), np.tile(uneven.pose[1], (LINES, 1)))
     assert static_cells(*where).line_poses().shape == (1, 12)
     with pytest.raises(InputError, match="a line without a time cell"):
         replace(strips, line_stop=strips.line_start + 1).line_poses()
@@ -97,6 +98,10 @@ def test_cells_with_motion_are_for_splats() -> None:
         moving.still()
     far = moving.scaled(50.0)
     np.testing.assert_array_equal(far.end_poses, 50.0 * moving.end_poses)
+    np.testing.assert_array_equal(far.pose, 50.0 * moving.pose)
+    table = micro_views(2, 3)
+    assert table.still() is table and table.readout == Readout("rows")
+    assert table.averages is True and micro_views(3, 1).averages is False
 
 
 @pytest.mark.parametrize("factor", [2, 3])
@@ -201,13 +206,14 @@ def test_geometry_and_timing_are_values() -> None:
 
 def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
     assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
-    for model, name, lowest, highest in (
-        (MicroViews, "strips", 1, 10_000), (MicroViews, "sub_intervals", 1, 10_000),
-        (PerRow, "sub_intervals", 1, 10_000), (Exact, "segments", 0, 1000), (Exact, "time_error", 1e-6, 1),
+    for model, name, ends, beyond in (
+        (MicroViews, "strips", (1, 10_000), (0, 10_001)), (MicroViews, "sub_intervals", (1, 10_000), (0, 10_001)),
+        (PerRow, "sub_intervals", (1, 10_000), (0, 10_001)), (Exact, "segments", (0, 1000), (-1, 1001)),
+        (Exact, "time_error", (1e-6, 1), (9e-7, 1.001)),
     ):
-        for inside in (lowest, highest):
+        for inside in ends:
             assert getattr(model(**{name: inside}), name) == inside
-        for outside in (lowest * 0.9 - 1e-9, highest * 1.001):
+        for outside in beyond:
             with pytest.raises(InputError):
                 model(**{name: outside})
     assert ConeGeometry(50.0, 70.0, (1, 1), (0.6, 0.5)).detector_shape == (1, 1)

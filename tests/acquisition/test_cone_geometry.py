@@ -1,14 +1,13 @@
 """Where source, detector and pixels stand, against formulas written out element by element."""
 
-from __future__ import annotations
-
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres, transpose_pose
+from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
 
 TOLERANCE_MM = 1e-10  # rounding of float64 at 1200 mm
@@ -26,6 +25,15 @@ def test_source_and_pixel_centres_by_hand(angle_rad) -> None:
         along_u_mm, along_v_mm = -2.5 + (column - 4.5) * 0.5, 1.25 + (row - 3.0) * 0.6
         expected = [-415 * cos - along_u_mm * sin, -415 * sin + along_u_mm * cos, along_v_mm]
         np.testing.assert_allclose(centres[row, column], expected, atol=TOLERANCE_MM)
+
+
+def test_the_nearest_circle_of_a_circle_is_itself() -> None:
+    poses = GEOMETRY.pose(np.array(ANGLES_RAD))
+    for height_mm in (0.0, 40.0):
+        poses[:, [2, 5]] += height_mm
+        found = plain_geometry(poses, GEOMETRY.detector_shape)
+        for name, expected in asdict(GEOMETRY).items():
+            np.testing.assert_allclose(getattr(found, name), expected, atol=TOLERANCE_MM, err_msg=name)
 
 
 def test_middle_pixels_and_many_angles_at_once() -> None:

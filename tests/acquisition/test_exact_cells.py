@@ -1,7 +1,5 @@
 """Time cells with motion: segments of a frame, when every line integrates in them, and how many there are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT64

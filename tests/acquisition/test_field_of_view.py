@@ -1,7 +1,5 @@
 """What a scan sees, and its grid replaced."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -33,10 +31,14 @@ def test_a_grid_that_ends_inside_of_what_is_seen() -> None:
         ((-200, 200, -200, 200, -200, 200), False),
         ((-16, 16, -200, 200, -200, 200), False),  # above and below there is nothing to see
         ((-16, 16, -200, 200, -200, 150), True),
+        ((-16, 16, -200, 200, -150, 200), True),
+        ((-16, 16, -192, 192, -192, 192), False),  # by a voxel
         ((-500, 500, -100, 100, -500, 500), True),
     ]:
         grid = GridChoice(roi_mm=roi_mm, voxel_mm=8).of(GRID)
         assert cuts(grid, GRID, GEOMETRY) is is_cut and not misses(grid, GEOMETRY), roi_mm
+    for x_mm, is_missed in ((248, True), (-248, True), (240, False)):  # two touch what is seen, ±240
+        assert misses(Grid((2, 2, 2), (8.0, 8.0, 8.0), (0.0, 0.0, x_mm)), GEOMETRY) is is_missed
 
 
 def test_a_reference_goes_with_a_part_of_its_grid_that_is_seen(scan) -> None:

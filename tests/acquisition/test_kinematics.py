@@ -1,7 +1,5 @@
 """θ(t) of every kind, and pose tables as a rigid body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """docs/orbits.md is one program that works: each orbit's scan gives its object back, as far as the orbit sees it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Protocols against the paper's numbers, and scans that check themselves."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pulsed exposure: a line sees the part of its window that lies in the pulse, and some lines see nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """When each line opens, and which strip it belongs to."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

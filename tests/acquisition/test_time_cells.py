@@ -1,7 +1,6 @@
 """Time cells of every motion model: weights, times (Eq. 2 of the paper), lines and poses."""
 
-from __future__ import annotations
-
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -12,6 +11,7 @@ from phyradgs_cl.acquisition import (
     ConeGeometry,
     ConstantSpeed,
     Exact,
+    LineMiddles,
     MicroViews,
     PerRow,
     Scan,
@@ -27,7 +27,15 @@ from phyradgs_cl.acquisition.cells import (
     static_cells,
     static_start_cells,
 )
-from phyradgs_cl.acquisition.motion import motion_of
+from phyradgs_cl.acquisition.motion import (
+    MODELS,
+    MOTIONS,
+    STILL,
+    check_own_motion,
+    motion_facts,
+    motion_from_facts,
+    motion_of,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -130,7 +138,7 @@ def scan(is_fly: bool) -> Scan:
 def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
     counts = {
         Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 30,
-        Exact(segments=5): 5,
+        Exact(segments=5): 5, LineMiddles(): 10,
     }
     for motion, count in counts.items():
         moving = motion.cells(scan(True), 1)
@@ -140,6 +148,46 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
         assert START_S <= first_s <= last_s <= START_S + 1.1
     with pytest.raises(InputError, match="micro-views"):
         motion_of("micro-view")
+    assert [motion_of(name).name for name in MOTIONS] == list(MOTIONS) and motion_of(STILL[2]) is STILL[2]
+    for model in MODELS:  # a name is no field that anybody sets
+        assert "name" not in repr(model())
+        with pytest.raises(TypeError, match="name"):
+            model(name="mine")
+
+
+def test_facts_of_a_model_are_the_model() -> None:
+    for model in MODELS:
+        assert motion_from_facts(motion_facts(model())) == model()
+    odd = MicroViews(3, 2)
+    assert motion_facts(odd) == {"name": "micro-views", "strips": 3, "sub_intervals": 2}
+    assert motion_from_facts(motion_facts(odd)) == odd and motion_from_facts({"name": "Own"}) is None
+    assert motion_facts(Own(None)) == {"name": "Own"}
+
+
+class Own:
+    """Cells that somebody else has made."""
+
+    def __init__(self, made: object) -> None:
+        self.made = made
+
+    def cells(self, scan: Scan, frame: int) -> object:
+        return self.made if frame == 0 else None
+
+
+def test_cells_of_ones_own_have_to_fit_the_scan() -> None:
+    fly = scan(True)
+    good = MicroViews(4, 3).cells(fly, 0)
+    for fine in (None, Static(), Own(good), Own(replace(good, weight=good.weight * 1.0009))):
+        check_own_motion(fine, fly)
+    for made, told in (
+        (None, "a NoneType from cells"), (replace(good, lines=9), "cells for 9 columns"),
+        (replace(good, axis="rows"), "cells for 10 rows"), (replace(good, pose=good.pose[:, :9]), "pose"),
+        (replace(good, time_s=good.time_s[:3]), "time_s"), (replace(good, weight=0.5 * good.weight), "sum to 0.5"),
+        (replace(good, weight=1.0015 * good.weight), "sum to 1.0015"),
+        (replace(good, line_stop=good.line_stop + (np.arange(12) < 3)), "sum to 2"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=f"motion Own.*{told}"):
+            check_own_motion(Own(made), fly)
 
 
 def test_without_a_number_segments_follow_from_the_time_error() -> None:

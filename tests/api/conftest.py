@@ -1,7 +1,5 @@
 """A small scan through the public door; PyTorch's tests are collected where PyTorch is."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import pytest

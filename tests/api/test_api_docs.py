@@ -1,7 +1,5 @@
 """docs/api.md is one program that works, and names everything that the API has."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bad input at every name of the API: one line with culprit and remedy, an InputError, and nothing half done."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -265,6 +263,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: api.prepare(GOOD, "rings", rings={"windo": 3}), "windo"),
     ],
     "reconstruct": [
+        (lambda: reconstruct(GOOD, "sirt", initial="volume.h5"), "initial: found .volume.h5."),
         (lambda: reconstruct(GOOD, "sirt", initial=np.zeros((2, 3))), "initial: found shape"),
         (lambda: reconstruct(GOOD, "fdk", initial=VOLUME), "--initial: found --method fdk"),
         (lambda: reconstruct(GOOD, "sirt", initial=ELSEWHERE), "--initial: found a volume in .*meets the scan's"),

@@ -1,12 +1,11 @@
 """Every name of the API says what it takes and gives: parameters by name, shapes, units, errors."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 from phyradgs_cl import api
@@ -82,9 +81,9 @@ def test_a_signature_is_short_enough_to_read(name) -> None:
 
 
 def test_the_test_sees_what_is_not_said(monkeypatch) -> None:
-    def silent(volume: np.ndarray, side_mm: float) -> None: ...  # noqa: F821
+    def silent(volume: np.ndarray, side_mm: float) -> None: ...
 
-    def brief(volume: np.ndarray, side_mm: float) -> None:  # noqa: F821
+    def brief(volume: np.ndarray, side_mm: float) -> None:
         """The volume."""
 
     monkeypatch.setattr(api, "silent", silent, raising=False)

@@ -1,7 +1,5 @@
 """Ctrl-C in a script: the script stops, and what there is is not lost."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

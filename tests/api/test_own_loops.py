@@ -1,7 +1,5 @@
 """Loops of one's own: nothing but scalars crosses the bus, and the examples reach what the methods reach."""
 
-from __future__ import annotations
-
 import importlib.util
 import runpy
 import sys

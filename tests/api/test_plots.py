@@ -1,7 +1,5 @@
 """Figures of scans and results: what they draw is what there is."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Operators from Python: two routes to one number, transposes, gradients, scipy, arrays of host and device."""
 
-from __future__ import annotations
-
 import gc
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Scans and reconstructions from Python."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

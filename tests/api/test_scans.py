@@ -1,7 +1,5 @@
 """Scans from arrays: the same as those of files and of the simulator."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

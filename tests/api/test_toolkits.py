@@ -1,7 +1,5 @@
 """Geometries of ASTRA and TIGRE: points fall where those programs' own definitions put them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Operators in PyTorch; collected only where PyTorch is installed (conftest.py)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

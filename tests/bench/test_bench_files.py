@@ -1,7 +1,5 @@
 """Results files, folders of volumes, rows and jobs: all that needs no device."""
 
-from __future__ import annotations
-
 import json
 import os
 import zipfile

@@ -1,7 +1,5 @@
 """Projections compared in 2D, bias of regions, and the figure of many columns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

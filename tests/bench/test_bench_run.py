@@ -1,7 +1,5 @@
 """Whole benchmarks at sizes of some voxels: resuming, tables, figures, poses, interruptions, the phantom study."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

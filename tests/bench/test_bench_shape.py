@@ -1,7 +1,5 @@
 """Roundness and edge sharpness against beads whose blur, place and ellipticity are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter

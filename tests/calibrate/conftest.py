@@ -1,7 +1,5 @@
 """Small noisy scans of a phantom, whose frames last as long as they are apart or less, turned one way and the other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

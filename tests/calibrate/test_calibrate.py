@@ -1,7 +1,5 @@
 """Planted errors are found, with deviations that cover them; what frames cannot tell is left; a right scan stays."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

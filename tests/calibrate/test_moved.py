@@ -1,7 +1,5 @@
 """Changed scans: what a change means, by two routes; and what a copy of a file holds of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import h5py

@@ -1,7 +1,5 @@
 """A small scan of a phantom with closed-form line integrals, noise included."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """The whole check: each planted fault is found, and a clean scan has none."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

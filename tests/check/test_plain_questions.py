@@ -1,7 +1,5 @@
 """The questions that need no reconstruction: each finds what is planted for it and is silent without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -156,9 +154,15 @@ def test_frames_that_are_no_line_integrals_of_an_object(clean) -> None:
         finding = check_coverage(replace(clean, projections=factor * clean.projections))
         assert finding.verdict == SUSPICIOUS
         assert "no object" in finding.text and "line integrals" in finding.advice
-    counts = (1000 * np.exp(-clean.projections)).astype(np.float32)
-    finding = check_coverage(replace(clean, projections=counts))
-    assert finding.verdict == SUSPICIOUS and "--quantity" in finding.advice
+    p = clean.projections
+    bright = p.copy()
+    bright[:, 8:24, 10:22] = -p.max()
+    for values, said, advised in (
+        (1000 * np.exp(-p), "largest, 1e+03, beside the object", "--quantity"),
+        (50 * p / p.max(), "one photon in", "--quantity"), (bright, "brighter than the flats", "flats those of this scan"),
+    ):
+        finding = check_coverage(replace(clean, projections=values.astype(np.float32)))
+        assert finding.verdict == SUSPICIOUS and said in finding.text and advised in finding.advice
 
 
 def test_a_small_part_on_the_axis_is_not_a_dead_pixel(clean) -> None:

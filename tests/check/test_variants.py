@@ -1,7 +1,5 @@
 """Coarse scans and hypotheses: the same poses and times, by another route."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A scan of some voxels that the commands are tried on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

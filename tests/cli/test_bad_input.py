@@ -1,7 +1,5 @@
 """Bad input: one line that names the culprit, exit status 2, nothing written, an existing output untouched."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 import subprocess

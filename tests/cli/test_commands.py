@@ -1,7 +1,5 @@
 """The commands, run as a user would through the same entry point."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Warnings where they belong and nowhere else, files that are taken for others, and what surrounds a command."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """estimate and --profile: what a run would take, and where one spent its time."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The grid of a volume, chosen on the command line: what is in the file, said, scored and refused."""
 
-from __future__ import annotations
-
 import os
 
 import h5py

@@ -1,7 +1,5 @@
 """The help as a manual page: every command in the list with its whole sentence, and the Tab key."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Volumes of runs that did not come to their end: everybody who opens one says so, once."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

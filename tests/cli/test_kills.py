@@ -1,7 +1,5 @@
 """Runs that are killed leave their last checkpoint, and go on from it to the bits of a run that was not."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """--memory: the same results within a limit, and one line where it does not suffice."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

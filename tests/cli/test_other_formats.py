@@ -1,7 +1,5 @@
 """Volumes and scans in other programs' formats at the commands that read them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

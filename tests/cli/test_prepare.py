@@ -1,7 +1,5 @@
 """phyradgs prepare: a file that says what was done to it, and bad input in one line that loses nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """--preview: a picture of the run under way, which changes nothing about the run."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skimage.io import imread

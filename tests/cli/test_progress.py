@@ -1,7 +1,5 @@
 """What is said on the way: the quantity by its name, Gaussians where there are any, time left."""
 
-from __future__ import annotations
-
 import pytest
 
 from phyradgs_cl import progress

@@ -1,7 +1,5 @@
 """What wins over what, and how a wrong value is named by the place where it stands."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Every command once, each on what the ones before it have made."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

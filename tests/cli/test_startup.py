@@ -1,7 +1,5 @@
 """What a command imports before it answers: seconds that nobody has to wait for. Times: benchmarks/startup.py."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of Dask's workers: `make test-cluster`. Without the extra there is nothing here to run."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 import subprocess

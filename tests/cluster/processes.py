@@ -1,7 +1,5 @@
 """Processes that tests start and end, and waiting for what they do."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

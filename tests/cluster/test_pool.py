@@ -1,7 +1,5 @@
 """The workers: one device each, what they raise, what is said where they are missing."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Forty runs while workers are killed at random and the scheduler is restarted: forty results, each once."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The corpus as files: python -m tests.corpus FOLDER [--seed N]; one line per file says what must become of it."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """A damaged or hostile file, the command that it is given to, and what must come of it."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass

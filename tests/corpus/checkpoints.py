@@ -1,7 +1,5 @@
 """Checkpoints: archives that unfold, lie or execute, and arrays that no run has written."""
 
-from __future__ import annotations
-
 import io
 import pickle
 import zipfile

@@ -1,7 +1,5 @@
 """All cases, in one order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The good files that the corpus damages: a fly-scan, raw counts, volumes, a scanner, a configuration, checkpoints."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

@@ -1,7 +1,5 @@
 """Damage to one object of an HDF5 file: every way in which a field may be missing, wrong, boundless or elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

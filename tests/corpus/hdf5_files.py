@@ -4,8 +4,6 @@ What is not in a ``HARMLESS`` table must be refused. A field that may be missing
 only what says what a thing is called, or what is not read, may hold anything.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator, Mapping
 from pathlib import Path

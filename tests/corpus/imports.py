@@ -1,7 +1,5 @@
 """Other programs' scans: every damage of tests/importers/hostile.py through the command itself."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Every reader of the package on one file or folder: what `worker` calls, by name."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Cases through the real command, in a process that is replaced when a file kills it."""
 
-from __future__ import annotations
-
 import json
 import os
 import select

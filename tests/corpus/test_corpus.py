@@ -1,7 +1,5 @@
 """Every damaged or hostile file of the corpus through the real command: its own verdict, one line, in bounds."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

@@ -5,8 +5,6 @@ first. `make stress` goes on for STRESS × 36 s, half an hour at STRESS=50. How 
 pytest's XML report (--junit-xml).
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Scanner descriptions and configurations in TOML."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 

@@ -5,8 +5,6 @@ error is caught at its descriptor, so that libraries' own complaints count too. 
 else the machine does.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Counts to line integrals and back."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The two detector models."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Detector lag: what it does to a step of light, and that undoing it gives the frames back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT32

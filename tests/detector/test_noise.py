@@ -1,7 +1,5 @@
 """Noise against the moments of the distributions it is made of, at any dose."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimate of noise from the line integrals themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

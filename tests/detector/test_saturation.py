@@ -1,7 +1,5 @@
 """Which raw counts are clipped, and which only look so: air without noise lies together at one count too."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

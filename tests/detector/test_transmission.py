@@ -1,7 +1,5 @@
 """Transmission weights of pixels (PWLS): mean 1 over what counts, one over the variance of a line integral."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A volume that no flip or exchange of axes leaves as it is, with Gaussians, in a file of ours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

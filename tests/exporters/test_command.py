@@ -1,7 +1,5 @@
 """phyradgs export, as the command line runs it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `export` writes is read back as it was, and so is what other programs make of it."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import random

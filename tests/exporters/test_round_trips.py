@@ -1,7 +1,5 @@
 """What other programs' own libraries read: the bright voxel at its place in mm, every value, every direction."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,7 +1,5 @@
 """The fixtures of faults_kit, which tests import by this name."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A tiny scan, the command line, and devices, memories and disks that fail when they are told to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A device that fails at any launch: one line, its own status, outputs as they were, runs that go on to the same bits."""
 
-from __future__ import annotations
-
 import os
 
 import faults_kit as kit

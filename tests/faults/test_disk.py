@@ -1,7 +1,5 @@
 """Disks that fill up, at every write: one line, status 4, older outputs and checkpoints whole, nothing half written."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """A machine whose memory runs out: one line, status 6, nothing half written."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

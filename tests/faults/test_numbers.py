@@ -1,7 +1,5 @@
 """Numbers at the edge of what may be asked: results are finite, or an error of ours says which number is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import faults_kit as kit

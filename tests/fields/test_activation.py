@@ -1,7 +1,5 @@
 """Raw numbers and parameters: inverse of each other, within the bounds, differentiable where it counts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import ACTIVATION_INVERSE, ACTIVATION_MARGIN, FLOAT32, FLOAT64

@@ -1,7 +1,5 @@
 """A cloud averaged over voxels: moments, mass, and the mean over a voxel itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT64

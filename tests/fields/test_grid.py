@@ -1,7 +1,5 @@
 """Voxel grids: centres, sizes, scaling, refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

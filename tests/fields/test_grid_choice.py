@@ -1,7 +1,5 @@
 """Grids that are chosen: what size, voxel and box mean alone and together, and what is refused."""
 
-from __future__ import annotations
-
 import pytest
 
 from phyradgs_cl.errors import InputError

@@ -4,8 +4,6 @@ Needs clang-15 with libclc-15 (NVIDIA, AMD), ptxas (NVIDIA) and ocloc (Intel); `
 the environment, in the folder that GPU_COMPILERS names, and leaves the system as it is.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -6,8 +6,6 @@ What can be asked for is recorded, not listed: all methods and operators run on 
 shape, on whatever device there is, with float64 and without. Exit status 1 where a compiler refuses or a kernel spills.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
@@ -16,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent / "oclgrind"))
+sys.path[:0] = [str(HERE), str(HERE.parent / "oclgrind")]
 
 from compilers import TARGETS, KernelCost, Refused, missing  # noqa: E402
 from every_kernel import cases  # noqa: E402
@@ -73,6 +71,16 @@ def table(found: dict[str, dict[str, list[KernelCost]]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def placed(text: str, page: str) -> str:
+    """A page with its table of kernels replaced by ``text``; the table alone where the page has none."""
+    lines = page.splitlines(keepends=True)
+    starts = [k for k, line in enumerate(lines) if line.startswith(text.partition("|---")[0].rstrip())]
+    if not starts:
+        return text
+    stop = next((k for k in range(starts[0], len(lines)) if not lines[k].startswith("|")), len(lines))
+    return "".join([*lines[: starts[0]], text, *lines[stop:]])
+
+
 def _worst(costs_of_kernel: list[KernelCost]) -> str:
     registers = [cost.registers for cost in costs_of_kernel if cost.registers is not None]
     if not registers:
@@ -85,7 +93,7 @@ def _worst(costs_of_kernel: list[KernelCost]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="file for the table of docs/gpu.md")
+    parser.add_argument("--table", type=Path, help="file for the table, or a page that has it: docs/gpu.md")
     asked = parser.parse_args()
     if missing():
         print(f"not installed: {', '.join(missing())}; run make test-gpu-build", file=sys.stderr)
@@ -108,7 +116,8 @@ def main() -> int:
                 )  # fmt: skip
     text = table(found)
     if asked.table:
-        asked.table.write_text(text, encoding="utf-8")
+        page = asked.table.read_text(encoding="utf-8") if asked.table.exists() else ""
+        asked.table.write_text(placed(text, page), encoding="utf-8")
     print(f"{len(programs[True])} programs for {', '.join(TARGETS)}: {bad} refused or with spills")
     return int(bad > 0)
 

@@ -1,9 +1,8 @@
 """What three compilers for GPUs say of a kernel that spills is read as that."""
 
-from __future__ import annotations
-
 import pytest
 from gpu_build.compilers import KernelCost, Refused, amdgcn_costs, ocloc_costs, ptxas_costs
+from gpu_build.every_program import placed
 
 PTXAS = """ptxas info    : Compiling entry function 'heavy' for 'sm_90'
 ptxas info    : Function properties for heavy
@@ -38,3 +37,10 @@ def test_costs() -> None:
 def test_an_answer_of_another_form_is_a_refusal(read) -> None:
     with pytest.raises(Refused):
         read()
+
+
+def test_the_table_takes_its_place_in_a_page() -> None:
+    head = "| kernel | NVIDIA: registers, warps | AMD: registers, waves | Intel |\n|---|---|---|---|\n"
+    text, page = head + "| `new` | 1 | 2 | builds |\n", "before\n" + head + "| `old` | 3 | 4 | builds |\n\nafter | it\n"
+    assert placed(text, page) == "before\n" + text + "\nafter | it\n"
+    assert placed(text, "") == text

@@ -1,7 +1,5 @@
 """One small scan of an asymmetric object in closed form: foreign files are written from it, imports must end at it."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Callable

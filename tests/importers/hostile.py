@@ -1,7 +1,5 @@
 """Damage done to good foreign files, format by format: what a stranger, or a broken disk, may hand over."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

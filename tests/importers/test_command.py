@@ -1,7 +1,5 @@
 """phyradgs import, as the command line runs it."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

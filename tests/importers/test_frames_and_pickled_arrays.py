@@ -1,7 +1,5 @@
 """Frames to line integrals, masks put together, and arrays out of pickles: what is refused, and what it says."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

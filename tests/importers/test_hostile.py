@@ -1,7 +1,5 @@
 """Damaged and hostile files: one InputError of one line, in seconds, and nothing executed, followed or filled up."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Geometries that are no circle: RTK's tilts and offsets, and calibrated views of a real C-arm."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

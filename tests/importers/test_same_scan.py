@@ -1,7 +1,5 @@
 """A scan in every foreign format, imported, is the scan itself: pixels, geometry, timing, grid and truth."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 

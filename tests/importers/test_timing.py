@@ -1,7 +1,5 @@
 """What is said of a gantry's turn without the time from frame to frame: refused, the same way in every format."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

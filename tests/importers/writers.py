@@ -1,7 +1,5 @@
 """Foreign files written as their own programs write them, from a Truth; nothing of the importers is used here."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Small scans for the file tests; every number differs from its neighbours, so that a mix-up shows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An output file is there whole or as it was: whatever is raised, killed or full."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

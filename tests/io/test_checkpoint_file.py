@@ -1,7 +1,5 @@
 """Checkpoint archives: read as they were written, or refused with what to do."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

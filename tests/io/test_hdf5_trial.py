@@ -1,7 +1,5 @@
 """Files that the HDF5 library does not survive: another process finds out, and is replaced."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

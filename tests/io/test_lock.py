@@ -1,7 +1,5 @@
 """One run per output: locks that end with their process."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -1,7 +1,5 @@
 """A trajectory of one's own: any class with ``pose(frame, time_s)`` reconstructs, and is saved as a table of poses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every defect of a scan file is one line that names the HDF5 path, and costs no output file."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace

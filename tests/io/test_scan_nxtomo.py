@@ -1,7 +1,5 @@
 """A scan file as the nxtomo package, which set the layout, reads it; and the other way round."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pint

@@ -1,7 +1,5 @@
 """What is written comes back: every trajectory, shutter, mask and quantity of the scan format."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path

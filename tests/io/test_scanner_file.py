@@ -1,7 +1,5 @@
 """Scanner files: the two that come with the project, and messages about others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Volume files: what is written comes back, viewers find their axes, damage is named."""
 
-from __future__ import annotations
-
 import hashlib
 
 import h5py

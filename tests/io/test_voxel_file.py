@@ -1,7 +1,5 @@
 """Volumes from files: two layouts, and an error that names every defect."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

@@ -1,7 +1,5 @@
 """Makes ``laws_kit`` importable wherever pytest starts."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

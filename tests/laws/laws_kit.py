@@ -1,7 +1,5 @@
 """Random geometries, shutters, motions and clouds for the laws, and how many of them."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ray-driven projector is linear and its adjoint is one, whatever the scanner, the shutter and the grid."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from laws_kit import grids, many, seeds, tables

@@ -1,7 +1,5 @@
 """Splats: frames are linear in the densities, gradients their adjoint and the derivative, whatever the scanner."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from kernel_kit import splat, splat_gradients

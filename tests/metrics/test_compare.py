@@ -1,7 +1,5 @@
 """3D comparison."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """PSNR against its definition and scikit-image."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from refusals import assert_refused

@@ -1,7 +1,5 @@
 """A volume on another grid, against what trilinear interpolation is exact for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The figure of slices: a PNG comes out, and unwritable places are named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SSIM against scikit-image's, whose mirrored border is replaced by a margin of zeros."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small wrong changes of a source text, one at a time: what a test suite should notice."""
 
-from __future__ import annotations
-
 import ast
 import copy
 from collections.abc import Iterator

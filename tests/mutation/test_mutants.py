@@ -1,7 +1,5 @@
 """What a mutant is: every kind of change, at its place, and nothing in texts and annotations."""
 
-from __future__ import annotations
-
 import ast
 
 from mutation.mutants import mutants

@@ -1,7 +1,5 @@
 """A small moving scan; these tests are collected where PyTorch is installed (make test-neural)."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import pytest

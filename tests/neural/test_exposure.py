@@ -1,7 +1,5 @@
 """Averages over an exposure: gradients, and random subsets of times that are right on average."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

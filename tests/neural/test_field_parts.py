@@ -1,7 +1,5 @@
 """The parts of the fields against plain twins: hash encoding, attention in segments, pixels, voxels in bricks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

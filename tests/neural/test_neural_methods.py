@@ -1,7 +1,5 @@
 """naf and sax-nerf as methods: better than FDK, motion known better than not, repeatable, resumed to the same bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Line integrals of known fields in the network's place, against closed forms along the scan's own rays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shrinkage of block cosine transforms: kernel against twin, twin against what defines it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT32, FLOAT64
@@ -17,10 +15,11 @@ def test_the_kernel_is_its_twin(any_rt, shape) -> None:
     prox, on_device = DctProx(any_rt, shape), any_rt.upload(volume)
     for nonnegative in (False, True):
         found = any_rt.empty(shape)
-        prox(on_device, 0.4, nonnegative=nonnegative, out=found)
+        assert prox(on_device, 0.4, nonnegative=nonnegative, out=found) is found
         np.testing.assert_allclose(
             any_rt.download(found), dct_prox(volume, 0.4, nonnegative=nonnegative), rtol=0, atol=FLOAT32
         )
+    np.testing.assert_array_equal(prox(volume, 0.4, nonnegative=True), any_rt.download(found))
     prox(on_device, 0.4, nonnegative=True, out=on_device)  # in place, the same bits
     np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(found))
 

@@ -1,7 +1,5 @@
 """L1 + λ(1 − SSIM): kernel, float64 twin, finite differences, scikit-image."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import assert_near

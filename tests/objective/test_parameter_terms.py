@@ -1,7 +1,5 @@
 """Density and shape terms: twin against finite differences; the kernel adds the same to its gradients."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, asdict
 
 import numpy as np

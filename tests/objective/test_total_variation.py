@@ -1,7 +1,5 @@
 """Total variation: kernel, float64 twin, finite differences, and its definition."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT64, TV_GRADIENT, TV_VALUE, TWIN_GRADIENT

@@ -1,7 +1,5 @@
 """The TV maps of the voxel methods: kernels against twins, twins against definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import TV_MAP, TWIN_GRADIENT

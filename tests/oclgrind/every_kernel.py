@@ -10,8 +10,6 @@ lane, so that builds with vectors cannot be run on it. Its check for unwritten m
 "freeze", so that it is left out where kernels have them; bounds and races are checked in all.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -44,7 +42,7 @@ GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
-VECTORS_OR_FREEZES = ("asd-pocs", "fista", "phyradgs", "r2", "nothing", "operators")
+VECTORS_OR_FREEZES = ("asd-pocs", "fista", "fused", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
@@ -54,6 +52,18 @@ BUILDS = {
 def filled_by_copy(self: Runtime, array: DeviceArray, value: float) -> None:
     """Oclgrind does not note that filled memory has been written; copied memory it does."""
     self.write(array, np.full(array.size, value, array.dtype))
+
+
+def copied_by_host(
+    self: Runtime, source: DeviceArray, target: DeviceArray, *,
+    nbytes: int | None = None, source_offset: int = 0, target_offset: int = 0,
+) -> None:
+    """Nor memory that was copied on the device: the host takes it there."""
+    count = source.nbytes if nbytes is None else nbytes
+    values = self.download(target)
+    taken = self.download(source).reshape(-1).view(np.uint8)[source_offset : source_offset + count]
+    values.reshape(-1).view(np.uint8)[target_offset : target_offset + count] = taken
+    self.write(target, values)
 
 
 def cloud(count: int) -> np.ndarray:
@@ -125,6 +135,7 @@ def method(rt: Runtime, name: str, motion: str) -> None:
         changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
     elif name != "fdk":
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
+        changes |= {"voxel_iterations": 1} if name == "fused" else {}
     reconstruct(scan, name, rt, method_options(name, None, changes))
 
 
@@ -154,6 +165,7 @@ def run_one(build: str, case: str) -> int:
         launch(self, kernel, *args, **options)  # type: ignore[arg-type]
 
     Runtime.launch, Runtime.fill = noted, filled_by_copy  # type: ignore[method-assign,assignment]
+    Runtime.copy = copied_by_host  # type: ignore[method-assign]
     cases()[case](Runtime("oclgrind", **BUILDS[build]))  # type: ignore[arg-type]
     print(" ".join(sorted(launched)))
     return 0

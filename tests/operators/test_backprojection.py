@@ -1,7 +1,5 @@
 """FDK's voxel-driven backprojections against their float64 twins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

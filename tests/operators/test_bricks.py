@@ -1,7 +1,5 @@
 """Volumes that do not fit the device are taken in bricks: the same result, within the limit, in every direction of a cut."""
 
-from __future__ import annotations
-
 import logging
 from itertools import product
 

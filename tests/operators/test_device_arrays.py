@@ -1,7 +1,5 @@
 """Operators between device arrays: what they do to NumPy's, bit for bit, and nothing crosses the bus."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import numpy as np

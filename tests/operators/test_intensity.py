@@ -1,7 +1,5 @@
 """The intensity model, its derivative and the transpose: twins, finite differences, ⟨Jd, y⟩ = ⟨d, Jᵀy⟩."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

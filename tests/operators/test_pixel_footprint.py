@@ -1,7 +1,5 @@
 """The pixel's footprint: splats widened by a pixel's variance, against the twin, a fine detector, and differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,11 +1,10 @@
 """A scan's projector and its adjoint in one launch each: twins, ⟨Ax, y⟩ = ⟨x, Aᵀy⟩, subsets, repeatable bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from kernel_kit import note_launches
 from ray_tables import SHAPE, noise, tables
 from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
@@ -123,6 +122,22 @@ def test_lines_without_cells_are_zero_and_give_nothing(rt) -> None:
     operator = RayOperator(rt, GRID, SHAPE, [replace(whole, **parts)])
     check_twins(operator)
     assert not operator.forward(noise(GRID.shape, 77))[0, 3:8].any()
+
+
+def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> None:
+    """Drivers of screens end long ones; a CPU's has no such limit."""
+    x, y = noise(GRID.shape, 90), noise((4, *SHAPE), 91)
+    launched = note_launches(monkeypatch)
+    for shape, frames_of_launch in (({"lanes": 1, "pixel_items": True}, 3), ({}, 4)):
+        operator = RayOperator(Runtime(**shape), GRID, SHAPE, tables("micro-views", frames=4))
+        forward, adjoint = operator.project(x, "intensity"), operator.adjoint(y)
+        with monkeypatch.context() as patch:
+            launched.clear()
+            patch.setattr(rays, "_MOST_SAMPLES", 3 * rays._SAMPLES_PER_VOXEL * x.size)
+            np.testing.assert_array_equal(operator.adjoint(y), adjoint)
+            patch.setattr(rays, "_MOST_SAMPLES", 3 * y[0].size * max(GRID.shape))
+            np.testing.assert_array_equal(operator.project(x, "intensity"), forward)
+        assert launched == ["rays_adjoint"] * (-(-4 // frames_of_launch)) + ["rays_forward"] * (-(-4 // frames_of_launch))
 
 
 def test_one_launch_is_the_frames_one_by_one_and_bits_repeat(any_rt) -> None:

@@ -1,7 +1,5 @@
 """Joseph's projector and its adjoint: float64 twin, ⟨Ax, y⟩ = ⟨x, Aᵀy⟩, splats of the same field, closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import assert_near

@@ -1,7 +1,5 @@
 """Detector columns parallel to z, and poses that serve many lines: another kernel, the same bits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

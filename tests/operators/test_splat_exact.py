@@ -1,7 +1,5 @@
 """The splat kernels against their float64 twin: one Gaussian at a time on 512², then clouds and odd cases."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import assert_between, assert_near

@@ -1,7 +1,5 @@
 """Multi-pose batch rendering: one launch per operator for all micro-views of a frame, equal to Eq. 3 written out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import assert_near, note_launches, splat

@@ -1,7 +1,5 @@
 """The splat's adjoint against central differences of its float64 twin, a class of parameters at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +21,7 @@ from phyradgs_cl.fields.gaussians import QUATERNION, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.operators.twins.splat import precision_matrices, splat_frame
+from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
@@ -115,6 +114,17 @@ def test_what_is_not_drawn_has_no_gradient(any_rt, make_cloud, make_geometry, on
     found = device_gradients(any_rt, rows, table, random_weights(SHAPE))
     np.testing.assert_array_equal(found[:, 1:], 0)
     assert np.all(np.isfinite(found)) and np.any(found[:, 0])
+
+
+@pytest.mark.parametrize("options", [{}, {"affine": True}, {"cutoff_sigma": 0.0}, {"pixel_footprint": True}], ids=str)
+@pytest.mark.parametrize("motion", ["static", "micro-views", "exact"])
+def test_a_group_sums_what_one_item_sums(make_cloud, make_geometry, motion, options) -> None:
+    """Lines are walked within the cutoff there and from side to side of a box here: thin, tilted, cut by the border."""
+    rows, shape = make_cloud(40, 27, scale=(0.01, 0.5)), (40, 46)
+    table, h = frame_cells(motion, make_geometry(*shape)), random_weights(shape)
+    shapes = Runtime(lanes=1), Runtime(lanes=1, pixel_items=True)
+    one, group = (device_gradients(rt, rows, table, h, **options) for rt in shapes)
+    assert_classes(group, one, GRADIENT)
 
 
 def image_with_moved_centre(

@@ -1,7 +1,5 @@
 """Splats on a detector that adds photons: −ln Σ w exp(−p) over a line's cells, against twins and differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

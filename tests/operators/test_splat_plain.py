@@ -1,7 +1,5 @@
 """Plain arrays in mm to the splats' internal rows and padded images, and back, against NumPy in every build."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT32

@@ -1,7 +1,5 @@
 """The float64 twin of the exact splat against numerical integration along rays, which knows no closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

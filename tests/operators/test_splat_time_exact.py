@@ -1,7 +1,5 @@
 """Splats that move through the segments of a frame, against quadrature in time and against hundreds of poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import MODELS, READOUTS, assert_between, assert_classes, assert_near, by_gaussian

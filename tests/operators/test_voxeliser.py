@@ -1,7 +1,5 @@
 """The voxeliser and its adjoint against direct evaluation of the field in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernel_kit import assert_between, assert_classes, assert_near, by_gaussian
@@ -11,6 +9,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, QUATERNION, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceGaussians, Voxeliser, voxelise
 from phyradgs_cl.operators.twins.splat import voxel_field
+from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 # not a cube, no cubes as voxels, not centred, odd counts, one voxel thin, one voxel
@@ -76,6 +75,18 @@ def test_gradients(any_rt, make_cloud, finite_differences, grid) -> None:
     found = Voxeliser(any_rt, grid.shape, cutoff_sigma=0.0).voxelise_adjoint(rows, grid, h)
     expected = by_gaussian(finite_differences, lambda r: (h * voxel_field(r, *axes)).sum(), rows)
     assert_classes(found, expected, GRADIENT)
+
+
+@pytest.mark.parametrize("cutoff_sigma", [0.0, DEFAULT_CUTOFF_SIGMA])
+def test_a_group_sums_what_one_item_sums(make_cloud, cutoff_sigma) -> None:
+    """Rows are walked within the cutoff there and from side to side of a box here: thin and tilted Gaussians."""
+    rows, grid = make_cloud(40, 49, scale=(0.01, 0.5)), Grid((21, 25, 30), (0.07, 0.06, 0.05))
+    h = np.random.default_rng(10).normal(size=grid.shape).astype(np.float32)
+    one, group = (
+        Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma).voxelise_adjoint(rows, grid, h)
+        for rt in (Runtime(lanes=1), Runtime(lanes=1, pixel_items=True))
+    )
+    assert_classes(group, one, GRADIENT)
 
 
 def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud) -> None:

@@ -1,7 +1,5 @@
 """Adam: the kernel, its float64 twin and the textbook must take the same steps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import ADAM_KERNEL, ADAM_SECOND_MOMENT, ADAM_TEXTBOOK, FLOAT32, FLOAT64

@@ -1,7 +1,5 @@
 """Clone, split, prune: who is chosen, what mass and moments they get, and that the seed decides all else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

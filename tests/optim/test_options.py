@@ -1,7 +1,5 @@
 """Options of density control and learning rates: published numbers, ranges with both ends, values that stay."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np

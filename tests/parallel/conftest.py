@@ -1,7 +1,5 @@
 """Ranks without MPI: threads of this process. What needs MPI itself is collected where it is there."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """What every rank of tests/parallel/test_mpi.py does: python mpi_work.py SCAN OUT.npz; rank 0 keeps what came out."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

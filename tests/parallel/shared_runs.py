@@ -1,7 +1,5 @@
 """The scan and the runs of splats that ranks share, as threads (test_shared_runs.py) and under MPI (mpi_work.py)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, MicroViews, Protocol, Scan

@@ -1,7 +1,5 @@
 """Sums over ranks: exact, whatever the order, the number of ranks and the range of the numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.parallel import Alone, exact_sum

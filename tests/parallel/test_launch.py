@@ -1,7 +1,5 @@
 """How launchers are recognised, who takes which share, and what is said where the extra is missing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

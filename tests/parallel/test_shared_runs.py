@@ -1,7 +1,5 @@
 """Runs on several ranks, which are threads here: the same bits as on one, and the same gradient as undivided."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Closed-form integrals against sums of samples, known volumes and chords."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Signed distances and textures of the procedural phantoms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The named phantoms: known numbers, symmetries, sameness at every resolution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from refusals import assert_refused

@@ -1,7 +1,5 @@
 """Scans of voxels with an effect planted, and without: the same noise in both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Flats that change while a scan is taken."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

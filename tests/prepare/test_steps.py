@@ -1,7 +1,5 @@
 """Every step against the effect that it undoes, planted in a fly-scan; and on the scan without it, which it leaves alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Two scans of which a method must make the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """States of checkpoints are believed only as far as a run can have written them."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 

@@ -1,7 +1,5 @@
 """FDK in absolute units: uniform bodies come out at their own attenuation, whatever the size of the scanner."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ramp filters: the space-domain kernel, and what windows do to spectrum and noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT64, RAMP

@@ -1,7 +1,5 @@
 """FDK with a pose for every line: scans that are read out while the gantry turns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

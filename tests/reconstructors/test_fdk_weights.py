@@ -1,7 +1,5 @@
 """FDK's weights: whatever a scan's arc, detector and order of views, bodies keep their attenuation."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

@@ -1,7 +1,5 @@
 """FISTA with priors over subsets, voxels and splats together, and first volumes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

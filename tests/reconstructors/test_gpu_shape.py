@@ -1,13 +1,11 @@
 """Methods as a GPU runs them, one work-item per pixel in groups the size of a sub-group, give what vectors of lanes give."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from kernel_kit import note_launches
+from kernel_kit import CPU_ONLY, note_launches
 from tolerances import LAUNCH_SHAPE
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
@@ -17,7 +15,6 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
 KERNELS = Path(__file__).resolve().parents[2] / "cl"
-CPU_ONLY = {"splat_forward_rows", "splat_backward_rows", "backproject_upright", "turn_upright", "rays_upright"}
 USERS_ARRAYS = {"rows_enter", "rows_leave", "row_copy"}  # no method has them; tests/test_device_check.py does, in this shape
 GEOMETRY = ConeGeometry(5.0, 7.5, (13, 18), (0.3, 0.23), (0.1, 0.2))
 GRID = Grid((11, 12, 14), (0.18, 0.17, 0.14))

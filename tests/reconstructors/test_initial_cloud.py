@@ -1,7 +1,5 @@
 """The first cloud: at occupied voxels, spaced like its neighbours, never empty."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tolerances import FLOAT64

@@ -1,7 +1,5 @@
 """Scans of a detector that adds photons: the iterative methods model it, and gain from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The iterative methods on small systems: their own twins, their limits, their laws."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -49,7 +47,7 @@ class MatrixOperator:
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
         return (self.matrix.T @ frames.ravel()).reshape(self.volume_shape)
 
-    def subset(self, frames: Sequence[int]) -> MatrixOperator:
+    def subset(self, frames: Sequence[int]) -> "MatrixOperator":
         rows = self.matrix.reshape(self.frames_shape[0], -1, self.matrix.shape[1])[list(frames)]
         return MatrixOperator(rows.reshape(-1, rows.shape[-1]), self.volume_shape, self.frames_shape[1:])
 

@@ -1,7 +1,5 @@
 """The loop around stepwise methods: what it records and reports, why it ends, what it goes on from."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A method of somebody's own: a function, by itself or by its name, wherever a method is asked for."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What is done to frames before a method sees them: lag undone or ignored, and the median filter."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options by name: converted, checked, and refused with the names that would have been right."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """The voxel methods on the device: nothing but numbers crosses the bus, the same bits twice, and what the host computes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whole reconstructions of a tiny scan: repeatable, independent of units and exposure, stoppable."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable
@@ -19,17 +17,17 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors.registry import METHODS
 from phyradgs_cl.reconstructors.result import Progress, Reconstruction
 from phyradgs_cl.reconstructors.splats import method as splatting
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.phyradgs import phyradgs
-from phyradgs_cl.reconstructors.splats.r2 import r2
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(
     motion=MicroViews(4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
 )
+phyradgs, r2 = METHODS["phyradgs"].run, METHODS["r2"].run
 STEADY = replace(OPTIONS, control=DensityControl(every=0))
 
 

@@ -4,8 +4,6 @@ Raw numbers → activation → splats through time cells → L1 + weighed square
 terms.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

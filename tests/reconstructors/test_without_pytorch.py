@@ -1,7 +1,5 @@
 """The neural methods where PyTorch is not installed: known, checked, and refused with what to install."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import pytest

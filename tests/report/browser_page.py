@@ -6,8 +6,6 @@
 PHYRADGS_CHROMIUM names the browser's program if it is not on the path; PHYRADGS_PICTURES a folder for screenshots.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A small fly-scan with its truth, and a reconstruction of it, as files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path

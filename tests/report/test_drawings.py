@@ -1,7 +1,5 @@
 """Geometry, shutter and curves: drawn where they are, for every kind of scan."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Elements, pictures and words that a page is made of."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

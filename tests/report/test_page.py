@@ -1,7 +1,5 @@
 """The page of a run: whole, on its own, with the right numbers, and safe from what files say."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The picture of a run under way, and the window of a finished one."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Algebra on the device against its twin on the host, in every shape of a launch; sums to float64, same bits every time."""
 
-from __future__ import annotations
-
 import gc
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which device is taken: by capability, by wish, by environment; never a checker or an emulator unasked."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 

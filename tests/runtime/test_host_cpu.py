@@ -1,7 +1,5 @@
 """The processor's name, which a results file carries beside its seconds."""
 
-from __future__ import annotations
-
 import platform
 
 from phyradgs_cl.runtime.host_cpu import cpu_facts, cpu_name

@@ -1,7 +1,5 @@
 """Limits of device memory: how they are written, that they hold, and what is said where they do not suffice."""
 
-from __future__ import annotations
-
 import gc
 
 import numpy as np

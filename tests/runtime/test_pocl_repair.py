@@ -1,7 +1,5 @@
 """The repair of PoCL's unknown processors, on a device record made for the test."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import struct

@@ -1,7 +1,5 @@
 """Where device time goes: what is counted, and the table that says so."""
 
-from __future__ import annotations
-
 import gc
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Programs and kernels: built once, sources with their headers, errors that name the file and line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

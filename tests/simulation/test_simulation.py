@@ -1,7 +1,5 @@
 """The simulator: each line over its own window, sampled finely enough, with scaling, noise and refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

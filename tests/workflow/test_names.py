@@ -1,7 +1,5 @@
 """Names that no program's author thought of: bytes that are no UTF-8, as long as a file system allows, a NUL in a title."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

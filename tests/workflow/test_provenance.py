@@ -1,7 +1,5 @@
 """Provenance and results lines are edited, damaged or made up: what is not of its kind is left out, in one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs of a sweep or a watched folder: they go on from their own checkpoint, and from no other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

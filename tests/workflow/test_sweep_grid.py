@@ -1,7 +1,5 @@
 """A sweep's file: what it expands to, and that everything wrong in it is named before any run."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sweeps in one process: resumed, failures noted and tried again, results and tables; without Dask they say so."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

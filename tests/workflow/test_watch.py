@@ -1,7 +1,5 @@
 """A watched folder: every scan once, failures set aside, half-written files left alone, signals answered."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -3,8 +3,6 @@
 STRESS=50, which `make stress` sets, is a hundred scans and ten kills.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

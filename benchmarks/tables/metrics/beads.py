@@ -1,7 +1,5 @@
 """Beads of known place and size in a volume: what the shape metrics are measured on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Bias: whether known regions have the right mean, which PSNR mixes with everything else."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray

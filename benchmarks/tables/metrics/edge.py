@@ -6,8 +6,6 @@ profile has no plateau. A straight edge blurred by σ rises from 10 % to 90 % wi
 their own width d add d²/12 to σ²: a perfect volume has a rise of about 0.74 voxel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A figure of many reconstructions side by side: a column each, the same slices and grey values in all."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The published 2D numbers divide every image by its own maximum, so that they can
 the maximum of the whole reference stack, serves all images, and nothing is rescaled.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

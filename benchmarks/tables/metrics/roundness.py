@@ -5,8 +5,6 @@ As in metrology, radii are taken about the centre of the least-squares circle, s
 displaced counts as round; the displacement is reported beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Zha, Zhang, Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

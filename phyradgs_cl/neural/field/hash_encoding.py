@@ -3,8 +3,6 @@
 Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102; in NAF (Zha, Zhang, Li, MICCAI 2022) in three dimensions.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

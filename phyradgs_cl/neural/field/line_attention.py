@@ -3,8 +3,6 @@
 Cai, Wang, Yuille, Zhou, Wang, "Structure-Aware Sparse-View X-ray 3D Reconstruction", CVPR 2024.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

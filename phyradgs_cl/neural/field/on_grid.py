@@ -1,7 +1,5 @@
 """The field that is fitted: positions in the volume's cube to attenuation, over all of a grid's voxels where asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import nn

@@ -1,7 +1,5 @@
 """The fields of the two methods, with their first random parameters."""
 
-from __future__ import annotations
-
 import torch
 
 from phyradgs_cl.neural.field.attenuation_network import naf_network, sax_network

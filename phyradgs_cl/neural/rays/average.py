@@ -1,7 +1,5 @@
 """What a pixel measures over its exposure, and the squared error of a prediction from a few of its times."""
 
-from __future__ import annotations
-
 import math
 
 import torch

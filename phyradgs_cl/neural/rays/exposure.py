@@ -1,7 +1,5 @@
 """The rays of a pixel: one to each of the times at which its line is exposed, from the frame's time cells."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +22,7 @@ class ExposureRays:
     axis: str
 
     @classmethod
-    def of_cells(cls, table: TimeCells, grid: Grid) -> ExposureRays:
+    def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
         """The rays of still cells in mm, for a volume on ``grid`` in mm.
 
         Raises InputError for a table whose lines have unlike numbers of cells, or unlike weights: no model here makes one.

@@ -1,7 +1,5 @@
 """Line integrals of a field along rays through the volume's box, by samples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -3,8 +3,6 @@
 Windows beside scattered pixels: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 

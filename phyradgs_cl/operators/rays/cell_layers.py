@@ -1,7 +1,5 @@
 """The cells of frames in layers of one cell per line, and what a detector that adds photons makes of them, on the host."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j) of every pixel, and Jᵀ y = Σ_k A
 per cell of a line, that cost together what one launch over all cells does. Twin: ``intensity_frame`` in twins/rays.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from typing import Any
@@ -92,7 +90,7 @@ class IntensityOperator:
         same: SameArray = self._given(total, out)
         return same
 
-    def subset(self, frames: Sequence[int]) -> IntensityOperator:
+    def subset(self, frames: Sequence[int]) -> "IntensityOperator":
         """The same for some of the frames, in this order, with a volume of its own for J."""
         chosen = list(frames)
         part = copy(self)

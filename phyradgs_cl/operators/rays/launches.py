@@ -1,8 +1,7 @@
-"""Launches of the ray-driven projector (Joseph) and its matched adjoint: cells of many frames, one launch per operator."""
-
-from __future__ import annotations
+"""Launches of the ray-driven projector (Joseph) and its matched adjoint: cells of many frames at a time."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -14,7 +13,9 @@ from phyradgs_cl.runtime.layout import GUARD
 _BRICK = (32, 32, 8)
 _SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL promises
 _BLOCK = 4  # voxels per side of what a work-group takes where work-items are voxels; as in cl/rays.cl
+_SAMPLES_PER_VOXEL = 4  # of a view that the adjoint takes, about
 _LONG_FROM = 2**31  # floats: where 32-bit indices end
+_MOST_SAMPLES = 2**29  # of a GPU's launch: a tenth of a second on a slow one, whose screen's driver ends long ones
 AVERAGES = ("log", "intensity", "gap")  # gap: log less intensity; in the order of cl/rays.cl
 
 
@@ -34,20 +35,22 @@ def launch_forward(
     ``add`` lays them onto what is there: line integrals of several bricks, for ``log`` alone.
     """
     blocks = -(-layout.width // rt.lanes)
-    rt.launch(
-        rt.kernel("rays", "rays_forward", **_defines(rt, layout)),
-        (blocks, layout.lines, frame_list.size),
-        volume,
-        cells.cells,
-        cells.cell_lines,
-        cells.line_cells,
-        frame_list,
-        *layout.constants(),
-        np.int32(AVERAGES.index(average)),
-        np.int32(add),
-        frames,
-        group=rt.group(on_cpu=min(blocks, 8)),
-    )
+    kernel = rt.kernel("rays", "rays_forward", **_defines(rt, layout, average))
+    for first, stop in _parts(rt, frame_list.size, layout.lines * layout.width * max(layout.brick.shape)):
+        rt.launch(
+            kernel,
+            (blocks, layout.lines, stop - first),
+            volume,
+            cells.cells,
+            cells.cell_lines,
+            cells.line_cells,
+            frame_list,
+            *layout.constants(),
+            np.int32(first),
+            np.int32(add),
+            frames,
+            group=rt.group(on_cpu=min(blocks, 8)),
+        )
 
 
 def launch_adjoint(
@@ -65,22 +68,32 @@ def launch_adjoint(
     bx, by, bz = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt)
     owners = (-(-nx // bx), -(-ny // by), -(-nz // bz))
     group = rt.group(on_cpu=1, on_gpu=_BLOCK**3)
-    rt.launch(
-        rt.kernel("rays", "rays_adjoint", **_defines(rt, layout)),
-        (owners[0] * group, *owners[1:]),
-        frames,
-        cells.cells,
-        cells.cell_lines,
-        cells.matrices,
-        np.int32(cells.matrix_stride),
-        cells.frame_cells,
-        frame_list,
-        np.int32(frame_list.size),
-        *layout.constants(),
-        np.int32(add),
-        volume,
-        group=group,
-    )
+    kernel = rt.kernel("rays", "rays_adjoint", **_defines(rt, layout, "log"))
+    for first, stop in _parts(rt, frame_list.size, _SAMPLES_PER_VOXEL * nz * ny * nx):
+        rt.launch(
+            kernel,
+            (owners[0] * group, *owners[1:]),
+            frames,
+            cells.cells,
+            cells.cell_lines,
+            cells.matrices,
+            np.int32(cells.matrix_stride),
+            cells.frame_cells,
+            frame_list,
+            np.int32(first),
+            np.int32(stop),
+            *layout.constants(),
+            np.int32(add or first > 0),  # onto what the launch before has left: the same sums, bit for bit
+            volume,
+            group=group,
+        )
+
+
+def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:
+    """First frame and the one after the last of each launch: all in one on a CPU, few enough on a GPU."""
+    step = max(_MOST_SAMPLES // samples_per_frame, 1) if rt.pixel_items else frames
+    for first in range(0, frames, step):
+        yield first, min(first + step, frames)
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
@@ -95,9 +108,10 @@ def owner_steps(rt: Runtime) -> tuple[int, int]:
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 
 
-def _defines(rt: Runtime, layout: RayLayout) -> dict[str, int]:
+def _defines(rt: Runtime, layout: RayLayout, average: str) -> dict[str, int]:
     x, y, z = brick_of(rt)
     return {
+        "AVERAGE": AVERAGES.index(average),
         "IMAGE_GUARD": GUARD,
         "BRICK_X": x,
         "BRICK_Y": y,

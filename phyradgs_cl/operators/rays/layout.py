@@ -1,7 +1,5 @@
 """How volumes, frames and time cells lie in device memory for the ray-driven projector (cl/rays.cl, cl/common/ray.h)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -34,11 +32,11 @@ class RayLayout:
     brick: Brick
 
     @classmethod
-    def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> RayLayout:
+    def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> "RayLayout":
         """The whole grid, with the readout's lines as rows of the frames."""
         return cls(grid, *Readout(axis).shape(detector_shape), whole(grid.shape))
 
-    def of(self, brick: Brick) -> RayLayout:
+    def of(self, brick: Brick) -> "RayLayout":
         """The same frames with another part of the grid."""
         return replace(self, brick=brick)
 
@@ -77,9 +75,6 @@ class RayLayout:
         self.inside(flat)[...] = volume
         return flat
 
-    def unpad_volume(self, flat: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(self.inside(flat))
-
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
         """The kernels' arguments about shapes: voxels, the first of them, pitch, voxel size, lines, width, pitch."""
         nz, ny, nx = self.brick.shape
@@ -107,7 +102,7 @@ class RayCells:
     frame_cells: DeviceArray
 
     @classmethod
-    def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> RayCells:
+    def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "RayCells":
         counts = np.array([table.count for table in tables])
         starts = np.concatenate([[0], np.cumsum(counts)])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])

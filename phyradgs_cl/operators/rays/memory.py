@@ -1,7 +1,5 @@
 """The device memory of ray-driven operators: a volume, whole or a brick at a time, and the frames of a batch."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The system matrix of a whole scan: all frames under one motion model, as one linear operator and its transpose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from typing import Any
@@ -37,7 +35,7 @@ class LinearOperator(Interface):
         """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         ...
 
-    def subset(self, frames: Sequence[int]) -> LinearOperator:
+    def subset(self, frames: Sequence[int]) -> "LinearOperator":
         """The rows of A that belong to these frames, in this order."""
         ...
 
@@ -160,7 +158,7 @@ class RayOperator:
                 launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
             self.memory.read_volume(layout, on_device, result)
 
-    def subset(self, frames: Sequence[int]) -> RayOperator:
+    def subset(self, frames: Sequence[int]) -> "RayOperator":
         """The same operator on some of the frames, in this order; cheap, but worth keeping if it is used again."""
         chosen = self._chosen[np.asarray(frames, np.int64)]
         if chosen.size == 0:

@@ -1,7 +1,5 @@
 """Ray-driven projector of one frame at a time, and its matched adjoint."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

@@ -3,8 +3,6 @@
 Rays of a column lie in one upright plane then, and share half of their work. The samples are those of ``rays``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

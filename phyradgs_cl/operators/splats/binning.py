@@ -1,13 +1,13 @@
 """Lists of splats per tile, by a stable counting sort on the device."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK, _SHORT_CHUNK = 512, 32  # splats that a work-item counts on a CPU, and on a GPU where counts stay few
+_CHUNK = 512  # splats that a work-item counts on a CPU
+_GROUP, _LARGEST_GROUP = 64, 256  # and a group on a GPU, an item each; the larger where counts would be too many
 _MANY_COUNTS = 1 << 22
+_SCANNED = 64  # counts that a group adds up at a time
 _SLACK = 1.5  # entries that there is memory for, over those of a build that was looked at
 _NEAR = 1.25  # grow before they outgrow it
 _MOST_ENTRIES = 2**31 - 1  # indices of entries are ints
@@ -33,10 +33,10 @@ class TileLists:
         self._counts: DeviceArray = rt.empty(1, np.int32)
         self._count_seen = -1
         self._needed: LaterItem | None = None
-        self._count = rt.kernel("binning", "bin_count")
-        self._within = rt.kernel("binning", "bin_within")
-        self._starts = rt.kernel("binning", "bin_starts")
-        self._fill = rt.kernel("binning", "bin_fill")
+        shape = "_group" if rt.pixel_items else ""
+        self._count, self._within, self._starts, self._fill = (
+            rt.kernel("binning", f"bin_{step}{shape}") for step in ("count", "within", "starts", "fill")
+        )
 
     def build(self, extents: DeviceArray, count: int, stride: int) -> None:
         """Fills ``starts`` (tiles + 1,) and ``entries`` from extents (6, stride).
@@ -50,6 +50,7 @@ class TileLists:
             self._counts = rt.empty(1, np.int32)  # the old goes before the new comes
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = (
+            extents,
             np.int32(stride),
             np.int32(count),
             np.int32(chunk),
@@ -57,18 +58,23 @@ class TileLists:
             self.tile,
             self.tiles,
         )
-        group = rt.group()
-        rt.launch(self._count, chunks, extents, *domain, self._counts, group=group)
+        group, scan = (chunk, _SCANNED) if rt.pixel_items else (1, 1)
+        boxes, scratch = ([rt.local(24 * group)], [rt.local(8 * scan)]) if rt.pixel_items else ([], [])
+        total = np.int32(self.total)
+        if rt.pixel_items:
+            rt.fill(self._counts, 0)
+        rt.launch(self._count, chunks * group, *domain, self._counts, *boxes, group=group)
         rt.launch(
             self._within,
-            self.total,
-            np.int32(self.total),
+            self.total * scan,
+            total,
             np.int32(chunks),
             self._counts,
             self.starts,
-            group=group,
+            *scratch,
+            group=scan,
         )
-        rt.launch(self._starts, 1, np.int32(self.total), self.starts)
+        rt.launch(self._starts, scan, total, self.starts, *scratch, group=scan)
         if self.waits or count != self._count_seen:
             self._make_room(int(rt.read_item(self.starts, self.total)), 1.0)
             self._count_seen, self._needed = count, None
@@ -77,13 +83,13 @@ class TileLists:
             self._needed = None
         rt.launch(
             self._fill,
-            chunks,
-            extents,
+            chunks * group,
             *domain,
             self._counts,
             self.starts,
             self.entries,
             np.int32(self.entries.size),
+            *boxes,
             group=group,
         )
         if not self.waits and self._needed is None:
@@ -106,8 +112,10 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Splats that one work-item counts, one after the other: a GPU has more work-items than there are long chunks."""
-    chunk = _SHORT_CHUNK if rt.pixel_items else _CHUNK
-    while chunk < _CHUNK and tiles * -(-count // chunk) > _MANY_COUNTS:
+    """Splats that one work-item counts, one after the other (CPUs), or a group, each by an item of its own (GPUs)."""
+    if not rt.pixel_items:
+        return _CHUNK
+    chunk, largest = _GROUP, min(_LARGEST_GROUP, rt.device.handle.max_work_group_size)
+    while 2 * chunk <= largest and tiles * -(-count // chunk) > _MANY_COUNTS:
         chunk *= 2
     return chunk

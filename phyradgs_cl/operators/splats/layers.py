@@ -4,8 +4,6 @@ A detector adds photons: the merged frame is −ln Σ w_k exp(−p_k) over the c
 the k-th layer; merging also keeps the derivative by every layer, which is what the adjoint needs.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.operators.splats.layout import DeviceCells

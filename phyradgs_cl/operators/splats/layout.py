@@ -1,7 +1,5 @@
 """How Gaussians and time cells lie in device memory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +21,7 @@ class DeviceGaussians:
     stride: int
 
     @classmethod
-    def upload(cls, rt: Runtime, rows: np.ndarray) -> DeviceGaussians:
+    def upload(cls, rt: Runtime, rows: np.ndarray) -> "DeviceGaussians":
         """From parameter rows (11, G); padding is a harmless unit Gaussian."""
         return cls(rt.upload(pad_columns(rows)), rows.shape[1], stride_of(rows.shape[1]))
 
@@ -76,7 +74,7 @@ class DeviceCells:
         return pitch_of(self.lines)
 
     @classmethod
-    def upload(cls, rt: Runtime, table: TimeCells) -> DeviceCells:
+    def upload(cls, rt: Runtime, table: TimeCells) -> "DeviceCells":
         pose = table.readout.poses(table.pose)
         poses, times = pose, np.zeros(1, np.float32)
         if table.end_poses is not None and table.line_times is not None:

@@ -5,8 +5,6 @@ sees the Gaussians again from the poses (``prepare``), and leaves that out where
 lies on the device, without padding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 
@@ -83,7 +81,7 @@ class SplatOperator:
         self._ready.note(point, self._cells[-1])
         return by_rows
 
-    def subset(self, frames: Sequence[int]) -> SplatOperator:
+    def subset(self, frames: Sequence[int]) -> "SplatOperator":
         """The same operator on some of the frames, in this order; costs nothing."""
         part = copy(self)
         part._cells = [self._cells[f] for f in frames]
@@ -107,7 +105,7 @@ class DensityOperator:
         """Frames (F, rows, columns) float32 to densities (G,)."""
         return self._operator.rows.densities(self._operator.back(self._point, frames))
 
-    def subset(self, frames: Sequence[int]) -> DensityOperator:
+    def subset(self, frames: Sequence[int]) -> "DensityOperator":
         """The same operator on some of the frames, in this order."""
         return DensityOperator(self._operator.subset(frames), self._point)
 

@@ -1,7 +1,5 @@
 """Between the arrays that users hold, in mm and without padding, and what the splats' kernels work on; all on the device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

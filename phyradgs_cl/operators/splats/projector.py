@@ -7,8 +7,6 @@ accumulation and strip concatenation (Eq. 3) straight into the merged frame, ``s
 needs the cells of a line one by one: they are drawn into a few layers then, which ``Layers`` merges.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +24,14 @@ DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
 DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
 PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
 _BAND_LINES = 8
-_BACKWARD_GROUP = 32
+GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
+"""How many work-items a Gaussian's adjoint takes, and how many of them along a line; by whether items are pixels."""
+
+
+def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Work-items and group of kernels in which Gaussians gather what is under them, as ``GROUP_DEFINES`` has it."""
+    items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
+    return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
@@ -51,7 +56,7 @@ class _Kernels:
     chain: Kernel
 
     @classmethod
-    def declare(cls, rt: Runtime, **options: bool) -> _Kernels:
+    def declare(cls, rt: Runtime, **options: bool) -> "_Kernels":
         by_pixel = rt.pixel_items
         defines = {"IMAGE_GUARD": GUARD, **options}
         forward = "splat_forward_pixels" if by_pixel else "splat_forward_rows"
@@ -59,7 +64,7 @@ class _Kernels:
         return cls(
             prepare=rt.kernel("splat_prepare", "splat_prepare", **defines),
             forward=rt.kernel("splat_forward", forward, BLOCK_PIXEL=by_pixel, **defines),
-            backward=rt.kernel("splat_backward", backward, GROUP=_BACKWARD_GROUP if by_pixel else 1, **defines),
+            backward=rt.kernel("splat_backward", backward, **GROUP_DEFINES[by_pixel], **defines),
             chain=rt.kernel("splat_chain", "splat_chain", **defines),
         )
 
@@ -159,12 +164,12 @@ class SplatProjector:
         Uses what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells.
         """
         rt = self.rt
-        group = _BACKWARD_GROUP if self.by_pixel else 1
+        items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
         kernels = self._kernels[cells.moving]
         rt.launch(
             kernels.backward,
-            gaussians.count * group,
+            items,
             self._records,
             self._seen,
             cells.cells,
@@ -178,7 +183,7 @@ class SplatProjector:
             np.int32(self.pitch),
             self.cutoff2,
             self._sums,
-            group=group if group > 1 else 16,
+            group=group,
         )
         rt.launch(
             kernels.chain,

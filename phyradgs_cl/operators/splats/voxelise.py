@@ -1,14 +1,12 @@
 """Voxeliser: Gaussians to a voxel grid, and its adjoint."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Shape, cut
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.layout import DeviceGaussians, split_coefficients
-from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA
+from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, GROUP_DEFINES, items_by_gaussian
 from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
@@ -39,8 +37,9 @@ class Voxeliser:
         self._extents = rt.empty(1, np.int32)
         self._prepare = rt.kernel("voxel_prepare", "voxel_prepare", IMAGE_GUARD=GUARD)
         self._forward = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=self.by_pixel, IMAGE_GUARD=GUARD)
-        self._backward = rt.kernel("voxel_backward", "voxel_backward", IMAGE_GUARD=GUARD)
-        self._chain = rt.kernel("voxel_backward", "voxel_chain", IMAGE_GUARD=GUARD)
+        backward = {"IMAGE_GUARD": GUARD, **GROUP_DEFINES[self.by_pixel]}
+        self._backward = rt.kernel("voxel_backward", "voxel_backward", **backward)
+        self._chain = rt.kernel("voxel_backward", "voxel_chain", **backward)
 
     def forward(
         self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
@@ -85,9 +84,10 @@ class Voxeliser:
         rt = self.rt
         if self._sums.size < gaussians.stride * SUM_FLOATS:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
+        items, group = items_by_gaussian(rt, gaussians.count)
         rt.launch(
             self._backward,
-            gaussians.count,
+            items,
             self._records,
             by_volume,
             self._shape4,
@@ -95,7 +95,7 @@ class Voxeliser:
             np.int32(gaussians.count),
             self.cutoff2,
             self._sums,
-            group=rt.group(on_cpu=16),
+            group=group,
         )
         rt.launch(
             self._chain,

@@ -3,8 +3,6 @@
 Reads the records of cl/common/splat.h back from the device; the loops of cl/splat_forward.cl are counted, not run.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Float64 twins of the backprojections: every voxel's ray by solving for it, every line by looking at all of them."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import map_coordinates
 

@@ -1,7 +1,5 @@
 """Float64 twin of the ray-driven projector and its transpose: Joseph's sums, one ray at a time in NumPy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

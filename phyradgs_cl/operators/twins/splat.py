@@ -5,8 +5,6 @@ the integral over the whole line, for Gaussians in front of the source. It share
 which works in detector coordinates (docs/mathematics.md).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -6,8 +6,6 @@ is the mean of the parabola through both ends and the middle. Conic and Q come f
 float64 can afford and the kernel cannot (docs/mathematics.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

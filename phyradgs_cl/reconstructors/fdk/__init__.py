@@ -1,7 +1,5 @@
 """FDK (Feldkamp, Davis and Kress 1984): ray weights, ramp filter, distance-weighted backprojection."""
 
-from __future__ import annotations
-
 import logging
 import time
 from dataclasses import dataclass

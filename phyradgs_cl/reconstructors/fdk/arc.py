@@ -1,7 +1,5 @@
 """How the views of a scan share the turn: angular cells, full turns and short scans."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ attenuation that the squares of what the row shows are a parabola for. Both only
 what lies beyond the panel stays unknown.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 WAYS = ("none", "cosine", "cylinder")

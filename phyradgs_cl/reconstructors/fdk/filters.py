@@ -3,8 +3,6 @@
 A. C. Kak and M. Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, Eq. 61 of chapter 3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

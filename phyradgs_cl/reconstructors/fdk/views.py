@@ -1,7 +1,5 @@
 """The views of an FDK reconstruction: where each pixel's ray starts, and what it counts before filtering."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displace
 arcs beyond the least, Med. Phys. 27 (2000) 773. A ray and its opposite have redundancy weights that sum to 2.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

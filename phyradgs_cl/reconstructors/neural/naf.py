@@ -3,14 +3,11 @@
 R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022.
 """
 
-from __future__ import annotations
+from functools import partial
 
-from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.neural import NeuralOptions
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.neural.run import reconstruct_neural
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, ignore_progress
-from phyradgs_cl.runtime import Runtime
 
 # Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels per side
 NAF_PUBLISHED = NeuralOptions(
@@ -30,18 +27,4 @@ NAF_PUBLISHED = NeuralOptions(
 )
 NAF_PRESETS = {"default": NeuralOptions(), "published": NAF_PUBLISHED}
 
-
-def naf(
-    scan: Scan,
-    options: NeuralOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-) -> Reconstruction:
-    """The volume (nz, ny, nx) in 1/mm of a neural field; the seed draws first parameters, frames, pixels and samples."""
-    return reconstruct_neural(scan, options, rt, seed, report, "naf", resume)
-
-
-METHOD = Method(naf, NAF_PRESETS)
+METHOD = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)

@@ -3,8 +3,6 @@
 The one place where the scan, the field and its training meet; PyTorch is imported when a run begins.
 """
 
-from __future__ import annotations
-
 import time
 from typing import TYPE_CHECKING
 
@@ -21,6 +19,7 @@ from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
     State,
+    ignore_progress,
     option_facts,
     state_arrays,
 )
@@ -35,12 +34,13 @@ def reconstruct_neural(
     scan: Scan,
     options: NeuralOptions,
     rt: Runtime,
-    seed: int,
-    report: ProgressReport,
+    *,
     method: str,
-    resume: State | None,
+    seed: int = 0,
+    report: ProgressReport = ignore_progress,
+    resume: State | None = None,
 ) -> Reconstruction:
-    """Runs a neural method; the public doors are ``naf`` and ``sax_nerf``.
+    """The volume of a neural field; the seed draws first parameters, frames, pixels and samples.
 
     ``rt`` makes the FDK volume that sets the unit of attenuation; the rest is PyTorch's. ``resume`` continues an
     interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed.
@@ -84,7 +84,7 @@ class _Passes:
 
     quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
 
-    def __init__(self, trainer: Trainer, iterations: int) -> None:
+    def __init__(self, trainer: "Trainer", iterations: int) -> None:
         self.trainer, self.iterations = trainer, iterations
 
     @property

@@ -1,7 +1,5 @@
 """Gaussians on the device with all that moves them: raw parameters, Adam's moments, gradients, statistics."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from phyradgs_cl.operators import DeviceGaussians

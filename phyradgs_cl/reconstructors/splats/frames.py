@@ -1,7 +1,5 @@
 """A scan's frames on the device as the splatting engine sees them: time cells, measurements and masks, internal units."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

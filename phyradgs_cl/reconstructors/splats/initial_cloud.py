@@ -1,7 +1,5 @@
 """The first cloud of Gaussians, drawn from an FDK volume."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

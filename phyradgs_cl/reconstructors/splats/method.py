@@ -5,8 +5,6 @@ volume's longest side and densities by a reference (FDK's 99.9th percentile), so
 constants mean the same for every scan; both are undone on the way out.
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np
@@ -17,7 +15,13 @@ from phyradgs_cl.operators.splats.work import Work
 from phyradgs_cl.optim import Population
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
+from phyradgs_cl.reconstructors.result import (
+    ProgressReport,
+    Reconstruction,
+    State,
+    ignore_progress,
+    option_facts,
+)
 from phyradgs_cl.reconstructors.splats.frames import Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.run import SplatRun
@@ -36,13 +40,14 @@ def reconstruct_splats(
     scan: Scan,
     options: SplatOptions,
     rt: Runtime,
-    seed: int,
-    report: ProgressReport,
+    *,
     method: str,
-    resume: State | None,
+    seed: int = 0,
+    report: ProgressReport = ignore_progress,
+    resume: State | None = None,
     initial: np.ndarray | None = None,
 ) -> Reconstruction:
-    """Runs a splatting method; the public doors are ``phyradgs`` and ``r2``.
+    """Runs a splatting method, called ``phyradgs`` or ``r2``.
 
     ``resume`` continues an interrupted run of the same scan and options from its state; ``initial`` (nz, ny, nx) in 1/mm
     is what the cloud is drawn from in place of an FDK volume.

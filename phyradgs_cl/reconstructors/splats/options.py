@@ -1,7 +1,5 @@
 """Options of the splatting methods, and the named presets: ours, the paper's, the released code's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

@@ -3,8 +3,6 @@
 The batch alone decides about the bits; how many ranks there are does not.
 """
 
-from __future__ import annotations
-
 from typing import Protocol as Interface
 
 import numpy as np

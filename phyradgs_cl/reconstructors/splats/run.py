@@ -1,7 +1,5 @@
 """One optimisation of radiative Gaussians: everything that changes from step to step."""
 
-from __future__ import annotations
-
 import json
 import time
 

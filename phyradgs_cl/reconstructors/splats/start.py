@@ -1,7 +1,5 @@
 """Where a splatting run starts: its internal units, and the first cloud."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

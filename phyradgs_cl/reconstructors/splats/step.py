@@ -1,7 +1,5 @@
 """One frame's part of a step: render, compare, go back, total variation, chain rule. The only place where they stand."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,29 +3,18 @@
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    state_arrays,
-)
-from phyradgs_cl.reconstructors.voxels.run import run_iterations
+from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.reconstructors.voxels.run import Setting, voxel_method
 from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, kept_columns
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime
 
 
 @dataclass(frozen=True)
@@ -53,28 +42,15 @@ class AsdPocsOptions(SartOptions):
         checks.within("residual_share", self.residual_share, 0, 1e6)
 
 
-def asd_pocs(
-    scan: Scan,
-    options: AsdPocsOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The ASD-POCS volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
-
-    def make(system: System) -> AsdPocs:
-        start = system.space.array(static_fdk(rt, scan))
-        epsilon = options.residual_share * system.space.norm(system.residual(start))
-        return AsdPocs(system, options, seed, TvDescent(rt, scan.grid.shape), epsilon)
-
-    volumes = 8 + kept_columns(scan, options)
-    return run_iterations("asd-pocs", make, scan, options, rt, report, resume, initial, volumes=volumes, frames=2)
+def _started(system: System, options: AsdPocsOptions, setting: Setting) -> "AsdPocs":
+    start = system.space.array(static_fdk(setting.rt, setting.scan))
+    epsilon = options.residual_share * system.space.norm(system.residual(start))
+    return AsdPocs(system, options, setting.seed, TvDescent(setting.rt, setting.scan.grid.shape), epsilon)
 
 
-METHOD = Method(asd_pocs, {"default": AsdPocsOptions()}, is_shared=True, takes_initial=True)
+METHOD = voxel_method(
+    "asd-pocs", AsdPocsOptions(), _started, volumes=lambda scan, options: 8 + kept_columns(scan, options), frames=2
+)
 
 
 class AsdPocs:

@@ -1,27 +1,16 @@
 """CGLS: conjugate gradients on the normal equations (Hestenes and Stiefel, J. Res. NBS 49 (1952) 409)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    state_arrays,
-)
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime
 
 
 @dataclass(frozen=True)
@@ -43,24 +32,6 @@ class CglsOptions(IterativeOptions):
             raise InputError("nonnegative", "true", "false for --method cgls", "use sirt or fista-tv")
 
 
-def cgls(
-    scan: Scan,
-    options: CglsOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The least-squares volume of a scan in 1/mm, as far as the iterations get. CGLS draws nothing from ``seed``."""
-
-    def make(system: System) -> Cgls:
-        return Cgls(system, options.noise_stop * _noise(system))
-
-    return run_iterations("cgls", make, scan, options, rt, report, resume, initial, volumes=7, frames=3)
-
-
 def _noise(system: System) -> float:
     """The norm of the measurement's noise."""
     measured = system.space.numpy(system.measured)
@@ -69,9 +40,10 @@ def _noise(system: System) -> float:
     return float(noise_level(measured, valid) * np.sqrt(pixels))
 
 
-METHOD = Method(
-    cgls, {"default": CglsOptions()}, is_shared=True, takes_initial=True, stops_itself=lambda options: options.noise_stop > 0
-)
+METHOD = voxel_method(
+    "cgls", CglsOptions(), lambda system, options, _: Cgls(system, options.noise_stop * _noise(system)),
+    volumes=7, frames=3, stops_itself=lambda options: options.noise_stop > 0,
+)  # fmt: skip
 
 
 class Cgls:

@@ -7,8 +7,6 @@ Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009)
 subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,7 +29,7 @@ from phyradgs_cl.reconstructors.result import (
 )
 from phyradgs_cl.reconstructors.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Prior, prior_of
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, Setting, voxel_method
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
@@ -72,6 +70,17 @@ class FistaOptions(IterativeOptions):
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
+def _started(system: System, options: FistaOptions, setting: Setting) -> "Fista":
+    scan = setting.scan
+    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
+    noise = noise_level(np.asarray(scan.projections, np.float32), valid)
+    prior = prior_of(options.prior, setting.rt, scan.grid, options.tv_iterations)
+    return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
+
+
+one_grid = voxel_method("fista", FistaOptions(), _started, volumes=_VOLUMES, frames=_FRAMES).run
+
+
 def fista(
     scan: Scan,
     options: FistaOptions,
@@ -98,7 +107,7 @@ def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
     first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
-        return _run(scan, replace(options, iterations=first), rt, report, resume, before)
+        return one_grid(scan, replace(options, iterations=first), rt, report=report, resume=resume, initial=before)
 
     def parted(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
         assert before is not None
@@ -106,7 +115,8 @@ def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
         start = before.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
         weight = _FINE_WEIGHT * options.prior_weight
         small = replace(options, iterations=options.iterations - first, prior_weight=weight)
-        return _run(replace(scan, grid=grid, reference=None), small, rt, report, resume, start)
+        fine = replace(scan, grid=grid, reference=None)
+        return one_grid(fine, small, rt, report=report, resume=resume, initial=start)
 
     if parts == 1:
         return [Stage("voxels", first, voxels)]
@@ -140,26 +150,6 @@ def _has_room(grid: Grid, parts: int, rt: Runtime) -> bool:
     voxels = math.prod(grid.shape) * parts**3
     holds = voxels <= MOST_VOXELS and rt.room().holds(*[4 * voxels] * (_VOLUMES + 2))
     return not rt.ranks.any(not holds)
-
-
-def _run(
-    scan: Scan,
-    options: FistaOptions,
-    rt: Runtime,
-    report: ProgressReport,
-    resume: State | None,
-    initial: np.ndarray | None,
-) -> Reconstruction:
-    """All passes on the scan's grid."""
-    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
-    noise = noise_level(np.asarray(scan.projections, np.float32), valid)
-
-    def make(system: System) -> Fista:
-        prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations)
-        return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
-
-    sizes = {"volumes": _VOLUMES, "frames": _FRAMES}
-    return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
 
 
 class Fista:

@@ -4,8 +4,6 @@ Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183 and IEEE Trans. Image Proce
 O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,20 +11,11 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.objective import TvProx
-from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.reconstructors.voxels.priors import axis_weights
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, Setting, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime
 
 _ARRAYS = ("volume", "previous", "projected", "projected_previous")
 
@@ -50,25 +39,12 @@ class FistaTvOptions(IterativeOptions):
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
-def fista_tv(
-    scan: Scan,
-    options: FistaTvOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The TV-regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
-
-    def make(system: System) -> FistaTv:
-        return FistaTv(system, options, TvProx(rt, scan.grid.shape, axis_weights(scan.grid)))
-
-    return run_iterations("fista-tv", make, scan, options, rt, report, resume, initial, volumes=12, frames=3)
+def _started(system: System, options: FistaTvOptions, setting: Setting) -> "FistaTv":
+    grid = setting.scan.grid
+    return FistaTv(system, options, TvProx(setting.rt, grid.shape, axis_weights(grid)))
 
 
-METHOD = Method(fista_tv, {"default": FistaTvOptions()}, is_shared=True, takes_initial=True)
+METHOD = voxel_method("fista-tv", FistaTvOptions(), _started, volumes=12, frames=3)
 
 
 class FistaTv:

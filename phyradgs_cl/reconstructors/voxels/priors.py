@@ -1,7 +1,5 @@
 """Priors of volumes by name, as proximal maps that start from where the last one ended."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -4,8 +4,6 @@ Volumes and frames are whole on every rank, so that the methods around an operat
 same everywhere. Sums of volumes do not depend on their order, but on how many frames per rank adds up by itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol as Interface
 from typing import TypeVar
@@ -59,7 +57,7 @@ class Intensity(Interface):
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray: ...
 
-    def subset(self, frames: Sequence[int]) -> Intensity: ...
+    def subset(self, frames: Sequence[int]) -> "Intensity": ...
 
 
 class SharedIntensity(SharedOperator):

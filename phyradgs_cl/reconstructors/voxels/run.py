@@ -1,14 +1,13 @@
 """The iterative voxel methods between scan and loop: options, system, convergence, facts.
 
-A method is a class with ``system``, ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it.
+A method is a class with ``system``, ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it, and
+``voxel_method`` makes a line of the registry of it.
 """
-
-from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 from typing import Protocol as Interface
 
 import numpy as np
@@ -20,7 +19,14 @@ from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.checkpoint import check_like, count_of
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, State, option_facts
+from phyradgs_cl.reconstructors.method import Method
+from phyradgs_cl.reconstructors.result import (
+    ProgressReport,
+    Reconstruction,
+    State,
+    ignore_progress,
+    option_facts,
+)
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
@@ -122,6 +128,45 @@ def run_iterations(
     }
     (volume, _), state = run.present_volume(), loop.state_if_interrupted()
     return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
+
+
+class Setting(NamedTuple):
+    """What a method may need beside its system and its options."""
+
+    scan: Scan
+    rt: Runtime
+    seed: int
+
+
+def voxel_method(
+    name: str,
+    default: IterativeOptions,
+    make: Callable[[System, Any, Setting], Algorithm],
+    *,
+    volumes: int | Callable[[Scan, Any], int],
+    frames: int,
+    stops_itself: Callable[[Any], bool] = lambda options: False,
+) -> Method:
+    """An algorithm as a method; ``volumes``, of scan and options where it depends on them, and ``frames`` as of
+    ``run_iterations``."""
+
+    def run(
+        scan: Scan,
+        options: Any,
+        rt: Runtime,
+        *,
+        seed: int = 0,
+        report: ProgressReport = ignore_progress,
+        resume: State | None = None,
+        initial: np.ndarray | None = None,
+    ) -> Reconstruction:
+        setting, held = Setting(scan, rt, seed), volumes(scan, options) if callable(volumes) else volumes
+        return run_iterations(
+            name, lambda system: make(system, options, setting), scan, options, rt, report, resume, initial,
+            volumes=held, frames=frames,
+        )  # fmt: skip
+
+    return Method(run, {"default": default}, is_shared=True, takes_initial=True, stops_itself=stops_itself)
 
 
 class _Iterations:

@@ -3,8 +3,6 @@
 Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,16 +13,9 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    state_arrays,
-)
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
-from phyradgs_cl.runtime import Runtime
 
 ORDERS = ("spread", "random", "ordered")
 _WEIGHT_CACHE_BYTES = 1 << 29
@@ -56,51 +47,6 @@ class SartOptions(IterativeOptions):
 OS_SART = SartOptions(frames_per_subset=10)
 
 
-def sart(
-    scan: Scan,
-    options: SartOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The SART volume of a scan in 1/mm; the seed orders frames where ``order`` is random."""
-    return _run("sart", scan, options, rt, seed, report, resume, initial)
-
-
-def os_sart(
-    scan: Scan,
-    options: SartOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The same with several frames per correction."""
-    return _run("os-sart", scan, options, rt, seed, report, resume, initial)
-
-
-def _run(
-    method: str,
-    scan: Scan,
-    options: SartOptions,
-    rt: Runtime,
-    seed: int,
-    report: ProgressReport,
-    resume: State | None,
-    initial: np.ndarray | None,
-) -> Reconstruction:
-    def make(system: System) -> Sart:
-        return Sart(system, options, seed)
-
-    volumes = 4 + kept_columns(scan, options)
-    return run_iterations(method, make, scan, options, rt, report, resume, initial, volumes=volumes, frames=2)
-
-
 def kept_columns(scan: Scan, options: SartOptions) -> int:
     """Column weights, a volume per subset, that are kept and not made anew."""
     subsets = -(-scan.frames // options.frames_per_subset)
@@ -111,8 +57,15 @@ def _most_kept(volume_shape: Sequence[int]) -> int:
     return max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1)
 
 
-METHOD = Method(sart, {"default": SartOptions()}, is_shared=True, takes_initial=True)
-OS_METHOD = Method(os_sart, {"default": OS_SART}, is_shared=True, takes_initial=True)
+def _method(name: str, default: SartOptions) -> Method:
+    """The seed orders frames where ``order`` is random."""
+    return voxel_method(
+        name, default, lambda system, options, setting: Sart(system, options, setting.seed),
+        volumes=lambda scan, options: 4 + kept_columns(scan, options), frames=2,
+    )  # fmt: skip
+
+
+METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 
 class Sart:

@@ -1,25 +1,14 @@
 """SIRT: every iteration corrects for all frames at once (Gilbert, J. Theor. Biol. 36 (1972) 105)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    state_arrays,
-)
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
+from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
-from phyradgs_cl.runtime import Runtime
 
 
 @dataclass(frozen=True)
@@ -35,23 +24,7 @@ class SirtOptions(IterativeOptions):
         checks.within("relaxation", self.relaxation, 1e-6, 2)
 
 
-def sirt(
-    scan: Scan,
-    options: SirtOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The SIRT volume of a scan in 1/mm. ``seed`` is accepted for the common signature; SIRT draws nothing."""
-    return run_iterations(
-        "sirt", lambda s: Sirt(s, options), scan, options, rt, report, resume, initial, volumes=4, frames=1
-    )
-
-
-METHOD = Method(sirt, {"default": SirtOptions()}, is_shared=True, takes_initial=True)
+METHOD = voxel_method("sirt", SirtOptions(), lambda system, options, _: Sirt(system, options), volumes=4, frames=1)
 
 
 class Sirt:

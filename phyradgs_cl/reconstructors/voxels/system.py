@@ -4,8 +4,6 @@ Its arrays lie on the device from the first iteration to the last where everythi
 host; a method does the same with both, through the system's ``space``.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -46,7 +44,7 @@ class System:
     space: Space[Any] = HostSpace()
 
     @classmethod
-    def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> System:
+    def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> "System":
         """The scan's frames with the cells of ``motion``; ``detector_model``: log, intensity, or the scan's own."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         operator: LinearOperator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
@@ -63,7 +61,7 @@ class System:
         valid = np.asarray(scan.pixel_mask == 0)
         return cls(operator, np.where(valid, measured, np.float32(0)), valid, intensity)
 
-    def resident(self, rt: Runtime, volumes: int, frames: int) -> System:
+    def resident(self, rt: Runtime, volumes: int, frames: int) -> "System":
         """The same on the device, where there is room for the operators and for so many volumes and stacks of all frames.
 
         Else the system itself, on the host: in bricks, and on ranks, which sum there.
@@ -145,11 +143,11 @@ class System:
         """Frames times their transmission weights, where there are any."""
         return frames if self.transmission is None else self.space.multiply(frames, self.transmission)
 
-    def transmission_weighted(self) -> System:
+    def transmission_weighted(self) -> "System":
         """The same system, on the host, its pixels weighted by their transmission (PWLS)."""
         return replace(self, transmission=transmission_weights(self.measured, self.valid))
 
-    def subset(self, frames: Sequence[int]) -> System:
+    def subset(self, frames: Sequence[int]) -> "System":
         """The system of some frames."""
         chosen = list(frames)
         valid = self.valid

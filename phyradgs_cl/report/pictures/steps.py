@@ -1,7 +1,5 @@
 """A frame of the scan before and after each step of ``prepare``, and how often each line integral was there."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
