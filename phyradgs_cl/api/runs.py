@@ -124,7 +124,9 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     not show what a step looks for.
     """
     check_scan(scan)
-    return prepared(scan, input_options({"steps": steps, **options}), runtime_of(device))
+    before = input_options({"steps": steps, **options})
+    before.check_written()
+    return prepared(scan, before, runtime_of(device))
 
 
 def reconstruct(
@@ -147,7 +149,8 @@ def reconstruct(
     options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested
     ones are dicts (``control={"every": 50}``). preset: where they start from.
     grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
-    (docs/methods.md#the-grid).
+    (docs/methods.md#the-grid). holdout: percent of the pixels that the method does not see; how far the volume is from them
+    stands in the result's facts (docs/methods.md#quality-without-a-truth).
     seed: of what is drawn at random; the same seed on the same device gives the same bits.
     report: a function that is called with every ``Progress``; True: a line with rate and time left, on a terminal or in a
     notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
