@@ -199,8 +199,8 @@ def table(path: Path) -> str:
     """Markdown: a row per case, size, views and parameter."""
     lines = read_lines(path)
     text = [
-        "| case | volume³, views | parameter | truth | error: mean, worst | σ stated | largest error/σ | within 2 σ | verdicts "
-        "| runs |",
+        "| case | volume³, views | parameter | truth | error: mean, worst | σ stated | largest error/σ | within 2 σ "
+        "| verdicts | runs |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[tuple[object, ...], list[dict]] = {}

@@ -104,8 +104,8 @@ def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(told)]
     if not changes and not earlier:
         return None
-    words = "The frame and the sinogram (a line per frame) that each step changed most, and the middle slice, in one range of "
-    words += "grey values each; difference, after less before."
+    words = "The frame and the sinogram (a line per frame) that each step changed most, and the middle slice, in one range "
+    words += "of grey values each; difference, after less before."
     note = element("p", words, class_="note") if changes else None
     return _section("preparation", "Preparation", note, *earlier, *(_change(change) for change in changes))
 

@@ -34,7 +34,8 @@ _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no
 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
-    """prior: one of ``PRIORS``. prior_weight: its strength, relative to the noise of the frames as it reaches a voxel.
+    """prior: one of ``PRIORS``; piccs takes the volume that the run starts from as its prior image, and prior_share of the
+    total variation from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
@@ -43,6 +44,7 @@ class FistaOptions(IterativeOptions):
     iterations: int = 30
     prior: str = "dct"
     prior_weight: float = 0.45
+    prior_share: float = 0.5
     frames_per_subset: int = 5
     tv_iterations: int = 5
     transmission_weights: bool = False  # type: ignore[misc]
@@ -51,6 +53,7 @@ class FistaOptions(IterativeOptions):
         super().__post_init__()
         checks.one_of("prior", self.prior, PRIORS)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)
+        checks.within("prior_share", self.prior_share, 0, 1)
         checks.within("frames_per_subset", self.frames_per_subset, 0, 1_000_000)
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
@@ -70,7 +73,7 @@ def fista(
     noise = noise_level(np.asarray(scan.projections, np.float32), valid)
 
     def make(system: System) -> Fista:
-        prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations)
+        prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations, initial, options.prior_share)
         return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
 
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, volumes=16, frames=3)
