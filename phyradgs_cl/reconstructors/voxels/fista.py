@@ -28,7 +28,7 @@ from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_GROWTH = 1.2  # of the residual from pass to pass: subsets that pull apart so much are too small
+_GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 
 
@@ -96,7 +96,7 @@ class Fista:
         space = system.space
         self.volume = space.full(system.volume_shape, 0.0)
         self.previous = self.volume
-        self.momentum, self.residual = 1.0, float("inf")
+        self.momentum, self.least = 1.0, float("inf")
         self.finished: str | None = None
         columns = space.largest(system.column_sums())
         # AᵀA has no negative entry: its largest row sum bounds its norm
@@ -114,11 +114,13 @@ class Fista:
 
     def step(self) -> float:
         squares = sum(self._step_of(subset) ** 2 for subset in self.subsets)
-        before, self.residual = self.residual, float(np.sqrt(squares))
-        if self.residual > _GROWTH * before and len(self.subsets) > 1:
+        residual = float(np.sqrt(squares))
+        pull_apart = residual > _GROWTH * self.least and len(self.subsets) > 1
+        if pull_apart:
             self.subsets = self._subsets(-(-len(self.subsets) // 2))
             self.momentum, self.previous = 1.0, self.volume
-        return self.residual
+        self.least = residual if pull_apart else min(self.least, residual)
+        return residual
 
     def _step_of(self, subset: System) -> float:
         system, space = self.system, self.system.space
@@ -139,13 +141,13 @@ class Fista:
         return {
             "volume": numpy(self.volume),
             "previous": numpy(self.previous),
-            "progress": np.array([self.momentum, self.residual, len(self.subsets)]),
+            "progress": np.array([self.momentum, self.least, len(self.subsets)]),
             **self.prior.state(),
         }
 
     def restore(self, state: State) -> None:
         volume, previous, progress = state_arrays(state, ["volume", "previous", "progress"])
         self.volume, self.previous = map(self.system.space.array, (volume, previous))
-        self.momentum, self.residual = float(progress[0]), float(progress[1])
+        self.momentum, self.least = float(progress[0]), float(progress[1])
         self.subsets = self._subsets(int(progress[2]))
         self.prior.restore(state)
