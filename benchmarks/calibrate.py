@@ -12,6 +12,7 @@ wide as the volume; the volume is fista-tv's, every line at its own times. Cases
     rows       the same, rows read: not to be known from such a scan
     turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way
     wobble     0.3° and 1 pixel (RMS) per view
+    motion     the object turns by up to 2° and moves by up to 2 voxels while it is scanned, about and along all axes
     draw       columns read; offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %, drawn by the
                seed: how often the stated intervals hold the truth (no volumes are scored)
 """
@@ -32,9 +33,10 @@ from tables.case import FLY, SyntheticCase
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PerRow, Protocol, Scan
 from phyradgs_cl.calibrate import Calibration, calibrate
-from phyradgs_cl.calibrate.moved import Change, Moved, Views, moved
+from phyradgs_cl.calibrate.moved import Change, Moved, Sway, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, change_of
-from phyradgs_cl.calibrate.wobble import views_of, without_gauges
+from phyradgs_cl.calibrate.views import SPLINES, centred
+from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import psnr
@@ -51,7 +53,7 @@ class Planned(Protocol):
     """A protocol whose gantry turns the other way, or wobbles."""
 
     is_backwards: bool = False
-    views_off: Views | None = None
+    views_off: Views | Sway | None = None
 
     def orbit(self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None):  # type: ignore[no-untyped-def]
         path = super().orbit(geometry, jitter_deg, rng)
@@ -116,6 +118,18 @@ def wobble(make: Maker, seed: int) -> Case:
     return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views)
 
 
+def motion(make: Maker, seed: int) -> Case:
+    """Splines with coefficients that are half of one drift and half of chance, about the mean place."""
+    scan, rng = make(seed), np.random.default_rng(seed)
+    numbers = numbers_of_sway(scan, SPLINES)
+    course = np.linspace(-1, 1, SPLINES)[:, None] * rng.choice([-1, 1], 6) + rng.uniform(-1, 1, (SPLINES, 6))
+    course = course / np.ptp(numbers.basis @ course, axis=0)
+    most = np.array([np.deg2rad(2.0)] * 3 + [2 * scan.grid.voxel_size_mm[0]] * 3)
+    sway = numbers.views(centred(numbers, course * most))
+    shaken = make(seed, views_off=sway)
+    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "motion", {})
+
+
 def draw(make: Maker, seed: int) -> Case:
     right, rng = make(seed, axis="columns"), np.random.default_rng(seed)
     most = {
@@ -130,7 +144,7 @@ def _without(scan: Scan, planted: dict[str, float]) -> Scan:
     return moved(scan, change_of({name: -value for name, value in planted.items()}))
 
 
-CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, draw)}
+CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, motion, draw)}
 
 
 def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
