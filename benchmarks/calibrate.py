@@ -35,8 +35,8 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PerRow, Protoco
 from phyradgs_cl.calibrate import Calibration, calibrate
 from phyradgs_cl.calibrate.moved import Change, Moved, Sway, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, change_of
-from phyradgs_cl.calibrate.views import SPLINES, centred
-from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges
+from phyradgs_cl.calibrate.views import SPLINES
+from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges, without_sway_gauges
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import psnr
@@ -125,7 +125,7 @@ def motion(make: Maker, seed: int) -> Case:
     course = np.linspace(-1, 1, SPLINES)[:, None] * rng.choice([-1, 1], 6) + rng.uniform(-1, 1, (SPLINES, 6))
     course = course / np.ptp(numbers.basis @ course, axis=0)
     most = np.array([np.deg2rad(2.0)] * 3 + [2 * scan.grid.voxel_size_mm[0]] * 3)
-    sway = numbers.views(centred(numbers, course * most))
+    sway = numbers.views(without_sway_gauges(scan, numbers, course * most))
     shaken = make(seed, views_off=sway)
     return Case(replace(shaken, trajectory=scan.trajectory), shaken, "motion", {})
 

@@ -33,8 +33,8 @@ class Calibration:
     """``scan``: with what was corrected, all else as it was. parameters: a line each. alike: combinations that leave no
     trace of their own, in words. residual_rms: of the frames before and after, dimensionless, at the finest level, whose
     residuals ``before`` and ``after`` (F, rows, columns) are kept for a picture. views: their own turns and shifts, or
-    the object's motion, where some were found; the table has the root mean square of each kind, with the deviation of one. Lengths are in mm,
-    angles in degrees, times in s. ``calibrate`` makes it, and raises InputError where it cannot."""
+    the object's motion, where some were found; the table has the root mean square of each kind, with the deviation of one.
+    Lengths are in mm, angles in degrees, times in s. ``calibrate`` makes it, and raises InputError where it cannot."""
 
     scan: Scan
     parameters: list[Found]

@@ -14,7 +14,7 @@ from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
 from phyradgs_cl.detector import noise_level
 
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
-_MISMATCH = 1.5  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
+_MISMATCH = 2.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
 _TINY = 1e-9
 _OVER_GAUGE, _MOST_GAUGE = 2.0, 0.2  # and of what is left of a gauge's, which is much where the geometry is wrong
 

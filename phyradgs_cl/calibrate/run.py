@@ -24,6 +24,7 @@ DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
 _SETTLED = 0.1  # of a standard deviation
+_OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
 
 @dataclass(frozen=True)
@@ -53,15 +54,15 @@ class _Search:
     problem: Reduced | None = None
 
     def found(self) -> tuple[np.ndarray, np.ndarray]:
-        """Values of what is known, and their standard deviations: those of noise, and the way that the values went from the
-        stage before to this one, which is what voxels are wrong by, together; both grow by what a parameter looks like those
-        that are not known and stay as stated, right or wrong."""
+        """Values of what is known, and their standard deviations: those of noise, and half the way that the values went from
+        the stage before to this one, which is what voxels are wrong by, together; both grow by what a parameter looks like
+        those that are not known and stay as stated, right or wrong."""
         if self.problem is None or not self.known:
             return np.zeros(0), np.zeros(0)
         values, noise = self.problem.step(), self.problem.deviations()
-        way = np.array([v - self.former[n] if n in self.former else d for n, v, d in zip(self.known, values, noise, strict=True)])
+        way = values - [self.former.get(name, value) for name, value in zip(self.known, values, strict=True)]
         others = np.maximum(self.problem.shares / [self.shares[name] for name in self.known], 1.0)
-        return values, others * np.hypot(noise, way)
+        return values, others * np.hypot(noise, _OF_WAY * way)
 
 
 def calibrate(
@@ -171,13 +172,17 @@ def _ask(problem: Reduced, gauge: float, search: _Search) -> None:
 
 
 def _corrections(search: _Search) -> dict[str, float]:
-    """The parameters that differ from what is stated by three deviations, with the values that they then have together."""
+    """The parameters that differ from what is stated by three deviations, with the values that they then have together; all
+    that are known, where those would take over by more than a deviation what the others are off by."""
     values, deviations = search.found()
     off = np.abs(values) > DEVIATIONS * deviations
     names = tuple(name for name, is_off in zip(search.known, off, strict=True) if is_off)
     if search.problem is None or not names:
         return {}
-    return dict(zip(names, map(float, search.problem.only(names).step()), strict=True))
+    alone = search.problem.only(names).step()
+    if np.any(np.abs(alone - values[off]) > deviations[off]):
+        return dict(zip(search.known, map(float, values), strict=True))
+    return dict(zip(names, map(float, alone), strict=True))
 
 
 def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: Mapping[str, float]) -> list[Found]:

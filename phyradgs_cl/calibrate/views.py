@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from phyradgs_cl.calibrate.wobble import (
     numbers_of_views,
     view_step,
     without_gauges,
+    without_sway_gauges,
 )
 from phyradgs_cl.runtime import Runtime
 
@@ -50,20 +52,15 @@ def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobb
     Shifts on each level; turns, which need fine detail, on the last one."""
     kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 1) + [KINDS]
     numbers = numbers_of_views(scan)
-    return _found(rt, scan, stages, change, numbers, kinds, lambda values: without_gauges(scan, values), _OF_VIEWS)
+    return _found(rt, scan, stages, change, numbers, kinds, partial(without_gauges, scan), _OF_VIEWS)
 
 
 def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:
-    """As ``find_wobble``, a rigid motion of the object, about its mean place: another is another object."""
+    """As ``find_wobble``, a rigid motion of the object."""
     kinds = [range(len(_OF_OBJECT))] * len(stages)
     numbers = numbers_of_sway(scan, SPLINES)
-    return _found(rt, scan, stages, change, numbers, kinds, lambda values: centred(numbers, values), _OF_OBJECT)
-
-
-def centred(numbers: Numbers, values: np.ndarray) -> np.ndarray:
-    """Values (n, K) whose numbers have the mean 0 over the views."""
-    centre: np.ndarray = values - (numbers.basis @ values).mean(0)
-    return centre
+    without = partial(without_sway_gauges, scan, numbers)
+    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_OBJECT)
 
 
 def _found(

@@ -25,8 +25,8 @@ _MISMATCH = 4.0  # errors that were measured (docs/calibrate.md) over what noise
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What is looked for: ``values`` (n, K), of which view f has ``basis`` (F, n) @ values (K,). ``units`` (K,): what of each
-    moves a frame by a pixel at its edge. ``views``: what values move, when they are put into a scan."""
+    """What is looked for: ``values`` (n, K), of which view f has ``basis`` (F, n) @ values (K,). ``units`` (K,): what of
+    each moves a frame by a pixel at its edge. ``views``: what values move, when they are put into a scan."""
 
     values: np.ndarray
     basis: np.ndarray
@@ -53,9 +53,9 @@ def numbers_of_sway(scan: Scan, count: int) -> Numbers:
 
 @dataclass(frozen=True, eq=False)
 class WithViews:
-    """A x + Σ d (basis a): a volume's line integrals, and signals d (F, K, rows, columns) times numbers of views, which come
-    of a (n, K) by ``basis`` (F, n); one vector. Signals are in units in which CGLS moves numbers about as fast as it does the
-    object's main features."""
+    """A x + Σ d (basis a): a volume's line integrals, and signals d (F, K, rows, columns) times numbers of views, which
+    come of a (n, K) by ``basis`` (F, n); one vector. Signals are in units in which CGLS moves numbers about as fast as it
+    does the object's main features."""
 
     operator: RayOperator
     signals: np.ndarray
@@ -103,14 +103,26 @@ def without_gauges(scan: Scan, numbers: np.ndarray) -> np.ndarray:
     return found
 
 
+def without_sway_gauges(scan: Scan, numbers: Numbers, values: np.ndarray) -> np.ndarray:
+    """Values (n, 6) without what another object looks like: one that lies elsewhere, the mean of each; one that is larger or
+    smaller, shifts along x and y that keep to the source's side."""
+    azimuth = start_azimuths_rad(scan)
+    beside = np.linalg.lstsq(numbers.basis, np.stack([np.cos(azimuth), np.sin(azimuth)], -1), rcond=None)[0]
+    found = values - (numbers.basis @ values).mean(0)
+    beside -= (numbers.basis @ beside).mean(0)
+    there, pattern = numbers.basis @ found[:, 3:5], numbers.basis @ beside
+    found[:, 3:5] -= np.sum(there * pattern) / np.sum(pattern**2) * beside
+    return found
+
+
 def views_of(numbers: np.ndarray) -> Views:
     return Views(numbers[:, 0], numbers[:, 1:])
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """``values`` (n, K) to add, 0 for kinds that were not asked for; ``signals`` (F, kinds, rows, columns) of a pixel's worth
-    of those that were."""
+    """``values`` (n, K) to add, 0 for kinds that were not asked for; ``signals`` (F, kinds, rows, columns) of a pixel's
+    worth of those that were."""
 
     values: np.ndarray
     signals: np.ndarray
