@@ -32,6 +32,7 @@ LOST_DB = 0.05
 CASES = (
     ({"sparks": 1e-3}, "sparks", {}, 0.6),
     ({"rings": 0.05}, "rings", {}, 0.4),
+    ({"rings": 0.05}, "rings", {"rings": {"method": "fitted"}}, 0.55),
     ({"scatter": 0.3}, "scatter", {}, 0.6),
     ({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}, 0.75),
     ({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}, 0.6),
@@ -58,6 +59,7 @@ def test_steps_that_look_for_their_effect_leave_a_clean_scan_alone(rt, planted) 
         before = psnr_db(rt, clean)
         for step in ("sparks", "dead", "scatter", "air", "rings"):
             assert psnr_db(rt, clean, step) > before - LOST_DB, (step, noise)
+        assert psnr_db(rt, clean, "rings", rings={"method": "fitted"}) > before - LOST_DB, noise
 
 
 def test_sparks_are_found_one_by_one(planted) -> None:
