@@ -1,5 +1,7 @@
 """How noisy line integrals are, estimated from themselves, and how far each can be trusted."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,11 +55,11 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM**2)
 
 
-def _along_rows(frames: NDArray[np.generic]) -> tuple[NDArray[np.generic], ...]:
+def _along_rows(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     return frames[..., :-2], frames[..., 1:-1], frames[..., 2:]
 
 
-def _along_columns(frames: NDArray[np.generic]) -> tuple[NDArray[np.generic], ...]:
+def _along_columns(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     return frames[..., :-2, :], frames[..., 1:-1, :], frames[..., 2:, :]
 
 
