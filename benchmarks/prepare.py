@@ -35,6 +35,7 @@ EFFECTS = {
     "sparks 0.1 %": Effect({"sparks": 1e-3}, "sparks"),
     "rings 1 %": Effect({"rings": 0.01}, "rings"),
     "rings 5 %": Effect({"rings": 0.05}, "rings"),
+    "rings 5 %, fitted": Effect({"rings": 0.05}, "rings", {"rings": {"method": "fitted"}}),
     "drift 2 %": Effect({"drift": 0.02}, "air"),
     "scatter 0.3, fitted": Effect({"scatter": 0.3}, "scatter"),
     "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}),
@@ -60,7 +61,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=48)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--dose", type=float, default=1e5)
-    parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"])
+    parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"], help="names, or files of volumes")
+    parser.add_argument("--seed", type=int, default=0, help="of noise and of what is planted")
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--effects", nargs="+", default=list(EFFECTS))
     parser.add_argument("--output", type=Path)
@@ -70,6 +72,7 @@ def main() -> None:
     usual = {
         "size": given.size, "detector": 3 * given.size // 2, "views": given.views, "peak": PEAK, "noise": "beer",
         "dose": given.dose, "exposure_deg": 0.8 * 360 / given.views, "device": rt,
+        "seed": given.seed,
     }  # fmt: skip
     if given.figure is not None:
         draw(given.figure, rt, usual)
@@ -86,12 +89,12 @@ def main() -> None:
                     "spoilt": scores(rt, spoilt, method),
                     "prepared": scores(rt, spoilt, method, effect),
                 }
-                line = {"effect": name, "phantom": phantom, "method": method, "clean": clean[method], **found}
+                line = {"effect": name, "phantom": Path(phantom).stem, "method": method, "clean": clean[method], **found}
                 line["regained"] = (line["prepared"] - line["spoilt"]) / max(line["clean"] - line["spoilt"], 1e-2)
                 lines.append({key: round(v, 3) if isinstance(v, float) else v for key, v in line.items()})
                 print(json.dumps(lines[-1]), flush=True)
     if given.output is not None:
-        facts = {"size": given.size, "views": given.views, "dose": given.dose, "device": rt.device.name}
+        facts = {"size": given.size, "views": given.views, "dose": given.dose, "seed": given.seed, "device": rt.device.name}
         given.output.write_text("".join(json.dumps(line) + "\n" for line in [facts, *lines]), encoding="utf-8")
 
 

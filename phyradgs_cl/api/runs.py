@@ -143,7 +143,9 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     not show what a step looks for.
     """
     check_scan(scan)
-    return prepared(scan, input_options({"steps": steps, **options}), runtime_of(device))
+    before = input_options({"steps": steps, **options})
+    before.check_written()
+    return prepared(scan, before, runtime_of(device))
 
 
 def reconstruct(
@@ -166,7 +168,8 @@ def reconstruct(
     options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested
     ones are dicts (``control={"every": 50}``). preset: where they start from.
     grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
-    (docs/methods.md#the-grid).
+    (docs/methods.md#the-grid). holdout: percent of the pixels that the method does not see; how far the volume is from them
+    stands in the result's facts (docs/methods.md#quality-without-a-truth).
     seed: of what is drawn at random; the same seed on the same device gives the same bits.
     report: a function that is called with every ``Progress``, of voxels each iteration, of splats every 50 and where ten
     seconds went by; True: a line with rate and time left, on a terminal or in a

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.calibrate.moved import Views
+from phyradgs_cl.calibrate.moved import Sway, Views
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
 
@@ -32,9 +32,9 @@ class Found:
 class Calibration:
     """``scan``: with what was corrected, all else as it was. parameters: a line each. alike: combinations that leave no
     trace of their own, in words. residual_rms: of the frames before and after, dimensionless, at the finest level, whose
-    residuals ``before`` and ``after`` (F, rows, columns) are kept for a picture. views: their own turns and shifts, where
-    some were found; the table has the root mean square of each kind, with the deviation of a single one. Lengths are in mm,
-    angles in degrees, times in s. ``calibrate`` makes it, and raises InputError where it cannot."""
+    residuals ``before`` and ``after`` (F, rows, columns) are kept for a picture. views: their own turns and shifts, or
+    the object's motion, where some were found; the table has the root mean square of each kind, with the deviation of one.
+    Lengths are in mm, angles in degrees, times in s. ``calibrate`` makes it, and raises InputError where it cannot."""
 
     scan: Scan
     parameters: list[Found]
@@ -42,7 +42,7 @@ class Calibration:
     residual_rms: tuple[float, float]
     before: np.ndarray
     after: np.ndarray
-    views: Views | None = None
+    views: Views | Sway | None = None
 
     @property
     def corrected(self) -> list[Found]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
-from phyradgs_cl.calibrate.moved import Change, Views, moved
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.check.coarse import binned, coarse_grid, fewer_frames, smooth
 from phyradgs_cl.check.questions.timing import exposure_arc_rad
 from phyradgs_cl.fields import Grid
@@ -56,7 +56,7 @@ class Level:
     def is_intensity(self) -> bool:
         return self.scans[0].detector_model == "intensity"
 
-    def operator(self, change: Change, views: Views | None = None) -> RayOperator:
+    def operator(self, change: Change, views: Views | Sway | None = None) -> RayOperator:
         """A of all frames after a change."""
         tables = []
         for scan in self.scans:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
@@ -44,13 +45,42 @@ class Views:
 
 
 @dataclass(frozen=True, eq=False)
+class Sway:
+    """A rigid motion of the object: turns about x, y and z in rad, then shifts along them in mm, by cubic splines of time
+    between ``start_s`` and ``end_s``, with coefficients (n, 6); before and after it stands still."""
+
+    coefficients: np.ndarray
+    start_s: float
+    end_s: float
+
+    @classmethod
+    def none(cls, scan: Scan, count: int) -> "Sway":
+        starts_s = np.asarray(scan.frame_start_s, np.float64)
+        return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
+
+    def basis(self, time_s: np.ndarray) -> np.ndarray:
+        """The splines (..., n) at times (...); they sum to 1."""
+        count = len(self.coefficients)
+        share = np.clip((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), 0, 1)
+        knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
+        found = BSpline.design_matrix(np.ravel(share), knots, 3).toarray()
+        return found.reshape(*np.shape(share), count)
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """The six numbers (..., 6) at times (...)."""
+        six: np.ndarray = self.basis(time_s) @ self.coefficients
+        return six
+
+
+@dataclass(frozen=True, eq=False)
 class Moved:
-    """Poses of ``base`` for a panel of ``shape`` (rows, columns) after a change of all views, then of each."""
+    """Poses of ``base`` for a panel of ``shape`` (rows, columns) after a change of all views, then of each by itself, or as
+    an object that moves sees them."""
 
     base: Trajectory
     shape: tuple[int, int]
     change: Change
-    views: Views | None = None
+    views: Views | Sway | None = None
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Poses (..., 12) at times (...)."""
@@ -60,7 +90,7 @@ class Moved:
         u_hat, v_hat = column / pitch_u_mm, row / pitch_v_mm
         normal = np.cross(u_hat, v_hat)  # towards the source
         half_v, half_u = ((n - 1) / 2 for n in self.shape)
-        shift_v_mm, shift_u_mm = (0.0, 0.0) if self.views is None else self.views.shift_mm[frame]
+        shift_v_mm, shift_u_mm = self.views.shift_mm[frame] if isinstance(self.views, Views) else (0.0, 0.0)
         middle = first + half_u * column + half_v * row - change.detector_distance_mm * normal
         middle = middle + (change.offset_u_mm + shift_u_mm) * u_hat + (change.offset_v_mm + shift_v_mm) * v_hat
         # columns of the turn: where the panel's u, v and normal go, in those three themselves
@@ -68,12 +98,19 @@ class Moved:
         frame_of = np.stack([u_hat, v_hat, normal], -1)
         column, row = (frame_of @ turn[:, k] * pitch for k, pitch in enumerate((pitch_u_mm, pitch_v_mm)))
         vectors = [source + change.source_distance_mm * normal, middle - half_u * column - half_v * row, column, row]
-        turn_rad = change.turn_rad + (0.0 if self.views is None else float(self.views.turn_rad[frame]))
+        turn_rad = change.turn_rad + (float(self.views.turn_rad[frame]) if isinstance(self.views, Views) else 0.0)
         about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
-        return np.concatenate([vector @ about_z.T for vector in vectors], -1)
+        vectors = [vector @ about_z.T for vector in vectors]
+        if isinstance(self.views, Sway):
+            six = self.views.at(time_s)
+            back = Rotation.from_rotvec(six[..., :3].reshape(-1, 3)).as_matrix().reshape(*six.shape[:-1], 3, 3)
+            places, steps = (np.stack(two, -2) for two in (vectors[:2], vectors[2:]))
+            six = six[..., None, 3:]
+            vectors = list(np.moveaxis(np.concatenate([(places - six) @ back, steps @ back], -2), -2, 0))
+        return np.concatenate(vectors, -1)
 
 
-def moved(scan: Scan, change: Change, views: Views | None = None) -> Scan:
+def moved(scan: Scan, change: Change, views: Views | Sway | None = None) -> Scan:
     """The scan after a change. Offsets and distances of a circular orbit stay numbers of its geometry; what they cannot say
     makes the trajectory one of its own."""
     shutter, geometry, path = scan.shutter, scan.geometry, scan.trajectory

@@ -117,25 +117,29 @@ GROUPS = {
     "distance": ("source-distance", "detector-distance"),
     "timing": ("readout", "exposure", "start"),
 }
-WOBBLE = "wobble"
+WOBBLE, MOTION = "wobble", "motion"
 
 
-def chosen(what: str | None, scan: Scan) -> tuple[list[Parameter], bool]:
-    """(the parameters that ``what`` names with commas, whether views are asked for one by one); None: those of the panel
-    and, of a fly-scan, readout and exposure. InputError for a name that there is not, or timing of a gantry at rest."""
+def chosen(what: str | None, scan: Scan) -> tuple[list[Parameter], str]:
+    """(the parameters that ``what`` names with commas; whether views are asked for one by one or the object's motion, as
+    named); None: those of the panel and, of a fly-scan, readout and exposure. InputError for a name that there is not, both
+    of the latter, or timing of a gantry at rest."""
     words = [word.strip() for word in (_usual(scan) if what is None else what).split(",")]
     names: list[str] = []
     for word in words:
-        if word not in (*PARAMETERS, *GROUPS, WOBBLE):
-            known = [*GROUPS, *PARAMETERS, WOBBLE]
+        if word not in (*PARAMETERS, *GROUPS, WOBBLE, MOTION):
+            known = [*GROUPS, *PARAMETERS, WOBBLE, MOTION]
             raise InputError("--what", repr(word), ", ".join(known), near_miss(word, known, "name some of them"))
         names += GROUPS.get(word, (word,))
     names = list(dict.fromkeys(names))
-    found = [PARAMETERS[name] for name in names if name != WOBBLE]
+    per_view = [name for name in names if name in (WOBBLE, MOTION)]
+    if len(per_view) > 1:
+        raise InputError("--what", f"{WOBBLE} and {MOTION}", "one of the two: each would take the other's part", "ask twice")
+    found = [PARAMETERS[name] for name in names if name not in per_view]
     timed = [one.name for one in found if one.is_timing]
     if timed and not _turns(scan):
         raise InputError("--what", timed[0], "a parameter of the panel: this gantry stands still in each frame")
-    return found, WOBBLE in names
+    return found, "".join(per_view)
 
 
 def _turns(scan: Scan) -> bool:

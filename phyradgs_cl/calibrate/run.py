@@ -9,10 +9,10 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
-from phyradgs_cl.calibrate.moved import Change, Views, moved
-from phyradgs_cl.calibrate.parameters import PARAMETERS, Parameter, change_of, chosen, in_words
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
+from phyradgs_cl.calibrate.parameters import PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
-from phyradgs_cl.calibrate.views import find_wobble
+from phyradgs_cl.calibrate.views import find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
 from phyradgs_cl.errors import InputError
@@ -24,6 +24,7 @@ DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
 _SETTLED = 0.1  # of a standard deviation
+_OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,26 @@ STAGES = (Stage(24, 6, 40, 40, 15), Stage(48, 3, 20, 40, 12), Stage(96, 3, 30, 5
 
 @dataclass(eq=False)
 class _Search:
-    """Where the search stands: ``at``, values by name; ``known``: those that the frames tell; the last stage's problem."""
+    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before; ``known``: those that
+    the frames tell; the last stage's problem."""
 
     at: dict[str, float] = field(default_factory=dict)
+    former: dict[str, float] = field(default_factory=dict)
     known: tuple[str, ...] = ()
     shares: dict[str, float] = field(default_factory=dict)
     alike: list[str] = field(default_factory=list)
     problem: Reduced | None = None
+
+    def found(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values of what is known, and their standard deviations: those of noise, and half the way that the values went from
+        the stage before to this one, which is what voxels are wrong by, together; both grow by what a parameter looks like
+        those that are not known and stay as stated, right or wrong."""
+        if self.problem is None or not self.known:
+            return np.zeros(0), np.zeros(0)
+        values, noise = self.problem.step(), self.problem.deviations()
+        way = values - [self.former.get(name, value) for name, value in zip(self.known, values, strict=True)]
+        others = np.maximum(self.problem.shares / [self.shares[name] for name in self.known], 1.0)
+        return values, others * np.hypot(noise, _OF_WAY * way)
 
 
 def calibrate(
@@ -62,9 +76,9 @@ def calibrate(
     usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong.
 
     InputError for parameters that there are not, a scan too small, or others that do not fit the first."""
-    parameters, has_wobble = chosen(what, scan)
+    parameters, per_view = chosen(what, scan)
     ready = [prepared(one, InputOptions()) for one in (scan, *others)]
-    _check(ready, has_wobble)
+    _check(ready, per_view)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     levels = [stage for k, stage in enumerate(STAGES) if k == 0 or _blocks(scan, stage) < _blocks(scan, STAGES[k - 1])]
     for number, stage in enumerate(levels if parameters else ()):
@@ -76,9 +90,10 @@ def calibrate(
     kept = _corrections(search)
     change, views = change_of(kept), None
     table = _table(scan, parameters, search, kept)
-    if has_wobble:
+    if per_view:
         report(len(levels), len(levels), "views")
-        wobble = find_wobble(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
+        find = find_wobble if per_view == WOBBLE else find_sway
+        wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
         table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
     level = Level.of(rt, ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
@@ -102,10 +117,10 @@ def _blocks(scan: Scan, stage: Stage) -> int:
     return -(-max(scan.geometry.detector_shape) // stage.columns)
 
 
-def _check(scans: Sequence[Scan], has_wobble: bool) -> None:
+def _check(scans: Sequence[Scan], per_view: str) -> None:
     first = scans[0]
-    if has_wobble and len(scans) > 1:
-        raise InputError("--what wobble", "a second scan", "one scan: views are each scan's own", "leave --with out")
+    if per_view and len(scans) > 1:
+        raise InputError(f"--what {per_view}", "a second scan", "one scan: views are each scan's own", "leave --with out")
     if first.frames < _FEWEST_FRAMES or first.geometry.detector_shape[1] < _FEWEST_COLUMNS:
         found = f"{first.frames} frames of {first.geometry.detector_shape[1]} columns"
         raise InputError("scan", found, f"at least {_FEWEST_FRAMES} frames of {_FEWEST_COLUMNS} columns")
@@ -122,6 +137,7 @@ def _descend(level: Level, stage: Stage, parameters: Sequence[Parameter], search
     """Steps on one level until they are small; which parameters the frames tell is asked at each step of the first one."""
     volume: np.ndarray | None = None
     asks = search.problem is None
+    search.former = {} if asks else dict(search.at)
     for number in range(stage.steps):
         asked = parameters if asks else [PARAMETERS[name] for name in search.known]
         volume = level.reconstruct(level.operator(change_of(search.at)), volume, stage.again if number else stage.first)
@@ -156,20 +172,21 @@ def _ask(problem: Reduced, gauge: float, search: _Search) -> None:
 
 
 def _corrections(search: _Search) -> dict[str, float]:
-    """The parameters that differ from what is stated by three deviations, with the values that they then have together."""
-    problem = search.problem
-    if problem is None or not search.known:
-        return {}
-    off = np.abs(problem.step()) > DEVIATIONS * problem.deviations()
+    """The parameters that differ from what is stated by three deviations, with the values that they then have together; all
+    that are known, where those would take over by more than a deviation what the others are off by."""
+    values, deviations = search.found()
+    off = np.abs(values) > DEVIATIONS * deviations
     names = tuple(name for name, is_off in zip(search.known, off, strict=True) if is_off)
-    return dict(zip(names, map(float, problem.only(names).step()), strict=True)) if names else {}
+    if search.problem is None or not names:
+        return {}
+    alone = search.problem.only(names).step()
+    if np.any(np.abs(alone - values[off]) > deviations[off]):
+        return dict(zip(search.known, map(float, values), strict=True))
+    return dict(zip(names, map(float, alone), strict=True))
 
 
 def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: Mapping[str, float]) -> list[Found]:
-    values: dict[str, tuple[float, float]] = {}
-    if search.problem is not None and search.known:
-        found = zip(search.problem.step().tolist(), search.problem.deviations().tolist(), strict=True)
-        values = dict(zip(search.known, found, strict=True))
+    values = dict(zip(search.known, zip(*map(np.ndarray.tolist, search.found()), strict=True), strict=True))
     table = []
     for one in parameters:
         stated, share = one.stated(scan) * one.scale, search.shares[one.name]
@@ -183,7 +200,7 @@ def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: M
     return table
 
 
-def _residual(level: Level, stage: Stage, change: Change, views: Views | None) -> np.ndarray:
+def _residual(level: Level, stage: Stage, change: Change, views: Views | Sway | None) -> np.ndarray:
     """What a volume leaves of the frames (F, rows, columns) after a change."""
     operator = level.operator(change, views)
     volume = level.reconstruct(operator, None, stage.first)

@@ -1,47 +1,91 @@
-"""Every view by itself, coarse to fine: shifts on each level, turns, which need fine detail, on the last one."""
+"""Every view by itself, or an object that moves slowly, coarse to fine."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.finding import AGREES, CORRECTED, Found
 from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.moved import Change, Views
-from phyradgs_cl.calibrate.wobble import KINDS, SHIFT_U, SHIFT_V, view_step, views_of, without_gauges
+from phyradgs_cl.calibrate.moved import Change, Sway, Views
+from phyradgs_cl.calibrate.wobble import (
+    KINDS,
+    SHIFT_U,
+    SHIFT_V,
+    Numbers,
+    certainty,
+    numbers_of_sway,
+    numbers_of_views,
+    view_step,
+    without_gauges,
+    without_sway_gauges,
+)
 from phyradgs_cl.runtime import Runtime
 
+SPLINES = 7  # of a motion: one for every seventh of the scan, about
 _STEPS = 3
 _ITERATIONS = 20
-_DEVIATIONS = 2.0  # of one view, that all of them have to be off by (root mean square)
-_NAMES = (("turn per view", "deg", np.rad2deg(1.0)), ("shift-v per view", "mm", 1.0), ("shift-u per view", "mm", 1.0))
+_DEVIATIONS = 2.0  # of one value, that all of them have to be off by (root mean square)
+_DEG = float(np.rad2deg(1.0))
+_OF_VIEWS = (("turn per view", "deg", _DEG), ("shift-v per view", "mm", 1.0), ("shift-u per view", "mm", 1.0))
+_OF_OBJECT = tuple(
+    (f"{kind} {axis} of the object", unit, scale)
+    for kind, unit, scale in (("turn about", "deg", _DEG), ("shift along", "mm", 1.0))
+    for axis in "xyz"
+)
+Stages = Sequence[tuple[int, int, int]]
 
 
 @dataclass(frozen=True, eq=False)
 class Wobble:
     """``views``: what was found of the kinds that are off, None where none is; a line of the table per kind."""
 
-    views: Views | None
+    views: Views | Sway | None
     table: list[Found]
 
 
-def find_wobble(rt: Runtime, scan: Scan, stages: Sequence[tuple[int, int, int]], change: Change) -> Wobble:
-    """Turns and shifts of all views of a scan after ``change``; stages: columns, iterations of a first and next volume."""
-    numbers = np.zeros((scan.frames, len(KINDS)))
-    for number, (columns, first, again) in enumerate(stages):
+def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:
+    """Turns and shifts of all views of a scan after ``change``; stages: columns, iterations of a first and next volume.
+
+    Shifts on each level; turns, which need fine detail, on the last one."""
+    kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 1) + [KINDS]
+    numbers = numbers_of_views(scan)
+    return _found(rt, scan, stages, change, numbers, kinds, partial(without_gauges, scan), _OF_VIEWS)
+
+
+def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:
+    """As ``find_wobble``, a rigid motion of the object."""
+    kinds = [range(len(_OF_OBJECT))] * len(stages)
+    numbers = numbers_of_sway(scan, SPLINES)
+    without = partial(without_sway_gauges, scan, numbers)
+    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_OBJECT)
+
+
+def _found(
+    rt: Runtime,
+    scan: Scan,
+    stages: Stages,
+    change: Change,
+    numbers: Numbers,
+    kinds: Sequence[Sequence[int]],
+    without: Callable[[np.ndarray], np.ndarray],
+    names: Sequence[tuple[str, str, float]],
+) -> Wobble:
+    for (columns, first, again), asked in zip(stages, kinds, strict=True):
         level, volume = Level.of(rt, [scan], columns, scan.frames), None
-        kinds = KINDS if number == len(stages) - 1 else (SHIFT_V, SHIFT_U)
         for _ in range(_STEPS):
-            operator = level.operator(change, views_of(numbers))
+            operator = numbers.operator(level, change)
             volume = level.reconstruct(operator, volume, first if volume is None else again)
-            step = view_step(level, change, numbers, volume, kinds, _ITERATIONS)
-            numbers = without_gauges(scan, numbers + step.numbers)
-    sizes = np.sqrt(np.mean(np.square(numbers), 0))
-    is_off = sizes > _DEVIATIONS * step.deviations
+            step = view_step(level, change, numbers, volume, asked, _ITERATIONS)
+            numbers = replace(numbers, values=without(numbers.values + step.values))
+    deviations, shares = certainty(level, change, numbers, step.signals, _ITERATIONS)
+    sizes = np.sqrt(np.mean(np.square(numbers.basis @ numbers.values), 0))
+    is_off = sizes > _DEVIATIONS * deviations
     table = []
-    for kind, (name, unit, scale) in zip(KINDS, _NAMES, strict=True):
-        size, deviation = float(sizes[kind] * scale), float(step.deviations[kind] * scale)
+    for kind, (name, unit, scale) in enumerate(names):
+        size, deviation = float(sizes[kind] * scale), float(deviations[kind] * scale)
         verdict = CORRECTED if is_off[kind] else AGREES
-        table.append(Found(name, unit, 0.0, size, deviation, float(step.shares[kind]), verdict))
-    return Wobble(views_of(numbers * is_off) if is_off.any() else None, table)
+        table.append(Found(name, unit, 0.0, size, deviation, float(shares[kind]), verdict))
+    return Wobble(numbers.views(numbers.values * is_off) if is_off.any() else None, table)

@@ -9,7 +9,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, Found, calibrate
-from phyradgs_cl.calibrate.parameters import GROUPS, PARAMETERS, WOBBLE
+from phyradgs_cl.calibrate.parameters import GROUPS, MOTION, PARAMETERS, WOBBLE
 from phyradgs_cl.calibrate.picture import residual_picture
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
@@ -24,7 +24,8 @@ from phyradgs_cl.settings import device_wish
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
-_WHAT = f"What to look for, with commas: {', '.join([*GROUPS, *(n for n in PARAMETERS if n not in GROUPS), WOBBLE])}."
+_NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION]
+_WHAT = f"What to look for, with commas: {', '.join(_NAMES)}."
 _OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."
 _WITH = "Another scan of the same object, which lies as it did: turned the other way, it tells readout and exposure."
 

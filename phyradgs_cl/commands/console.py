@@ -35,9 +35,12 @@ def complain(text: str, status: int = 2) -> int:
 
 
 def scores(metrics: Mapping[str, float | None]) -> str:
-    """PSNR and SSIM where there are any, with a comma before."""
-    psnr_db, ssim = metrics.get("psnr_db"), metrics.get("ssim")
-    return "" if psnr_db is None else f", PSNR {psnr_db:.2f} dB, SSIM {ssim:.4f}"
+    """PSNR, SSIM and the error on held-out pixels where there are any, with a comma before each."""
+    psnr_db, ssim, held_out = (metrics.get(name) for name in ("psnr_db", "ssim", "holdout_rms"))
+    said = "" if psnr_db is None else f", PSNR {psnr_db:.2f} dB, SSIM {ssim:.4f}"
+    if held_out is not None:
+        said += f", held-out pixels {held_out:.4g} RMS of line integrals (noise {metrics['holdout_noise_rms']:.4g})"
+    return said
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:

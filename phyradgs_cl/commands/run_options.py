@@ -75,6 +75,9 @@ RUN_OPTIONS: dict[str, Any] = {
         bool, option("Leave the lag that the scan file states in the frames.", True, "--ignore-lag")
     ],
     "steps": options.Steps,
+    "holdout": _asked(
+        float, "Pixels that the method does not see, to say how far its volume is from them.", "0", metavar="PERCENT"
+    ),
     "median_filter": _asked(int, "Median filter of the frames: 3 or 5 pixels per side, 0 none.", "0"),
     "device": options.Device,
     "memory": options.Memory,

@@ -33,15 +33,20 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HardeningOptions:
-    """polynomial: of p², p³ and p⁴; kvp: tube voltage, kV, whose spectrum is taken; neither: fitted to one material."""
+    """polynomial: of p², p³ and p⁴; kvp: tube voltage, kV, whose spectrum is taken; neither: fitted to one material.
+    bone_per_mm: attenuation from which a voxel is bone, beside kvp; 0: where the volume's values part by themselves."""
 
     polynomial: Polynomial = _NONE
     kvp: float = 0.0
+    bone_per_mm: float = 0.0
 
     def __post_init__(self) -> None:
         checks.fields_within("hardening.", self, {"polynomial": (-_LARGEST, _LARGEST)})
         if self.kvp != 0:
             checks.within("hardening.kvp", self.kvp, LOWEST_KVP, HIGHEST_KVP)
+        checks.within("hardening.bone_per_mm", self.bone_per_mm, 0, _LARGEST)
+        if self.bone_per_mm and not self.kvp:
+            raise InputError("hardening.bone_per_mm", "given without hardening.kvp", "both, or neither", "state the voltage")
         if self.kvp and any(self.polynomial):
             raise InputError("hardening.kvp", "given with hardening.polynomial", "one of the two", "leave one out")
 
@@ -67,7 +72,8 @@ def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeMod
     """The scan with straight line integrals."""
     frames = unmasked_frames(scan)
     if options.kvp:
-        clean, bone = straighten_two(frames, tube_spectrum(options.kvp), make_model(scan), water_polynomial(options.kvp))
+        spectrum, water = tube_spectrum(options.kvp), water_polynomial(options.kvp)
+        clean, bone = straighten_two(frames, spectrum, make_model(scan), water, options.bone_per_mm)
         return replace(scan, projections=clean), {"kvp": options.kvp, "bone_share": bone}
     fitted = not any(options.polynomial)
     polynomial = fit_polynomial(frames, make_model(scan)) if fitted else options.polynomial
@@ -76,14 +82,14 @@ def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeMod
 
 
 def straighten_two(
-    frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial
+    frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial, bone_per_mm: float = 0.0
 ) -> tuple[np.ndarray, float]:
     """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the object's voxels; those of water
-    where no bone is found."""
+    where no bone is found. ``bone_per_mm``: as of ``HardeningOptions``."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.volume(clean)
-        masks = _materials(volume)
+        masks = _materials(volume, bone_per_mm)
         if masks is None or masks[1] is None:
             break
         bone = masks[1]
@@ -133,15 +139,18 @@ def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, f
     return path, level, float(found[1] / found[0] ** 2), left
 
 
-def _materials(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """The object and, if there is any, what is bone in it (z, y, x) bool; None where nothing stands out."""
+def _materials(volume: np.ndarray, bone_per_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """The object and, if there is any, what is bone in it (z, y, x) bool, from ``bone_per_mm`` on if that is not 0; None
+    where nothing stands out."""
     from skimage.filters import threshold_multiotsu  # slow to import
 
     values = volume[_measured(volume.shape)]
     if np.ptp(values) == 0:
         return None
     low, high = threshold_multiotsu(values, classes=3)
-    inside, dense = volume >= low, volume >= high
+    inside, dense = volume >= low, volume >= (bone_per_mm or high)
+    if bone_per_mm:
+        return inside, dense if dense.any() else None
     soft = inside & ~dense
     many = dense.sum() > _LEAST_SHARE * inside.sum() and soft.any()
     has_bone = bool(many and volume[dense].mean() > _DENSE * volume[soft].mean())

@@ -2,8 +2,10 @@
 
 ``few``: per frame what a median along the row takes away, and what of that the sectors of a turn have in common (Boin and
 Haibel, Opt. Express 14 (2006) 12071, with averages). It asks no more of a view than that the object moves on, and holds for
-fly-scans. ``many``: the sorting of Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396, algorithm 3: over a turn all
-neighbouring pixels see much the same values, in another order.
+fly-scans. ``fitted``: likewise of what a volume with little total variation, which has few rings, leaves of the frames
+(after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268): patterns of any width, of an object that is on the grid.
+``many``: the sorting of Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396, algorithm 3: over a turn all neighbouring
+pixels see much the same values, in another order.
 """
 
 from dataclasses import dataclass, replace
@@ -15,9 +17,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.prepare.dead import axis_column
 from phyradgs_cl.prepare.masked import unmasked_frames
-from phyradgs_cl.prepare.step import Facts, MakeModel
+from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
-METHODS = ("auto", "few", "many")
+METHODS = ("auto", "few", "fitted", "many")
 MANY_VIEWS = 180
 _NORMAL_MAD, _MEDIAN_ERROR = 1.4826, 1.2533  # of normal values; a median's standard error over a mean's
 _PASSES, _SECTORS = 3, 15
@@ -28,7 +30,8 @@ _NEAR_AXIS = 3.0  # columns: here the object's own rings look like the panel's
 
 @dataclass(frozen=True)
 class RingOptions:
-    """method: few, many, or auto by the number of views. window: pixels of the median along a row; wider rings stay."""
+    """method: few or many, or auto by the number of views; fitted. window: pixels of the median along a row; wider rings
+    stay, but for ``fitted``."""
 
     method: str = "auto"
     window: int = 7
@@ -69,6 +72,15 @@ def _common(rest: np.ndarray, may_be_object: np.ndarray) -> np.ndarray:
     return (middle * np.maximum(signal / (signal + noise), sure)).astype(np.float32)
 
 
+def fitted_pattern(frames: np.ndarray, model: Model, first: np.ndarray) -> np.ndarray:
+    """What the pixels add to all line integrals (F, v, u), (v, u) float32, from a ``first`` guess on: ``fitted``."""
+    pattern, nowhere = first, np.zeros(frames.shape[2], bool)
+    for _ in range(_PASSES):  # a volume of frames with fewer rings has fewer rings
+        left = frames - model.frames(model.regularised(frames - pattern))
+        pattern = _common(left, nowhere)
+    return pattern
+
+
 def sort_rings(frames: np.ndarray, *, window: int = 7) -> np.ndarray:
     """Line integrals (F, v, u) without rings, float32: the method ``many``."""
     order = np.argsort(frames, axis=0)
@@ -85,10 +97,10 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     if method == "auto":
         method = "many" if scan.frames >= MANY_VIEWS else "few"
     frames = unmasked_frames(scan)
-    if method == "few":
-        pattern = ring_pattern(frames, window=options.window, axis_column=axis_column(scan))
-        clean = frames - pattern
-    else:
+    if method == "many":
         clean = sort_rings(frames, window=options.window)
+    else:
+        pattern = ring_pattern(frames, window=options.window, axis_column=axis_column(scan))
+        clean = frames - (pattern if method == "few" else fitted_pattern(frames, make_model(scan), pattern))
     change = float(np.sqrt(np.mean((clean - frames).astype(np.float64) ** 2)))
     return replace(scan, projections=clean), {"method": method, "rms_change": change}

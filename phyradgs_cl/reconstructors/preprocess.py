@@ -20,26 +20,41 @@ from phyradgs_cl.reconstructors.reprojection import reprojection
 from phyradgs_cl.runtime import Runtime
 
 MEDIAN_EDGES = (0, 3, 5)
+MOST_HELD = 50.0
 
 
 @dataclass(frozen=True)
 class InputOptions(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
-    median_filter: edge of its window in pixels, 0 for none. steps and a table each: as of ``PrepareOptions``.
+    median_filter: edge of its window in pixels, 0 for none. holdout: percent of the pixels that no method sees
+    (``holdout.py``). steps and a table each: as of ``PrepareOptions``.
     """
 
     ignore_lag: bool = False
     median_filter: int = 0
+    holdout: float = 0.0
 
     def __post_init__(self) -> None:
         GridChoice.__post_init__(self)
         PrepareOptions.__post_init__(self)
         checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
+        checks.within("holdout", self.holdout, 0, MOST_HELD)
+        if self.holdout and self.median_filter:
+            found = "a median filter, which mixes held-out pixels into their neighbours"
+            raise InputError("--holdout", found, "frames as they are", "leave one of the two out")
 
     def facts(self) -> dict[str, object]:
         """What is chosen, by name."""
         plain = {name: value for name, value in asdict(self).items() if name not in STEP_FIELDS and value is not None}
+        if not self.holdout:
+            del plain["holdout"]
         return {**plain, **self.step_facts()}
+
+    def check_written(self) -> None:
+        """InputError for what makes no sense in a scan that is kept."""
+        if self.holdout:
+            remedy = "give it to the reconstruction, whose error it measures"
+            raise InputError("--holdout", f"{self.holdout:g} %, without a method", "0 where a scan is prepared", remedy)
 
 
 def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Scan:

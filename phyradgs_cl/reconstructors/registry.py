@@ -15,9 +15,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import resampled
 from phyradgs_cl.prepare import TOLD
+from phyradgs_cl.prepare.masked import with_masked
+from phyradgs_cl.reconstructors.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
-from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors.result import HELD_OUT, ProgressReport, Reconstruction, ignore_progress
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 
@@ -142,11 +144,16 @@ def reconstruct(
     chosen = method_options(method) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method_name(method), rt)
-    ready = prepared(scan, InputOptions() if before is None else before, rt)
+    asked = InputOptions() if before is None else before
+    ready = prepared(scan, asked, rt)
     check_own_motion(getattr(chosen, "motion", None), ready)
     if initial is not None:
         extra["initial"] = _initial(method, *initial, ready.grid)
-    result = method_of(method).run(ready, chosen, rt, seed=seed, report=report, **extra)
+    held = held_out(ready, asked.holdout) if asked.holdout else None
+    seen = ready if held is None else with_masked(ready, held)
+    result = method_of(method).run(seen, chosen, rt, seed=seed, report=report, **extra)
+    if held is not None and rt.ranks.rank == 0:
+        result.facts[HELD_OUT] = holdout_errors(rt, ready, held, result)
     if TOLD in ready.provenance:
         result.facts[TOLD] = ready.provenance[TOLD]
     return result

@@ -8,10 +8,13 @@ from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.prepare import Model
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+from phyradgs_cl.reconstructors.voxels import fista_tv
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.reconstructors.voxels.sart import OS_METHOD, OS_SART
 from phyradgs_cl.runtime import Runtime
 
 _ITERATIONS = 5
+_LITTLE_VARIATION = FistaTvOptions(motion=PerRow(sub_intervals=1), iterations=30, tv_weight=0.002)
 
 
 def reprojection(rt: Runtime, scan: Scan) -> Model:
@@ -28,4 +31,8 @@ def reprojection(rt: Runtime, scan: Scan) -> Model:
         times = replace(OS_SART, motion=PerRow(sub_intervals=1), iterations=_ITERATIONS)
         return OS_METHOD.run(scan, times, rt).volume
 
-    return Model(volume, operator.forward, fitted)
+    def regularised(frames: np.ndarray) -> np.ndarray:
+        own = replace(scan, projections=np.asarray(frames, np.float32))
+        return fista_tv.METHOD.run(own, _LITTLE_VARIATION, rt).volume
+
+    return Model(volume, operator.forward, fitted, regularised)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 State = Mapping[str, np.ndarray]
 """What an interrupted run needs to go on, as named arrays: each method knows its own names."""
+HELD_OUT = "held_out"
+"""Where a result's facts have its error on pixels that its method did not see."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -45,7 +45,9 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
         facts["residual_of_the_shown_frames"] = float(np.sqrt(np.mean([view.rms**2 for view in views])))
     if not facts:
         return None
-    told = "Against the reference that the scan carries." if run.reference is not None else None
+    told = "Against the reference that the scan carries. " if run.reference is not None else ""
+    if "holdout_rms" in facts:
+        told += "Holdout: of line integrals that the method did not see, and what their noise makes of it."
     return _section("metrics", "Metrics", told and element("p", told, class_="note"), facts_table(facts))
 
 
@@ -102,7 +104,8 @@ def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(told)]
     if not changes and not earlier:
         return None
-    words = "The frame that each step changed most, in one range of grey values; difference, after less before."
+    words = "The frame and the sinogram (a line per frame) that each step changed most, and the middle slice, in one range "
+    words += "of grey values each; difference, after less before."
     note = element("p", words, class_="note") if changes else None
     return _section("preparation", "Preparation", note, *earlier, *(_change(change) for change in changes))
 
@@ -112,25 +115,30 @@ def _tables(told: object) -> list[Mapping[str, object]]:
 
 
 def _change(change: Change) -> Markup:
-    low, high = float(change.before.min()), float(change.before.max())
-    difference = change.after - change.before
+    shown = [_compared(change.step, name, *pair) for name, pair in change.pairs.items()]
+    chart = _charts([("Line integrals of all frames: dashed before, drawn after.", histogram(change.edges, change.counts))])
+    return joined(*shown, chart, facts_table(change.numbers))
+
+
+def _compared(step: str, name: str, before: np.ndarray, after: np.ndarray) -> Markup:
+    """An image before and after a step, and what the step did to it."""
+    low, high = float(before.min()), float(before.max())
+    difference = after - before
     limit = float(np.percentile(np.abs(difference), 99.9)) or float(np.abs(difference).max()) or 1.0
     pictures = [
-        ("before", png_bytes(top_row_first(bytes_of(change.before, low, high)))),
-        ("after", png_bytes(top_row_first(bytes_of(change.after, low, high)))),
+        ("before", png_bytes(top_row_first(bytes_of(before, low, high)))),
+        ("after", png_bytes(top_row_first(bytes_of(after, low, high)))),
         (f"difference, ±{number(limit)}", png_bytes(top_row_first(bytes_of(difference, -limit, limit)), diverging())),
     ]
     figures = [
         element(
             "figure",
-            element("div", element("img", src=data_uri(png), alt=f"{change.step}, {words}"), class_="picture"),
+            element("div", element("img", src=data_uri(png), alt=f"{step}, {name}, {words}"), class_="picture"),
             element("figcaption", words),
         )
         for words, png in pictures
     ]
-    title = element("h3", f"{change.step}: frame {change.frame}")
-    chart = _charts([("Line integrals of all frames: dashed before, drawn after.", histogram(change.edges, change.counts))])
-    return joined(element("div", title, *figures, class_="view"), chart, facts_table(change.numbers))
+    return element("div", element("h3", f"{step}: {name}"), *figures, class_="view")
 
 
 def provenance_section(run: Run) -> Markup:

@@ -27,6 +27,7 @@ def run_preparation(
     says the same, and of which scan. Bad pixels are masked and filled in. Raises InputError and OutputError as any run."""
     if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
+    options.check_written()
     refuse_overwriting("-o", output, source, *([config] if config else []))
     check_writable(output)
     with only_run(output):

@@ -45,7 +45,7 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
-from phyradgs_cl.reconstructors.result import option_facts
+from phyradgs_cl.reconstructors.result import HELD_OUT, option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
@@ -175,11 +175,12 @@ def _reconstructed(
 
 
 def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
-    """Against the scan's reference, where the volume is on its grid or a part of that."""
+    """Against the scan's reference, where the volume is on its grid or a part of that, and against held-out pixels."""
     reference = scan.on_grid(result.grid).reference
     if scan.reference is not None and reference is None:
         log.warning("no PSNR: the scan's reference is on another grid")
-    return {} if reference is None else compare(result.volume, reference)
+    held_out = result.facts.pop(HELD_OUT, {})
+    return held_out if reference is None else {**compare(result.volume, reference), **held_out}
 
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:

@@ -10,8 +10,8 @@ from phyradgs_cl.acquisition import CircularOrbit
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.moved import Change, Views, moved
 from phyradgs_cl.calibrate.parameters import in_words
-from phyradgs_cl.calibrate.views import find_wobble
-from phyradgs_cl.calibrate.wobble import views_of, without_gauges
+from phyradgs_cl.calibrate.views import SPLINES, find_sway, find_wobble
+from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges, without_sway_gauges
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.workflow import load_scan
@@ -91,6 +91,46 @@ def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt,
     assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
 
 
+def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
+    """Frames that overlap in time are no hindrance: a motion is of time alone."""
+    numbers = numbers_of_sway(right, SPLINES)
+    course = np.zeros((SPLINES, 6))
+    course[:, 3:] = 0.15 * np.random.default_rng(2).normal(size=(SPLINES, 3))
+    planted = without_sway_gauges(right, numbers, course)
+    path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
+    write_scan(path, moved(right, Change(), numbers.views(-planted)))
+    assert cli.run(["calibrate", str(path), "--what", "motion", "-o", str(out), "--json"]) == 0
+    lines = {one["name"]: one for one in json.loads(capsys.readouterr().out)["parameters"]}
+    sizes_mm = np.std(numbers.basis @ planted, 0)
+    for kind, axis in enumerate("xyz"):
+        one = lines[f"shift along {axis} of the object"]
+        assert one["verdict"] == CORRECTED and one["unit"] == "mm"
+        assert one["found"] == pytest.approx(sizes_mm[3 + kind], rel=0.2)
+    times_s = right.frame_start_s + right.shutter.middle_s
+    truth, stated, found = (
+        np.array([scan.trajectory.pose(f, t) for f, t in enumerate(times_s)])
+        for scan in (right, load_scan(path), load_scan(out))
+    )
+    assert np.std((found - truth)[:, :3]) < 0.25 * np.std((stated - truth)[:, :3])
+
+
+def test_a_still_object_stays_still(rt, right) -> None:
+    found = find_sway(rt, right, [(16, 30, 10), (32, 30, 10)], Change())
+    shifts_mm = np.zeros(1) if found.views is None else found.views.coefficients[:, 3:]
+    assert np.abs(shifts_mm).max() < 0.02
+
+
+def test_gauges_of_a_motion_are_an_object_elsewhere_and_a_larger_one(right) -> None:
+    numbers = numbers_of_sway(right, SPLINES)
+    angle = np.deg2rad(24 * np.arange(15))
+    towards = np.linalg.lstsq(numbers.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
+    gauges = np.tile(np.arange(6.0), (SPLINES, 1))
+    gauges[:, 3:5] += towards
+    np.testing.assert_allclose(without_sway_gauges(right, numbers, gauges), 0, atol=1e-9)
+    once = without_sway_gauges(right, numbers, np.random.default_rng(0).normal(size=(SPLINES, 6)))
+    np.testing.assert_allclose(without_sway_gauges(right, numbers, once), once, atol=1e-12)
+
+
 def test_gauges_of_views_are_what_another_object_looks_like(right) -> None:
     angle = np.deg2rad(24 * np.arange(15))
     gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
@@ -117,6 +157,8 @@ def few(scan):
         ("readout", lambda s: replace(s, is_fly=False), (), "stands still"),
         ("roll", few, (), "found 5 frames"),
         ("wobble", lambda s: s, (lambda s: s,), "one scan"),
+        ("motion", lambda s: s, (lambda s: s,), "one scan"),
+        ("wobble,motion", lambda s: s, (), "one of the two"),
         ("roll", lambda s: s, (lambda s: moved(s, Change(offset_u_mm=1.0)),), "--with: geometry"),
     ],
 )

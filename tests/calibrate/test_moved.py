@@ -5,9 +5,10 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PerRow, pixel_centres
-from phyradgs_cl.calibrate.moved import Change, Moved, Views, moved
+from phyradgs_cl.calibrate.moved import Change, Moved, Sway, Views, moved
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.io.scan.copy import copy_with_motion
 from phyradgs_cl.workflow import load_scan
@@ -49,6 +50,20 @@ def test_views_move_by_themselves(right) -> None:
     assert np.flatnonzero(is_off).tolist() == [3, 5]
     shift = (after.trajectory.pose(5, time_s) - right.trajectory.pose(5, time_s))[0]
     np.testing.assert_allclose(shift[3:6], [0, 0, 0.2], atol=1e-12)
+
+
+def test_an_object_that_moves_sees_source_and_panel_move_the_other_way(right) -> None:
+    """Rays meet the object where they would have met it at rest."""
+    rng = np.random.default_rng(0)
+    sway = replace(Sway.none(right, 5), coefficients=0.1 * rng.normal(size=(5, 6)))
+    path = moved(right, Change(), sway).trajectory
+    time_s = right.frame_start_s[0] + np.array([0.0, 0.3, 5.0])
+    stated, seen = (trajectory.pose(0, time_s).reshape(3, 4, 3) for trajectory in (right.trajectory, path))
+    for at, before, after in zip(sway.at(time_s), stated, seen, strict=True):
+        turn = Rotation.from_rotvec(at[:3]).as_matrix()
+        np.testing.assert_allclose(after[:2] @ turn.T + at[3:], before[:2], atol=1e-12)
+        np.testing.assert_allclose(after[2:] @ turn.T, before[2:], atol=1e-12)
+    np.testing.assert_allclose(sway.basis(np.linspace(-9, 99, 7)).sum(-1), 1)
 
 
 def datasets(path) -> dict[str, object]:

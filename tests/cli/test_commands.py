@@ -51,6 +51,19 @@ def test_each_method_writes_a_volume_that_evaluates(cli, scan, reconstructed, ca
     assert ("iterations asked" in told) == ("--iterations" in options)
 
 
+def test_the_error_on_held_out_pixels_is_said_and_kept(scan, reconstructed, capsys):
+    """In the file's attributes, and without a word where it was not asked for."""
+    volume = reconstructed(scan, "--method", "fdk", "--holdout", "3")
+    said = re.search(r"held-out pixels (\S+) RMS of line integrals \(noise (\S+)\)", capsys.readouterr().out)
+    with h5py.File(volume) as file:
+        kept = dict(file["entry/metrics"].attrs)
+    assert float(said[1]) == pytest.approx(kept["holdout_rms"], rel=1e-3)
+    assert float(said[2]) == pytest.approx(kept["holdout_noise_rms"], rel=1e-3) and kept["holdout_pixels"] > 50
+    assert facts_of(volume)["input"]["holdout"] == 3
+    reconstructed(scan, "--method", "fdk")
+    assert "held-out" not in capsys.readouterr().out
+
+
 def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, capsys):
     words = ["--method", "sirt", "--iterations", "9"]
     reconstructed(scan, *words, "--set", "tolerance=0.9")

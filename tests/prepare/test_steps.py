@@ -30,6 +30,7 @@ LOST_DB = 0.05
 CASES = (
     ({"sparks": 1e-3}, "sparks", {}, 0.6),
     ({"rings": 0.05}, "rings", {}, 0.4),
+    ({"rings": 0.05}, "rings", {"rings": {"method": "fitted"}}, 0.55),
     ({"scatter": 0.3}, "scatter", {}, 0.6),
     ({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}, 0.75),
     ({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}, 0.6),
@@ -49,6 +50,17 @@ def test_a_step_gives_back_what_its_effect_took(rt, planted, effect, step, optio
     assert found - spoilt > share * (clean - spoilt), (clean, spoilt, found)
 
 
+def test_what_is_bone_may_be_stated(rt, planted) -> None:
+    """The half of the largest attenuation that the simulation takes; where nothing is as dense, all is water."""
+    clean, spoilt = planted(), planted(kvp=120.0)
+    half = 0.5 * float(clean.reference.max())
+    before, lost = psnr_db(rt, spoilt), psnr_db(rt, clean) - psnr_db(rt, spoilt)
+    stated = psnr_db(rt, spoilt, "hardening", hardening={"kvp": 120.0, "bone_per_mm": half})
+    assert stated - before > 0.6 * lost
+    none = prepared(spoilt, input_options({"steps": "hardening", "hardening": {"kvp": 120.0, "bone_per_mm": 99.0}}), rt)
+    np.testing.assert_array_equal(none.projections, straighten(spoilt.projections, water_polynomial(120.0)))
+
+
 def test_steps_that_look_for_their_effect_leave_a_clean_scan_alone(rt, planted) -> None:
     for noise in ("beer", "none"):
         effects = {} if noise == "beer" else {"noise": "none", "dose": None}
@@ -56,6 +68,7 @@ def test_steps_that_look_for_their_effect_leave_a_clean_scan_alone(rt, planted) 
         before = psnr_db(rt, clean)
         for step in ("sparks", "dead", "scatter", "air", "rings"):
             assert psnr_db(rt, clean, step) > before - LOST_DB, (step, noise)
+        assert psnr_db(rt, clean, "rings", rings={"method": "fitted"}) > before - LOST_DB, noise
 
 
 def test_sparks_are_found_one_by_one(planted) -> None:
@@ -168,6 +181,7 @@ def test_what_is_no_step_or_no_option_of_one(planted) -> None:
         (lambda: input_options({"rings": {"window": 5}}), "rings among the steps"),
         (lambda: input_options({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
         (lambda: input_options({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
+        (lambda: input_options({"steps": "hardening", "hardening": {"bone_per_mm": 0.1}}), "without hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 80, "polynomial": [1, 0, 0]}}), "one of the two"),
         (lambda: prepared(full, InputOptions(steps="air")), "pixels of air"),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tolerances import FDK_MEAN, FDK_SCALE, FDK_SHEPP_LOGAN, FLOAT32
 
 from phyradgs_cl.acquisition import (
@@ -121,3 +122,36 @@ def test_masked_pixels_are_filled_along_their_row() -> None:
     expected[1, 2, 0] = 1.0  # rows without a pixel: from those beside them
     np.testing.assert_array_equal(filled, expected)
     assert spoiled.max() == 1e6  # the caller's frames are left alone
+
+
+def test_orbits_that_are_no_circle_about_z_are_told_and_refused(rt, caplog) -> None:
+    """A circle, displaced, short, jittered or off by a pixel, is none of them."""
+    geometry = ConeGeometry(5.0, 7.0, (12, 12), (0.3, 0.3))
+    angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+    circle = geometry.pose(angle)
+
+    def lifted(feed_mm: float) -> np.ndarray:
+        return circle + np.outer(feed_mm * (angle / np.pi - 1), np.eye(12)[2] + np.eye(12)[5])
+
+    def turned(axis: str, deg: float, poses: np.ndarray = circle) -> np.ndarray:
+        return (poses.reshape(-1, 4, 3) @ Rotation.from_euler(axis, deg, degrees=True).as_matrix().T).reshape(-1, 12)
+
+    def tilted(deg: float) -> np.ndarray:
+        beam = turned("y", -deg, geometry.pose(0.0))[0].reshape(4, 3)
+        return np.concatenate([(beam @ Rotation.from_euler("z", a).as_matrix().T).reshape(1, 12) for a in angle])
+
+    cases = {
+        "circle": (circle, 0), "half-fan": (replace(geometry, detector_offset_mm=(0.0, 0.9)).pose(angle), 0),
+        "shaken": (circle + 0.05 * np.random.default_rng(0).normal(size=(20, 1)) * np.eye(12)[3], 0),
+        "helix": (lifted(1.0), 1), "laminography": (tilted(20), 1), "steep": (tilted(50), 2),
+        "about y": (turned("x", 90), 2),
+    }  # fmt: skip
+    for name, (poses, worst) in cases.items():
+        caplog.clear()
+        scan = Scan.from_poses(np.ones((20, 12, 12), np.float32), poses, Grid.cube(8, 1.0))
+        if worst == 2:
+            with pytest.raises(InputError, match="off a circle about z.*any orbit"):
+                fdk(scan, FdkOptions(), rt)
+        else:
+            fdk(scan, FdkOptions(), rt)
+            assert ("off a circle about z" in caplog.text) == bool(worst), name

@@ -234,8 +234,8 @@ def test_the_command_writes_a_page_and_says_so(cli, files, tmp_path, capsys) -> 
 
 
 def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> None:
-    """A frame before and after, their difference and a histogram for each; of a scan that was prepared already, its
-    numbers."""
+    """A frame, a sinogram and a slice before and after, their differences and a histogram for each; of a scan that was
+    prepared already, its numbers."""
     sparked = small_scan.projections.copy()
     sparked[1, 5, 6] -= 3
     told = {"prepared": [{"step": "air", "light": [0.98, 1.01]}]}
@@ -247,5 +247,6 @@ def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> N
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     section = text.split('id="preparation"')[1].split("</section>")[0]
     assert "sparks: frame 1" in section and "rings: frame" in section and "0.98" in section
-    assert section.count("<img") == 6 and section.count("Histogram of line integrals") == 2
+    assert section.count("sparks: sinogram of row 5") == 1 and section.count("middle slice by fdk</h3>") == 2
+    assert section.count("<img") == 18 and section.count("Histogram of line integrals") == 2
     assert not parse(text).open

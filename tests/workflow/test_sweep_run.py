@@ -25,6 +25,7 @@ from phyradgs_cl.workflow.sweep import (
     run_sweep,
     task,
 )
+from phyradgs_cl.workflow.sweep.tables import comma_separated, markdown
 
 TEXT = """
 scans = ["*.h5"]
@@ -89,6 +90,15 @@ def test_every_run_is_in_the_file_once_with_what_it_depends_on(job) -> None:
     again = lines_of(job)[RUNS:]
     assert len(again) == RUNS // 2 and {line["scan"] for line in again} == {str(scan)}
     assert len(records_of(job)) == RUNS
+
+
+def test_tables_have_held_out_errors_where_they_were_asked_for() -> None:
+    line = {"label": "one", "seconds": 1.0, "metrics": {}, "input": {}, "changes": {}}
+    held_out = {**line, "metrics": {"holdout_rms": 0.01234, "holdout_noise_rms": 0.0111}}
+    assert "held-out" not in markdown([line], 1)
+    title, _, row = markdown([held_out], 1).splitlines()[2:]
+    assert "| held-out RMS | of noise |" in title and "| 0.01234 | 0.0111 |" in row
+    assert "holdout_rms" in comma_separated([held_out]) and "0.01234" in comma_separated([held_out])
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(job) -> None:

@@ -20,6 +20,7 @@ from phyradgs_cl.reconstructors.fdk.extrapolate import WAYS, extrapolated
 from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
+    check_orbit,
     pose_of_pixels,
     ray_weight,
     view_angles,
@@ -59,12 +60,16 @@ class FdkOptions:
 def fdk(
     scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
 ) -> Reconstruction:
-    """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing."""
+    """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing.
+
+    Of orbits that are no circle about z a warning is logged; InputError for those that are far from any.
+    """
     started = time.perf_counter()
     frames, numbers = _seen_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
+    check_orbit(pose)
     how = {"window": options.window, "extrapolate": options.extrapolate}
     volume = fdk_volume(rt, frames, pose, scan.grid, axis=scan.shutter.axis, **how)
     facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}

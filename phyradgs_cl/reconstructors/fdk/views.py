@@ -5,12 +5,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.arc import Arc
 
 log = logging.getLogger(__name__)
 
+_CIRCLE, _NO_CIRCLE = 0.05, 0.5  # of the way from source to panel: from here FDK loses decibels, or the object
+_PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0
 _DISPLACED = 0.1  # of the fan: less may be a misaligned panel that still sees the whole object
 RayWeight = Callable[[int], np.ndarray]
 
@@ -79,6 +82,25 @@ def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray
     moved = pose.copy()
     moved[..., 3:6] -= missing[0] * pose[..., 6:9]
     return moved
+
+
+def check_orbit(pose: np.ndarray) -> None:
+    """Says of poses (F, 12) or (F, lines, 12) how far they are from one circle about z with a panel that turns along, and
+    from that circle's plane. Raises InputError where FDK would make no volume of the object."""
+    middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
+    canonical = weights.turned_back(middle, weights.source_angle(middle)).reshape(-1, 4, 3)
+    source, corner = canonical[:, 0], canonical[:, 1]
+    usual = np.median(canonical, axis=0)
+    length_mm = float(np.linalg.norm(usual[1] - usual[0]))
+    off = max(float(np.linalg.norm(at - of, axis=-1).max()) for at, of in ((source, usual[0]), (corner, usual[1])))
+    above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
+    found = f"source and panel up to {100 * off / length_mm:.0f} % of their distance off a circle about z"
+    found += f", {above_deg:.0f}° above its middle"
+    if off > _NO_CIRCLE * length_mm or above_deg > _NO_PLANE_DEG:
+        expected = f"at most {100 * _NO_CIRCLE:.0f} % and {_NO_PLANE_DEG:.0f}°"
+        raise InputError("--method fdk", found, expected, "take an iterative or splatting method: they take any orbit")
+    if off > _CIRCLE * length_mm or above_deg > _PLANE_DEG:
+        log.warning("FDK: %s: the volume is an approximation; iterative and splatting methods take any orbit", found)
 
 
 def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid) -> None:

@@ -29,12 +29,12 @@ from phyradgs_cl.reconstructors.result import (
 )
 from phyradgs_cl.reconstructors.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Prior, prior_of
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, Setting, voxel_method
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_GROWTH = 1.2  # of the residual from pass to pass: subsets that pull apart so much are too small
+_GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time
 # of the passes, the result and the prior's weight: what is the smaller voxels' (docs/results/settings.md)
@@ -44,7 +44,8 @@ _FINE_PASSES, _FINE_SHARE, _FINE_WEIGHT = 3 / 7, np.float32(2 / 3), 2 / 3
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or ``package.module:function`` of one's own: (volume (nz, ny, nx) in 1/mm, noise in 1/mm) to
-    a volume. prior_weight: its strength, relative to the noise of the frames as it reaches a voxel.
+    a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the total variation
+    from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 where the device has room for them, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
@@ -56,6 +57,7 @@ class FistaOptions(IterativeOptions):
     prior: str = "dct"
     prior_weight: float = 0.45
     subvoxels: int = 0
+    prior_share: float = 0.5
     frames_per_subset: int = 5
     tv_iterations: int = 5
     transmission_weights: bool = False  # type: ignore[misc]
@@ -66,19 +68,9 @@ class FistaOptions(IterativeOptions):
             checks.one_of("prior", self.prior, PRIORS)
         checks.within("subvoxels", self.subvoxels, 0, 8)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)
+        checks.within("prior_share", self.prior_share, 0, 1)
         checks.within("frames_per_subset", self.frames_per_subset, 0, 1_000_000)
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
-
-
-def _started(system: System, options: FistaOptions, setting: Setting) -> "Fista":
-    scan = setting.scan
-    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
-    noise = noise_level(np.asarray(scan.projections, np.float32), valid)
-    prior = prior_of(options.prior, setting.rt, scan.grid, options.tv_iterations)
-    return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
-
-
-one_grid = voxel_method("fista", FistaOptions(), _started, volumes=_VOLUMES, frames=_FRAMES).run
 
 
 def fista(
@@ -92,7 +84,7 @@ def fista(
     initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """The regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
-    stages = fista_stages(scan, options, rt)
+    stages = fista_stages(scan, options, rt, initial)
     result = run_stages(stages, scan.grid, report, resume, initial)
     result.facts["options"] = option_facts(options)
     return result
@@ -101,22 +93,23 @@ def fista(
 METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
 
 
-def fista_stages(scan: Scan, options: FistaOptions, rt: Runtime) -> list[Stage]:
-    """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels."""
+def fista_stages(
+    scan: Scan, options: FistaOptions, rt: Runtime, image: np.ndarray | None = None
+) -> list[Stage]:
+    """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels; ``image``: of piccs."""
     parts = options.subvoxels or (2 if _has_room(scan.grid, 2, rt) else 1)
     first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
-        return one_grid(scan, replace(options, iterations=first), rt, report=report, resume=resume, initial=before)
+        return _run(scan, replace(options, iterations=first), rt, report, resume, before, image)
 
     def parted(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
         assert before is not None
         grid = finer(scan.grid, parts)
-        start = before.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
         weight = _FINE_WEIGHT * options.prior_weight
         small = replace(options, iterations=options.iterations - first, prior_weight=weight)
         fine = replace(scan, grid=grid, reference=None)
-        return one_grid(fine, small, rt, report=report, resume=resume, initial=start)
+        return _run(fine, small, rt, report, resume, repeated(before, parts), repeated(image, parts))
 
     if parts == 1:
         return [Stage("voxels", first, voxels)]
@@ -137,6 +130,11 @@ def finer(grid: Grid, parts: int) -> Grid:
     return replace(grid, shape=(parts * z, parts * y, parts * x), voxel_size_mm=(dz / parts, dy / parts, dx / parts))
 
 
+def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
+    """The same volume in ``parts`` voxels for one along each axis."""
+    return None if volume is None else volume.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
+
+
 def block_means(volume: np.ndarray, parts: int) -> np.ndarray:
     """Means of a volume (parts nz, parts ny, parts nx) over blocks, (nz, ny, nx) float32."""
     nz, ny, nx = (count // parts for count in volume.shape)
@@ -150,6 +148,27 @@ def _has_room(grid: Grid, parts: int, rt: Runtime) -> bool:
     voxels = math.prod(grid.shape) * parts**3
     holds = voxels <= MOST_VOXELS and rt.room().holds(*[4 * voxels] * (_VOLUMES + 2))
     return not rt.ranks.any(not holds)
+
+
+def _run(
+    scan: Scan,
+    options: FistaOptions,
+    rt: Runtime,
+    report: ProgressReport,
+    resume: State | None,
+    initial: np.ndarray | None,
+    image: np.ndarray | None,
+) -> Reconstruction:
+    """All passes on the scan's grid."""
+    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
+    noise = noise_level(np.asarray(scan.projections, np.float32), valid)
+
+    def make(system: System) -> "Fista":
+        prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations, image, options.prior_share)
+        return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
+
+    sizes = {"volumes": _VOLUMES, "frames": _FRAMES}
+    return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
 
 
 class Fista:
@@ -166,7 +185,7 @@ class Fista:
         space = system.space
         self.volume = space.full(system.volume_shape, 0.0)
         self.previous = self.volume
-        self.momentum, self.residual = 1.0, float("inf")
+        self.momentum, self.least = 1.0, float("inf")
         self.finished: str | None = None
         columns = space.largest(system.column_sums())
         # AᵀA has no negative entry: its largest row sum bounds its norm
@@ -184,11 +203,13 @@ class Fista:
 
     def step(self) -> float:
         squares = sum(self._step_of(subset) ** 2 for subset in self.subsets)
-        before, self.residual = self.residual, float(np.sqrt(squares))
-        if self.residual > _GROWTH * before and len(self.subsets) > 1:
+        residual = float(np.sqrt(squares))
+        pull_apart = residual > _GROWTH * self.least and len(self.subsets) > 1
+        if pull_apart:
             self.subsets = self._subsets(-(-len(self.subsets) // 2))
             self.momentum, self.previous = 1.0, self.volume
-        return self.residual
+        self.least = residual if pull_apart else min(self.least, residual)
+        return residual
 
     def _step_of(self, subset: System) -> float:
         system, space = self.system, self.system.space
@@ -209,13 +230,13 @@ class Fista:
         return {
             "volume": numpy(self.volume),
             "previous": numpy(self.previous),
-            "progress": np.array([self.momentum, self.residual, len(self.subsets)]),
+            "progress": np.array([self.momentum, self.least, len(self.subsets)]),
             **self.prior.state(),
         }
 
     def restore(self, state: State) -> None:
         volume, previous, progress = state_arrays(state, ["volume", "previous", "progress"])
         self.volume, self.previous = map(self.system.space.array, (volume, previous))
-        self.momentum, self.residual = float(progress[0]), float(progress[1])
+        self.momentum, self.least = float(progress[0]), float(progress[1])
         self.subsets = self._subsets(int(progress[2]))
         self.prior.restore(state)

@@ -7,13 +7,14 @@ from typing import Protocol as Interface
 
 import numpy as np
 
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import DctProx, TvProx
 from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
 
-PRIORS = ("dct", "tv", "none")
+PRIORS = ("dct", "tv", "piccs", "none")
 _TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where both are in one step
 
 
@@ -31,13 +32,20 @@ class Prior(Interface):
     def restore(self, state: State) -> None: ...
 
 
-def prior_of(name: str, rt: Runtime, grid: Grid, tv_iterations: int) -> Prior:
-    """A prior by its name in ``PRIORS``, or by ``package.module:function`` of one's own (``Denoiser``)."""
+def prior_of(
+    name: str, rt: Runtime, grid: Grid, tv_iterations: int, image: np.ndarray | None = None, share: float = 0.5
+) -> Prior:
+    """A prior by its name in ``PRIORS``, or by ``package.module:function`` of one's own (``Denoiser``); of piccs the prior
+    image (nz, ny, nx) in 1/mm, and its share. InputError: it has none."""
     if ":" in name:
         return OwnPrior(imported(name, "prior"))
     tv = TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations)
     if name == "tv":
         return tv
+    if name == "piccs":
+        if image is None:
+            raise InputError("--set prior=piccs", "no prior image", "a volume: --initial VOLUME", "or take prior=tv")
+        return Piccs(tv, TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations), image, share)
     return TvAndDct(tv, DctProx(rt, grid.shape)) if name == "dct" else NoPrior()
 
 
@@ -76,6 +84,29 @@ class TvAndDct(TvPrior):
         smooth = super().__call__(space, volume, _TV_SHARE * weight, nonnegative=nonnegative)
         shrink = partial(self.shrink, threshold=_DCT_SHARE * weight, nonnegative=nonnegative)
         return space.apply(shrink, smooth, self.prox.shape)
+
+
+class Piccs:
+    """Total variation of the volume, and that of what it differs from a prior image by: (1 − share) TV(x) + share TV(x − i),
+    one map after the other (prior image constrained compressed sensing; Chen, Tang and Leng, Med. Phys. 35 (2008) 660)."""
+
+    def __init__(self, plain: TvPrior, change: TvPrior, image: np.ndarray, share: float) -> None:
+        self.plain, self.change, self.image, self.share = plain, change, image, share
+        self._there: Any = None
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        if self._there is None:
+            self._there = space.array(np.ascontiguousarray(self.image, np.float32))
+        volume = self.plain(space, volume, (1 - self.share) * weight, nonnegative=nonnegative)
+        change = self.change(space, space.add(volume, self._there, -1.0), self.share * weight, nonnegative=False)
+        return space.add(change, self._there, 1.0, nonnegative=nonnegative)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {**self.plain.state(), "dual_of_change": self.change.prox.dual}
+
+    def restore(self, state: State) -> None:
+        self.plain.restore(state)
+        (self.change.prox.dual,) = state_arrays(state, ["dual_of_change"])
 
 
 class NoPrior:

@@ -1,11 +1,14 @@
-"""A frame of the scan before and after each step of ``prepare``, and how often each line integral was there."""
+"""What each step of ``prepare`` did: a frame, a sinogram and a slice before and after, and how often each line integral was
+there."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare.step import Facts
+from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.preprocess import stages
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
@@ -16,14 +19,13 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What a step did: its numbers; the frame that changed most, before and after (rows, columns); the scan's line integrals
-    as ``counts`` (2, n), before and after, between ``edges`` (n + 1,)."""
+    """What a step did: its numbers; by name an image (rows, columns) before and after: the frame that changed most, the
+    sinogram (frames, columns) of the row that did, the middle slice (y, x) by FDK; the scan's line integrals as ``counts``
+    (2, n), before and after, between ``edges`` (n + 1,)."""
 
     step: str
     numbers: Facts
-    frame: int
-    before: Image
-    after: Image
+    pairs: dict[str, tuple[Image, Image]]
     edges: NDArray[np.float64]
     counts: NDArray[np.int64]
 
@@ -32,18 +34,31 @@ def step_changes(run: Run, rt: Runtime) -> list[Change]:
     """The steps of the run, done again on its scan."""
     if run.scan is None or not run.before.chosen:
         return []
-    found, former = [], None
+    found: list[Change] = []
+    former: tuple[np.ndarray, Image] | None = None
     for name, scan, numbers in stages(run.scan, run.before, rt):
+        now = scan.projections, static_fdk(rt, scan.on_grid(_middle(scan.grid)))[0]
         if former is not None:
-            found.append(_change(name, numbers, former, scan.projections))
-        former = scan.projections
+            found.append(_change(name, numbers, former, now))
+        former = now
     return found
 
 
-def _change(name: str, numbers: Facts, before: np.ndarray, after: np.ndarray) -> Change:
-    moved = [float(np.mean(np.abs(b - a))) for b, a in zip(before, after, strict=True)]
-    frame = int(np.argmax(moved))
+def _middle(grid: Grid) -> Grid:
+    """One slice across the axis, in the middle of a grid."""
+    return Grid((1, *grid.shape[1:]), grid.voxel_size_mm, grid.offset_mm)
+
+
+def _change(name: str, numbers: Facts, former: tuple[np.ndarray, Image], now: tuple[np.ndarray, Image]) -> Change:
+    (before, slice_before), (after, slice_after) = former, now
+    moved = np.stack([np.abs(b - a).mean(axis=1) for b, a in zip(before, after, strict=True)])
+    frame, row = int(np.argmax(moved.mean(axis=1))), int(np.argmax(moved.mean(axis=0)))
+    pairs = {
+        f"frame {frame}": (before[frame], after[frame]),
+        f"sinogram of row {row}": (before[:, row], after[:, row]),
+        "middle slice by fdk": (slice_before, slice_after),
+    }
     low, high = np.percentile(np.stack([before, after]), [0.01, 99.99])
     edges = np.linspace(low, high if high > low else low + 1, _BINS + 1)
     counts = np.stack([np.histogram(frames, edges)[0] for frames in (before, after)])
-    return Change(name, numbers, frame, before[frame], after[frame], edges, counts)
+    return Change(name, numbers, pairs, edges, counts)

@@ -15,8 +15,9 @@ from phyradgs_cl.workflow.sweep.grid import flat
 from phyradgs_cl.workflow.sweep.plan import SweepRun, same_run
 
 _METRICS = {"psnr_db": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".4f")}
+_HELD_OUT = {"holdout_rms": ("held-out RMS", ".4g"), "holdout_noise_rms": ("of noise", ".4g")}  # where it was asked for
 _FACTS = ("run", "scan", "method", "preset", "seed")
-_RESULTS = ("psnr_db", "ssim", "seconds", "gaussians", "device", "host", "version", "volume", "error")
+_RESULTS = ("psnr_db", "ssim", *_HELD_OUT, "seconds", "gaussians", "device", "host", "version", "volume", "error")
 
 
 def write_tables(folder: Path, lines: Sequence[Line], plan: Sequence[SweepRun]) -> list[Path]:
@@ -35,16 +36,18 @@ def write_tables(folder: Path, lines: Sequence[Line], plan: Sequence[SweepRun]) 
 def markdown(lines: Sequence[Line], planned: int) -> str:
     """Means and standard deviations over the scans and seeds of every setting, the failed runs below."""
     done = [line for line in lines if "error" not in line]
+    asked = {name for line in done for name in line["metrics"]}
+    metrics = {**_METRICS, **{name: column for name, column in _HELD_OUT.items() if name in asked}}
     rows = [
         f"{len(done)} of {planned} runs, {len(lines) - len(done)} failed; mean ± standard deviation over scans and seeds.",
         "",
-        "| setting | runs | " + " | ".join(title for title, _ in _METRICS.values()) + " | seconds |",
-        "| --- | ---: |" + " ---: |" * (len(_METRICS) + 1),
+        "| setting | runs | " + " | ".join(title for title, _ in metrics.values()) + " | seconds |",
+        "| --- | ---: |" + " ---: |" * (len(metrics) + 1),
     ]
     for label in dict.fromkeys(line["label"] for line in done):
         same = [line for line in done if line["label"] == label]
-        found = {name: [line["metrics"].get(name) for line in same] for name in _METRICS}
-        numbers = [_spread(found[name], form) for name, (_, form) in _METRICS.items()]
+        found = {name: [line["metrics"].get(name) for line in same] for name in metrics}
+        numbers = [_spread(found[name], form) for name, (_, form) in metrics.items()]
         seconds = _spread([line["seconds"] for line in same], ".1f")
         rows.append("| " + " | ".join([_cell(label), str(len(same)), *numbers, seconds]) + " |")
     rows += _failures([line for line in lines if "error" in line])
