@@ -42,7 +42,7 @@ class Calibration:
     residual_rms: tuple[float, float]
     before: np.ndarray
     after: np.ndarray
-    views: Views | Sway | None = None
+    views: "Views | Sway | None" = None
 
     @property
     def corrected(self) -> list[Found]:

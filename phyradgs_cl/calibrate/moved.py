@@ -80,7 +80,7 @@ class Moved:
     base: Trajectory
     shape: tuple[int, int]
     change: Change
-    views: Views | Sway | None = None
+    views: "Views | Sway | None" = None
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Poses (..., 12) at times (...)."""

@@ -24,8 +24,8 @@ from phyradgs_cl.reconstructors.result import (
 )
 from phyradgs_cl.reconstructors.splats import phyradgs
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
+from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.runtime import Runtime
 
 

@@ -16,7 +16,6 @@ from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts
-from phyradgs_cl.reconstructors.reprojection import reprojection
 from phyradgs_cl.runtime import Runtime
 
 MEDIAN_EDGES = (0, 3, 5)
@@ -82,6 +81,8 @@ def _begun(scan: Scan, options: InputOptions) -> Scan:
 def _model(rt: Runtime | None, scan: Scan) -> Model:
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
+    from phyradgs_cl.reconstructors.reprojection import reprojection  # methods: slow to import
+
     return reprojection(rt, scan)
 
 

@@ -27,10 +27,10 @@ from phyradgs_cl.reconstructors.result import (
     option_facts,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Prior, prior_of
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
+from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
