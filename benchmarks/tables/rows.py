@@ -109,6 +109,10 @@ _SPLATTING = (
 _FUSED = (
     Row("FISTA with DCT", "fista"),
     Row("FISTA with DCT per-row", "fista", "per-row", still="FISTA with DCT"),
+    Row(
+        "FISTA with DCT, one grid per-row", "fista", "per-row", still="FISTA with DCT, one grid", variant="one grid",
+        changes={"subvoxels": 1, "iterations": 30},
+    ),
     Row("Fused", "fused"),
     Row("Fused exact in time", "fused", "exact", still="Fused"),
 )

@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from scipy.sparse.linalg import lsqr
 from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
 
-from phyradgs_cl.acquisition import ConeGeometry, Scan, Static, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan, Static, make_protocol
 from phyradgs_cl.detector import beer_lambert_noise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -384,4 +384,4 @@ def test_methods_are_registered_and_bad_options_named() -> None:
             method_options(method, None, {option: value})
     assert set(ITERATIVE) <= set(METHODS)
     for name in ITERATIVE:
-        assert method_options(name).motion == Static()
+        assert method_options(name).motion == (PerRow() if name == "fista" else Static())

@@ -41,6 +41,8 @@ def options_of(method: str, model: str, iterations: int = 4):
         changes["transmission_weights"] = True
     if method == "cgls":
         changes["noise_stop"] = 0
+    if method == "fista":  # one grid: between two the volume comes to the host, once
+        changes["subvoxels"] = 1
     return method_options(method, None, changes)
 
 

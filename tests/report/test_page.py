@@ -86,7 +86,7 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
 def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
     target = tmp_path / "short.h5"
     changes = {"iterations": 12, "gaussians": 50, "tv_weight": 0.0}
-    job = ReconstructionJob(files[0], target, changes=changes)
+    job = ReconstructionJob(files[0], target, method="phyradgs", changes=changes)
     run_reconstruction(job, lambda: rt, lambda progress: None)
     record = load_run(target).record
     assert [line["iteration"] for line in record] == list(range(1, 13))
