@@ -114,7 +114,9 @@ def method_options(method: object, preset: str | None = None, changes: Mapping[s
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
     if not isinstance(chosen, str) or chosen not in presets:
-        raise InputError("--preset", checks.shown(chosen), f"one of {', '.join(presets)} for --method {name}")
+        having = [other for other, one in METHODS.items() if isinstance(chosen, str) and chosen in one.presets]
+        remedy = f"--method {' or '.join(having)} has it" if having else ""
+        raise InputError("--preset", checks.shown(chosen), f"one of {', '.join(presets)} for --method {name}", remedy)
     changes = dict(changes or {})
     base = presets[chosen]
     if hasattr(base, "motion"):

@@ -68,7 +68,7 @@ def run_stages(
 ) -> Reconstruction:
     """One stage after the other, reported as one run, from ``initial`` or from a state of the whole run.
 
-    The result is the last stage's; iterations, seconds and the record are of all, facts has ``stages``: each one's own.
+    The result is the last stage's; iterations, seconds and the record are of all, facts has ``stages``: those of each.
     """
     way, facts = _Way(initial, record=[]), {}
     own = None if resume is None else way.restore(resume, stages, grid)
@@ -76,7 +76,8 @@ def run_stages(
     while True:
         stage = stages[way.index]
         result = stage.run(way.volume, _reporting(stage, way, total, grid, report), own)
-        facts[stage.name], own = result.facts, None
+        done = result.facts.get("iterations", stage.iterations)
+        facts[stage.name], own = {"iterations": done, "seconds": result.facts["seconds"]}, None
         volume = stage.shown(result.volume, way.volume)
         at, state = result.facts["interrupted_at"], result.state
         state = None if state is None else way.state(state)
@@ -85,8 +86,8 @@ def run_stages(
         if at is not None or way.index == len(stages) - 1:
             break
         way.volume, way.index, way.iterations = volume, way.index + 1, way.iterations + stage.iterations
-    done = way.iterations + result.facts.get("iterations", stage.iterations)
-    whole: dict[str, Any] = {**result.facts, "stages": facts, "iterations": done, "seconds": way.seconds}
+    whole: dict[str, Any] = {**result.facts, "stages": facts, "seconds": way.seconds}
+    whole["iterations"] = way.iterations + done
     whole["interrupted_at"] = None if at is None else way.iterations + at
     return Reconstruction(volume, grid, result.gaussians, way.record, whole, state)
 
