@@ -14,8 +14,9 @@ from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid, Table
 PHANTOMS, VOXELS, PIXELS, ITERATIONS = ("foot", "jaw"), 32, 64, 600
 _ROWS: tuple[tuple[str, Table], ...] = (
     ("fdk", {"motion": "static"}),
-    ("fista-tv", {"motion": "static"}),
     ("fista-tv", {"motion": "per-row"}),
+    ("fista", {"motion": "static"}),
+    ("fista", {"motion": "per-row"}),
     ("r2", {"motion": "static"}),
     ("phyradgs", {"motion": "static"}),
     ("phyradgs", {"motion": "micro-views", "strips": 8, "sub_intervals": 5}),
