@@ -50,14 +50,16 @@ demo: $(VENV)/.installed-cpu
 	$(PHYRADGS) simulate --phantom foot --size 64 --detector 128 --protocol rapid --noise tigre --dose 1e4 \
 		--electronic-noise 10 --seed 0 -o $(OUT)/scan.h5
 	$(PHYRADGS) reconstruct $(OUT)/scan.h5 --method fdk -o $(OUT)/fdk.h5
+	$(PHYRADGS) reconstruct $(OUT)/scan.h5 -o $(OUT)/fista.h5
 	$(PHYRADGS) reconstruct $(OUT)/scan.h5 --method phyradgs --motion static --config $(CONFIG) -o $(OUT)/static.h5
 	$(PHYRADGS) reconstruct $(OUT)/scan.h5 --method phyradgs --config $(CONFIG) -o $(OUT)/phyradgs.h5
 	$(PHYRADGS) evaluate $(OUT)/fdk.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/fdk.json
+	$(PHYRADGS) evaluate $(OUT)/fista.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/fista.json
 	$(PHYRADGS) evaluate $(OUT)/static.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/static.json
 	$(PHYRADGS) evaluate $(OUT)/phyradgs.h5 --reference $(OUT)/scan.h5 --json > $(OUT)/phyradgs.json
-	@$(BIN)/python benchmarks/demo_table.py "fdk=$(OUT)/fdk.json" "phyradgs, static=$(OUT)/static.json" \
+	@$(BIN)/python benchmarks/demo_table.py "fdk=$(OUT)/fdk.json" "fista=$(OUT)/fista.json" "phyradgs, static=$(OUT)/static.json" \
 		"phyradgs=$(OUT)/phyradgs.json"
-	@$(BIN)/python benchmarks/demo_picture.py $(OUT)/slices.png $(OUT)/scan.h5 "fdk=$(OUT)/fdk.h5" \
+	@$(BIN)/python benchmarks/demo_picture.py $(OUT)/slices.png $(OUT)/scan.h5 "fdk=$(OUT)/fdk.h5" "fista=$(OUT)/fista.h5" \
 		"phyradgs, static=$(OUT)/static.h5" "phyradgs=$(OUT)/phyradgs.h5"
 	@echo "pictures: $(OUT)/slices.png and one beside each volume"
 
