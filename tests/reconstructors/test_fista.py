@@ -146,3 +146,28 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
     changes = {"iterations": 60, "voxel_iterations": 6}
     voxels, mean, splats = (run(rt, scan, "fused", splat_weight=w, **changes).volume for w in (0.0, 0.5, 1.0))
     np.testing.assert_allclose(mean, (voxels + splats) / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("at", [2, 5])
+def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at) -> None:
+    options = method_options("fista", None, {"iterations": 7, "subvoxels": 2})
+
+    def stop(progress: Progress) -> None:
+        assert progress.iterations == 7
+        if progress.iteration >= at:
+            raise KeyboardInterrupt
+
+    whole = reconstruct(scan, "fista", rt, options)
+    part = reconstruct(scan, "fista", rt, options, report=stop)
+    assert part.facts["interrupted_at"] == at and part.volume.shape == scan.grid.shape
+    rest = reconstruct(scan, "fista", rt, options, resume=part.state)
+    np.testing.assert_array_equal(rest.volume, whole.volume)
+    assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
+
+
+def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
+    (tmp_path / "own_priors.py").write_text("def nothing(volume, noise):\n    return 0 * volume\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert not run(rt, scan, "fista", prior="own_priors:nothing", iterations=2).volume.any()
+    with pytest.raises(InputError, match="prior: found own_priors:nobody"):
+        run(rt, scan, "fista", prior="own_priors:nobody", iterations=2)

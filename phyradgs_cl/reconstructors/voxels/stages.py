@@ -1,7 +1,7 @@
 """A run of several stages, each a run of its own that starts from the volume of the one before."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,11 +42,11 @@ class _Way:
     index: int = 0
     iterations: int = 0
     seconds: float = 0.0
-    record: list[dict[str, float]] | None = None
+    record: list[dict[str, float]] = field(default_factory=list)
 
     def state(self, own: State) -> State:
         """The state of the present stage as the whole run's."""
-        history = history_arrays(self.record or [], self.seconds)
+        history = history_arrays(self.record, self.seconds)
         volume = {} if self.index == 0 or self.volume is None else {_VOLUME: self.volume}
         return {**own, **volume, **{_HISTORY[name]: a for name, a in history.items()}, _STAGE: np.array(self.index)}
 
@@ -70,7 +70,7 @@ def run_stages(
 
     The result is the last stage's; iterations, seconds and the record are of all, facts has ``stages``: those of each.
     """
-    way, facts = _Way(initial, record=[]), {}
+    way, facts = _Way(initial), {}
     own = None if resume is None else way.restore(resume, stages, grid)
     total = sum(stage.iterations for stage in stages)
     while True:
@@ -81,7 +81,7 @@ def run_stages(
         volume = stage.shown(result.volume, way.volume)
         at, state = result.facts["interrupted_at"], result.state
         state = None if state is None else way.state(state)
-        way.record = _later(way.record or [], result.record, way.iterations)
+        way.record = _later(way.record, result.record, way.iterations)
         way.seconds += result.facts["seconds"]
         if at is not None or way.index == len(stages) - 1:
             break
