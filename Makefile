@@ -156,7 +156,7 @@ gpu: $(VENV)/.installed-test
 	$(BIN)/python benchmarks/gpu.py --device $(DEVICE) $(QUICK) --json results/gpu.json --table results/gpu.md
 
 test-neural: $(VENV)-neural/.installed
-	$(call tested,$(VENV)-neural,tests/neural)
+	$(call tested,$(VENV)-neural,tests/neural tests/api tests/test_examples.py)
 
 test-browser: export PHYRADGS_PICTURES = $(abspath $(VENV)-browser/pictures)
 test-browser: $(VENV)-browser/.installed
