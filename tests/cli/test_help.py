@@ -7,6 +7,9 @@ import sys
 import pytest
 import typer
 
+from phyradgs_cl.acquisition import MOTIONS
+from phyradgs_cl.phantoms import PHANTOMS
+
 PROGRAM = "import sys; sys.argv[0] = 'phyradgs'; from phyradgs_cl.__main__ import main; sys.exit(main())"
 
 
@@ -49,6 +52,8 @@ def test_the_tab_key_in_bash() -> None:
         "phyradgs re": {"reconstruct", "report"},
         "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
         "phyradgs check --fi": {"--fix-offset"},
+        "phyradgs reconstruct s.h5 --motion ": {*MOTIONS},
+        "phyradgs simulate --phantom ": {*PHANTOMS},
     }.items():
         asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
         command = [sys.executable, "-c", PROGRAM]
