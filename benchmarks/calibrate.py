@@ -3,7 +3,7 @@
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
     python benchmarks/calibrate.py --table RESULTS.jsonl
 
-FOLDER holds volumes as `python benchmarks/tables` takes them. Scans are R2-Gaussian's scanner with TIGRE's noise, detectors twice as
+FOLDER holds volumes as benchmarks/tables takes them. Scans are R2-Gaussian's scanner with TIGRE's noise, detectors twice as
 wide as the volume; the volume is fista-tv's, every line at its own times. Cases:
 
     panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once

@@ -18,7 +18,7 @@ RAPID = PROTOCOLS["rapid"]
 def make_scan(
     rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0
 ) -> Scan:
-    """The scan of a volume file as `python benchmarks/tables` makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
+    """The scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
 
     ``size`` counts the reference's voxels per side, half the detector's pixels; ``away`` multiplies the distances of source
     and detector, which leaves the magnification.
@@ -30,7 +30,7 @@ def make_scan(
 
 
 def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
-    """Volumes as `python benchmarks/tables` finds them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
+    """Volumes as benchmarks/tables finds them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
     return find_volumes(Path(folder), names.split(",") if names else None, size)
 
 
