@@ -30,7 +30,7 @@ def make_scan(
 
 
 def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
-    """Volumes as benchmarks/tables finds them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
+    """Volumes as benchmarks/tables has them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
     return find_volumes(Path(folder), names.split(",") if names else None, size)
 
 
