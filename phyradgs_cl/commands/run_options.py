@@ -24,7 +24,7 @@ _MOTION = (
     "every line at its own times (per-row), or splats that move while lines integrate (exact); "
     "not every method has all of them."
 )
-_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2); the window of fdk."
+_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2, naf, sax-nerf); the window of fdk."
 _CONFIG = (
     "TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
     "the command line wins."
