@@ -1,4 +1,4 @@
-# make demo    simulate a fly-scan, reconstruct it three ways, print a table (minutes on two cores)
+# make demo    simulate a fly-scan, reconstruct it four ways, print a table (minutes on two cores)
 # make test    style, types, every kernel, a bit of everything else: minutes; a skipped kernel test is a failure
 # make test-all   the same and then all other tests: a quarter of an hour
 # make docs     the documentation as a site, in site/
@@ -13,7 +13,7 @@
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
 # make gpu     what a GPU says: tests on it, trust, speed; results in results/gpu.json (ten minutes; DEVICE=..., QUICK=--quick)
 # make test-gpu-build every kernel compiled for NVIDIA, AMD and Intel: registers, spills (Debian, x86-64 Linux; another 500 MB)
-# make clean   remove what the two have made
+# make clean   remove the environments, the demo and what was built
 #
 # Needs python3 >= 3.10 with the module venv; nothing else has to be installed.
 

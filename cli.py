@@ -27,7 +27,7 @@ COMMANDS = {
     "report": ("report", "Write one HTML page about a reconstruction."),
     "view": ("view", "Look at a volume in napari."),
     "export": ("export_volume", "Write a volume for 3D Slicer, ImageJ, napari and others."),
-    "bench": ("bench", "Compare methods on volumes."),
+    "bench": ("bench", "Compare methods on two built-in phantoms."),
     "sweep": ("sweep", "Reconstruct many scans with many settings."),
     "watch": ("watch", "Reconstruct the scans of a folder as they arrive."),
     "info": ("info", "Say what a scan or volume file holds."),

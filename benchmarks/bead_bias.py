@@ -84,7 +84,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("results", type=Path, help="JSON lines; runs that it holds are not made again")
-    parser.add_argument("--size", default="S", help="of phyradgs bench")
+    parser.add_argument("--size", default="S", help="of benchmarks/tables")
     parser.add_argument("--trials", default="", help="beginnings of their names, with commas; all without it")
     parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     parser.add_argument("--device")

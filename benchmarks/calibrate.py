@@ -3,7 +3,7 @@
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
     python benchmarks/calibrate.py --table RESULTS.jsonl
 
-FOLDER holds volumes as `phyradgs bench` takes them. Scans are R2-Gaussian's scanner with TIGRE's noise, detectors twice as
+FOLDER holds volumes as benchmarks/tables takes them. Scans are R2-Gaussian's scanner with TIGRE's noise, detectors twice as
 wide as the volume; the volume is fista-tv's, every line at its own times. Cases:
 
     panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once
@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scans import append, files_of, read_lines
+from scans import append, chosen, files_of, lines_of, read_lines
 from tables.case import FLY, SyntheticCase
 
 from phyradgs_cl import __version__
@@ -209,7 +209,7 @@ def score(rt: Runtime, scan: Scan) -> float:
 
 def table(path: Path) -> str:
     """Markdown: a row per case, size, views and parameter."""
-    lines = read_lines(path)
+    lines = lines_of(path)
     text = [
         "| case | volume³, views | parameter | truth | error: mean, worst | σ stated | largest error/σ | within 2 σ "
         "| verdicts | runs |",
@@ -269,12 +269,15 @@ def main() -> None:
     if arguments.table:
         print(table(arguments.folder))
         return
+    if arguments.results is None:
+        parser.error("the results file is missing")
+    cases, volumes = chosen("--cases", arguments.cases, CASES), files_of(arguments.folder, arguments.only, arguments.size)
     rt = Runtime(arguments.device)
     key = ("case", "volume", "size", "views", "seed")
     done = {tuple(run[k] for k in key) for run in read_lines(arguments.results)}
     for seed in range(arguments.seeds):
-        for case in arguments.cases.split(","):
-            for name, path in files_of(arguments.folder, arguments.only, arguments.size).items():
+        for case in cases:
+            for name, path in volumes.items():
                 what = (case, name, arguments.size, arguments.views, seed)
                 if what not in done:
                     result = run_one(rt, CASES[case](maker(rt, path, arguments.size, arguments.views), seed))

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scans import append, read_lines
+from scans import append, lines_of, read_lines
 
 from phyradgs_cl import __version__
 from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, CountReader, check
@@ -26,7 +26,7 @@ FACTS = ("file", "group", "kind", "object", "planted", "right", "undecidable")
 def run_all(folder: Path, results: Path, only: list[str], device: str | None) -> None:
     rt = Runtime(device)
     done = {line["file"] for line in read_lines(results)}
-    for scan in read_lines(folder / "manifest.jsonl"):
+    for scan in lines_of(folder / "manifest.jsonl"):
         name = str(scan["file"])
         if name not in done and any(part in name for part in only):
             append(results, {key: scan[key] for key in FACTS} | run_one(rt, folder / name))
@@ -79,7 +79,7 @@ def words(line: dict[str, Any]) -> str:
 
 def table(path: Path) -> str:
     """Markdown: one row per scan and the sums."""
-    lines = read_lines(path)
+    lines = lines_of(path)
     text = ["| planted | object | answer | in words |", "| --- | --- | --- | --- |"]
     sums: dict[tuple[str, str], int] = {}
     for line in sorted(lines, key=lambda line: line["group"] == "good"):
@@ -103,6 +103,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.table:
         print(table(arguments.folder))
+    elif arguments.results is None:
+        parser.error("the results file is missing")
     else:
         run_all(arguments.folder, arguments.results, arguments.only.split(","), arguments.device)
 

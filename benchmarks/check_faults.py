@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scans import RAPID, append, files_of, make_scan, read_lines
+from scans import RAPID, append, chosen, files_of, lines_of, make_scan, read_lines
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Protocol, Scan, make_protocol
@@ -96,14 +96,14 @@ FAULTS: dict[str, tuple[Plant, Protocol, float, tuple[str, ...], str]] = {
 
 
 def run_all(arguments: argparse.Namespace) -> None:
-    rt = Runtime(arguments.device)
-    results = Path(arguments.results)
     volumes = files_of(arguments.volumes, arguments.names, arguments.size)
+    faults, results = chosen("--faults", arguments.faults, FAULTS), Path(arguments.results)
+    rt = Runtime(arguments.device)
     done = {key_of(line) for line in read_lines(results)}
     for seed in (int(s) for s in arguments.seeds.split(",")):
         for name, path in volumes.items():
             scans: dict[tuple[Protocol, float], Scan] = {}
-            for fault in arguments.faults.split(","):
+            for fault in faults:
                 facts = {"volume": name, "fault": fault, "size": arguments.size, "seed": seed}
                 if key_of(facts) in done:
                     continue
@@ -134,7 +134,7 @@ def key_of(line: dict[str, object]) -> tuple[object, ...]:
 
 def table(path: Path) -> str:
     """Markdown: a row for each planted fault, then every scan that was answered wrong."""
-    lines = read_lines(path)
+    lines = lines_of(path)
     text = [
         "| planted | scans | answered rightly | not | other questions suspicious |",
         "| --- | --- | --- | --- | --- |",
@@ -194,6 +194,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.table:
         print(table(Path(arguments.volumes)))
+    elif arguments.results is None:
+        parser.error("the results file is missing")
     else:
         run_all(arguments)
 

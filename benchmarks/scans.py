@@ -1,12 +1,14 @@
 """What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of one line of JSON per run."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 from tables.case import FLY, SyntheticCase
 from tables.volumes import find_volumes
 
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Protocol, Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.runtime import Runtime
@@ -18,7 +20,7 @@ RAPID = PROTOCOLS["rapid"]
 def make_scan(
     rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0
 ) -> Scan:
-    """The scan of a volume file as `phyradgs bench` makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
+    """The scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
 
     ``size`` counts the reference's voxels per side, half the detector's pixels; ``away`` multiplies the distances of source
     and detector, which leaves the magnification.
@@ -30,8 +32,26 @@ def make_scan(
 
 
 def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
-    """Volumes as `phyradgs bench` finds them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
-    return find_volumes(Path(folder), names.split(",") if names else None, size)
+    """Volumes as benchmarks/tables has them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
+    try:
+        return find_volumes(Path(folder), names.split(",") if names else None, size)
+    except InputError as error:
+        raise SystemExit(str(error)) from None
+
+
+def chosen(option: str, names: str, known: Iterable[str]) -> list[str]:
+    """The ``names`` of an option, with commas between; the script ends where one of them is not ``known``."""
+    asked = names.split(",")
+    if unknown := set(asked) - set(known):
+        raise SystemExit(f"{option}: found {', '.join(sorted(unknown))}; expected some of {', '.join(known)}")
+    return asked
+
+
+def lines_of(path: Path) -> list[dict[str, object]]:
+    """``read_lines`` of a file that has to be there: the script ends where it is not."""
+    if not path.is_file():
+        raise SystemExit(f"{path}: found no such file; expected JSON lines; check the path")
+    return read_lines(path)
 
 
 def read_lines(path: Path) -> list[dict[str, object]]:

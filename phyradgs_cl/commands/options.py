@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.commands.files import file_argument, file_option, option
-from phyradgs_cl.prepare import STEPS
+from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import numbers, pair_parser
 
@@ -28,6 +28,7 @@ _MEMORY = (
 Memory = Annotated[str | None, option(_MEMORY, "what the device has", metavar="SIZE")]
 
 _STEPS = f"What to undo in the frames first, of {', '.join(STEPS)} (docs: prepare.md)."
+STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 
 # where many runs are made

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
-from phyradgs_cl.commands.options import Device, Memory, Output, Scan, Steps
+from phyradgs_cl.commands.options import STEPS_OF_PREPARE, Device, Memory, Output, Scan
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
@@ -22,7 +22,7 @@ _SET = "Any option of a step, as --set rings.window=11. Docs: prepare.md."
 def prepare_command(
     scan: Scan,
     output: Output,
-    steps: Steps = None,
+    steps: Annotated[str | None, STEPS_OF_PREPARE] = None,
     config: Annotated[Path | None, file_option(_CONFIG, "--config")] = None,
     assignments: Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")] = None,
     ignore_lag: Annotated[bool, option("Leave the lag that the scan file states.", True, "--ignore-lag")] = False,

@@ -21,7 +21,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import profile_report, run_reconstruction
 
 EXAMPLE = (
-    "Example: phyradgs reconstruct scan.h5 -o volume.h5 --iterations 2000\n\n"
+    "Example: phyradgs reconstruct scan.h5 -o volume.h5 --method phyradgs --iterations 2000\n\n"
     "Ctrl-C keeps what there is, here as volume.partial.h5, and a checkpoint; --resume goes on from it."
 )
 _CHECKPOINT = "Keep a checkpoint beside the output so often, for --resume after a kill; 0: on Ctrl-C only."

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
+from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.commands import options
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
@@ -23,7 +24,7 @@ _MOTION = (
     "every line at its own times (per-row), or splats that move while lines integrate (exact); "
     "not every method has all of them."
 )
-_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2); the window of fdk."
+_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2, naf, sax-nerf); the window of fdk."
 _CONFIG = (
     "TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
     "the command line wins."
@@ -42,7 +43,7 @@ def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
 RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
     "motion": _asked(
-        Literal["static", "static-start", "micro-views", "per-row", "exact"],
+        Literal[MOTIONS],
         _MOTION,
         "each line at its own times for fista, phyradgs and fused; else static",
     ),

@@ -37,10 +37,10 @@ def _from_voxels(name: str, draw: Callable[[int, int], NDArray[np.float32]]) -> 
 
 
 PHANTOMS: dict[str, Factory] = {
-    "shepp-logan": lambda half_size_mm, resolution, seed: shepp_logan(half_size_mm),
-    "spheres": lambda half_size_mm, resolution, seed: sphere_phantom(half_size_mm),
     "foot": _from_voxels("foot", foot),
     "jaw": _from_voxels("jaw", jaw),
+    "shepp-logan": lambda half_size_mm, resolution, seed: shepp_logan(half_size_mm),
+    "spheres": lambda half_size_mm, resolution, seed: sphere_phantom(half_size_mm),
 }
 
 

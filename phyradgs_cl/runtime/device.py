@@ -109,7 +109,7 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
         matching = [d for d in devices if wish.lower() in f"{d.platform} {d.name}".lower()]
     if not matching:
         known = "; ".join(f"{d.index}: {d.name} ({d.platform})" for d in devices)
-        raise NoSuchDeviceError(source, repr(wish), f"an index, cpu, gpu or part of a name: {known}")
+        raise NoSuchDeviceError(source, f"{wish!r}, which fits no device", f"an index or part of a name of {known}")
     return max(matching, key=lambda d: d.rank), f"asked for by {source}={wish}"
 
 

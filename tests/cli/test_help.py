@@ -7,6 +7,10 @@ import sys
 import pytest
 import typer
 
+from phyradgs_cl.acquisition import MOTIONS
+from phyradgs_cl.phantoms import PHANTOMS
+from phyradgs_cl.prepare import DEFAULT_STEPS
+
 PROGRAM = "import sys; sys.argv[0] = 'phyradgs'; from phyradgs_cl.__main__ import main; sys.exit(main())"
 
 
@@ -44,11 +48,20 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
         assert "--batch" in at_the_end and "--batch" not in usual and "--help" in usual
 
 
+def test_a_default_is_that_of_the_command(told) -> None:
+    """`prepare` has steps that nobody asked for, `reconstruct` has none."""
+    for name, default in {"prepare": DEFAULT_STEPS, "reconstruct": "none"}.items():
+        steps = told(name, "-h").split("--steps ")[1].split(" --")[0]
+        assert f"[default: ({default})]" in " ".join(steps.split()), steps
+
+
 def test_the_tab_key_in_bash() -> None:
     for words, expected in {
         "phyradgs re": {"reconstruct", "report"},
         "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
         "phyradgs check --fi": {"--fix-offset"},
+        "phyradgs reconstruct s.h5 --motion ": {*MOTIONS},
+        "phyradgs simulate --phantom ": {*PHANTOMS},
     }.items():
         asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
         command = [sys.executable, "-c", PROGRAM]

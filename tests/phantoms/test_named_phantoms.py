@@ -96,7 +96,7 @@ def test_registry_makes_every_phantom_with_its_kind() -> None:
 
 
 def test_unknown_names_and_sizes_are_refused() -> None:
-    named = "'hand'; expected one of 'shepp-logan', 'spheres', 'foot', 'jaw'"
+    named = "'hand'; expected one of 'foot', 'jaw', 'shepp-logan', 'spheres'"
     assert_refused({
         named: lambda: make_phantom("hand", 1.0), "half_size_mm": lambda: make_phantom("foot", -1.0),
         "resolution": lambda: make_phantom("foot", 1.0, 0), "variant": lambda: shepp_logan(1.0, "tofu"),
