@@ -88,6 +88,7 @@ def fly(
 
 
 GOOD = fly()
+BACKWARDS = replace(GOOD, trajectory=PoseTable([0.0, 9.0], EXCHANGED))
 FLAT = np.zeros((11, 2))
 
 
@@ -216,7 +217,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: PoseTable([0.0, 1.0], POSES), "pose table: found shapes"),
         (lambda: PoseTable([0.0, 1.0], np.zeros((2, 12))), "pose table: found parallel pixel steps"),
         (
-            lambda: reconstruct(replace(GOOD, trajectory=PoseTable([0.0, 9.0], EXCHANGED)), "fdk"),
+            lambda: reconstruct(BACKWARDS, "fdk"),
             "pose table: found the grid behind the panel in every frame; .*axis and panel exchanged",
         ),
     ],
@@ -262,6 +263,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "calibrate": [
         (lambda: api.calibrate("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
         (lambda: api.calibrate(GOOD, "rol"), "rol"),
+        (lambda: api.calibrate(BACKWARDS), "pose table: found the grid behind the panel"),
         (lambda: api.calibrate(GOOD), "4 frames|12 columns|8 frames|columns"),
     ],
     "prepare": [
