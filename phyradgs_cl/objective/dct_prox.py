@@ -41,7 +41,8 @@ class DctProx:
     ) -> SameArray:
         """The map of a volume (z, y, x), float32; ``threshold`` in its unit, of coefficients of the orthonormal transform.
 
-        ``turn``, 0 to 3: which quarter of the shifts. A device array gives a device array, ``out`` if there is one, and nothing crosses the bus.
+        ``turn``, 0 to 3: which quarter of the shifts. A device array gives a device array, ``out`` if there is one, and
+        nothing crosses the bus.
         """
         is_there = isinstance(volume, DeviceArray)
         observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
