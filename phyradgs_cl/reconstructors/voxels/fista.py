@@ -37,8 +37,9 @@ from phyradgs_cl.runtime import Runtime
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time
-# of the passes, the result and the prior's weight: what is the smaller voxels' (docs/results/settings.md)
-_FINE_PASSES, _FINE_SHARE, _FINE_WEIGHT = 3 / 7, np.float32(2 / 3), 2 / 3
+_FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
+# of the weight at half the side, as neighbours differ less: of 64³ and 128³ from 128² pixels, and of 128³ from 256²
+_HALF_SIDE, _SIDE = 2 / 3, 64
 
 
 @dataclass(frozen=True)
@@ -106,8 +107,7 @@ def fista_stages(
     def parted(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
         assert before is not None
         grid = finer(scan.grid, parts)
-        weight = _FINE_WEIGHT * options.prior_weight
-        small = replace(options, iterations=options.iterations - first, prior_weight=weight)
+        small = replace(options, iterations=options.iterations - first)
         fine = replace(scan, grid=grid, reference=None)
         return _run(fine, small, rt, report, resume, repeated(before, parts), repeated(image, parts))
 
@@ -175,7 +175,7 @@ class Fista:
     """The residual that is reported is the pass's own: of every subset just before its step.
 
     The weight of the prior is ``prior_weight`` · σ √(h max Aᵀ1): the noise σ of a pixel, back in a voxel of side h as the
-    gradient has it, times 1/mm.
+    gradient has it, times 1/mm; on a grid of 64³, and 2/3 of it for every halving of the side.
     """
 
     def __init__(
@@ -191,7 +191,9 @@ class Fista:
         # AᵀA has no negative entry: its largest row sum bounds its norm
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         largest = space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
-        self.weight = options.prior_weight * max(noise * (voxel_mm * columns) ** 0.5, _FEWEST * largest)
+        halvings = math.log2(math.prod(system.volume_shape) ** (1 / 3) / _SIDE)
+        strength = options.prior_weight * _HALF_SIDE**halvings
+        self.weight = strength * max(noise * (voxel_mm * columns) ** 0.5, _FEWEST * largest)
         size = options.frames_per_subset or system.frames
         self.subsets = self._subsets(max(1, round(system.frames / size)))
 
