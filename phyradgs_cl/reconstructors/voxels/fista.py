@@ -40,6 +40,7 @@ _VOLUMES, _FRAMES = 16, 3  # held at one time
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
 # of the weight at half the side, as neighbours differ less: of 64³ and 128³ from 128² pixels, and of 128³ from 256²
 _HALF_SIDE, _SIDE = 2 / 3, 64
+_MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time for: of 64³ they are, of 128³ not
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class FistaOptions(IterativeOptions):
     a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the total variation
     from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
-    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 where the device has room for them, else 1.
+    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 for grids of at most 90³ where the device has room, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
@@ -98,7 +99,8 @@ def fista_stages(
     scan: Scan, options: FistaOptions, rt: Runtime, image: np.ndarray | None = None
 ) -> list[Stage]:
     """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels; ``image``: of piccs."""
-    parts = options.subvoxels or (2 if _has_room(scan.grid, 2, rt) else 1)
+    is_small = math.prod(scan.grid.shape) <= _MOST_PARTED
+    parts = options.subvoxels or (2 if is_small and _has_room(scan.grid, 2, rt) else 1)
     first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
