@@ -1,0 +1,229 @@
+"""Frames of a phantom of known shape at one coarseness: what is left to find is how it lies, how dense it is, a background."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
+from phyradgs_cl.check.coarse import binned, fewer_frames
+from phyradgs_cl.check.questions.timing import exposure_arc_rad
+from phyradgs_cl.detector import intensity_average
+from phyradgs_cl.phantoms import EllipsoidPhantom
+
+MOST_FRAMES = 60
+_LEAST_SAMPLES, _MOST_SAMPLES = 4, 24  # of an exposure; the phantom's edge moves by a pixel between two
+_PIXEL_SAMPLES = 2  # along each side: sharp edges within a pixel
+_SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
+_BACKGROUND = 4  # cosines along each side of a frame that tell no bead: a holder, scatter, drift of the tube
+_STEP_PX = 0.25
+_MOST_PX = 1.5  # that a step of the placement moves a frame by
+DENSITY = 6  # of a placement's numbers, the last
+
+
+@dataclass(frozen=True, eq=False)
+class BeadOperator:
+    """Frames (F, rows, columns) of a phantom where ``tables`` say that its lines look, ``model`` being the detector's."""
+
+    phantom: EllipsoidPhantom
+    tables: Sequence[TimeCells]
+    shape: tuple[int, int]
+    model: str
+
+    def forward(self, placement: np.ndarray) -> np.ndarray:
+        """Line integrals of the phantom turned (rotation vector, rad), shifted (mm) and of a density: seven numbers (7,)."""
+        pose, weight = _by_line(self.tables)
+        frames, lines, samples = weight.shape
+        turn = Rotation.from_rotvec(placement[:3]).as_matrix()
+        places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
+        is_rows = self.tables[0].axis == "rows"
+        seen = _Lines(
+            source=places[:, 0] @ turn,
+            first=places[:, 1] @ turn,
+            line_step=steps[:, int(is_rows)] @ turn,
+            pixel_step=steps[:, 1 - int(is_rows)] @ turn,
+            line=np.tile(np.repeat(np.arange(lines), samples), frames),
+            pixels=self.shape[1] if is_rows else self.shape[0],
+        )
+        p = placement[DENSITY] * seen.integrals(self.phantom).reshape(frames, lines, samples, -1)
+        parts = np.moveaxis(p, 2, 0), np.moveaxis(weight, 2, 0)[..., None]
+        found = sum(w * q for q, w in zip(*parts, strict=True)) if self.model == "log" else intensity_average(*parts)[0]
+        return np.ascontiguousarray(found if is_rows else found.swapaxes(1, 2), np.float32)
+
+
+def _by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]:
+    """(poses (F · lines · S, 4, 3), weights (F, lines, S)) of every line of every frame, at as many times each."""
+    poses, weights = [], []
+    for table in tables:
+        counts = table.line_stop - table.line_start
+        cell = np.repeat(np.arange(table.count), counts)
+        line = table.line_start[cell] + np.arange(cell.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        cell = cell[np.argsort(line, kind="stable")]
+        poses.append(table.pose[cell].reshape(-1, 4, 3))
+        weights.append(table.weight[cell].reshape(table.lines, -1))
+    return np.concatenate(poses), np.stack(weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Lines of a panel as the phantom sees them, each at one time: source and middle of the panel's first pixel (N, 3), steps
+    to the next line and to the next pixel in it, mm; which ``line`` (N,) it is, of ``pixels`` each."""
+
+    source: np.ndarray
+    first: np.ndarray
+    line_step: np.ndarray
+    pixel_step: np.ndarray
+    line: np.ndarray
+    pixels: int
+
+    def integrals(self, phantom: EllipsoidPhantom) -> np.ndarray:
+        """Line integrals (N, pixels), float32, of rays to the pixels' areas."""
+        total = np.zeros((len(self.line), self.pixels), np.float32)
+        offsets = (np.arange(_PIXEL_SAMPLES) + 0.5) / _PIXEL_SAMPLES - 0.5
+        for body in phantom.ellipsoids:
+            chosen, start, width = self._shadow(np.array(body.ends_mm), body.reach_mm)
+            if chosen.size == 0:
+                continue
+            pixel = start[:, None] + np.arange(width)
+            source = self.source[chosen][:, None]
+            line_mm = self.line[chosen, None] * self.line_step[chosen]
+            to_pixel = (self.first[chosen] + line_mm)[:, None] + pixel[..., None] * self.pixel_step[chosen][:, None] - source
+            for across in offsets:
+                for along in offsets:
+                    step = to_pixel + (across * self.line_step[chosen] + along * self.pixel_step[chosen])[:, None]
+                    flat = step.reshape(-1, 3)
+                    part = body.chord_fraction(np.broadcast_to(source, step.shape).reshape(-1, 3), flat)
+                    value = body.attenuation_per_mm * part * np.sqrt(np.einsum("ij,ij->i", flat, flat))
+                    total[chosen[:, None], pixel] += value.reshape(pixel.shape) / _PIXEL_SAMPLES**2
+        return total
+
+    def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
+        """(which lines (n,) may see a body, from which pixel on (n,), how many pixels)."""
+        normal = np.cross(self.line_step, self.pixel_step)
+        pitch_mm = [np.linalg.norm(step, axis=-1) for step in (self.line_step, self.pixel_step)]
+        lowest, highest = [], []
+        for end_mm in ends_mm:
+            away = end_mm - self.source
+            stretch = np.sum(normal * (self.first - self.source), -1) / np.sum(normal * away, -1)
+            hit = self.source + stretch[:, None] * away - self.first
+            at = [np.sum(hit * s, -1) / p**2 for s, p in zip((self.line_step, self.pixel_step), pitch_mm, strict=True)]
+            reach = [_SLACK * reach_mm * np.abs(stretch) / p + 1 for p in pitch_mm]
+            lowest.append([a - r for a, r in zip(at, reach, strict=True)])
+            highest.append([a + r for a, r in zip(at, reach, strict=True)])
+        (line_from, pixel_from), (line_to, pixel_to) = np.min(lowest, 0), np.max(highest, 0)
+        in_line = (self.line >= line_from) & (self.line <= line_to)
+        chosen = np.flatnonzero(in_line & (pixel_to >= 0) & (pixel_from <= self.pixels - 1))
+        first = np.clip(np.floor(pixel_from[chosen]), 0, self.pixels - 1).astype(int)
+        last = np.clip(np.ceil(pixel_to[chosen]), 0, self.pixels - 1).astype(int)
+        width = int((last - first).max(initial=0)) + 1
+        return chosen, np.minimum(first, self.pixels - width), width
+
+
+@dataclass(frozen=True, eq=False)
+class BeadLevel:
+    """As ``Level``, of a phantom that lies about as ``start`` (7,) says: ``measured`` (F, rows, columns) are frames in blocks."""
+
+    scans: Sequence[Scan]
+    block: int
+    measured: np.ndarray
+    valid: np.ndarray | None
+    phantom: EllipsoidPhantom
+    start: np.ndarray
+
+    @classmethod
+    def of(cls, scans: Sequence[Scan], columns: int, phantom: EllipsoidPhantom, start: np.ndarray) -> "BeadLevel":
+        """Blocks such that the longer side has at most ``columns`` of them."""
+        block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
+        fewer = [fewer_frames(scan, MOST_FRAMES) for scan in scans]
+        small = [binned(scan, block) for scan in fewer]
+        measured = np.concatenate([np.asarray(scan.projections, np.float32) for scan in small])
+        valid = np.concatenate([scan.valid for scan in small])
+        bare = [replace(s, projections=np.broadcast_to(np.float32(0), s.projections.shape)) for s in fewer]
+        return cls(bare, block, measured, None if valid.all() else valid, phantom, start)
+
+    def operator(self, change: Change, views: Views | Sway | None = None) -> BeadOperator:
+        """The frames of the phantom after a change."""
+        tables: list[TimeCells] = []
+        for scan in self.scans:
+            small = binned(moved(scan, change, views), self.block)
+            edge_px = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification / min(small.geometry.pixel_size_mm)
+            times = int(np.clip(math.ceil(exposure_arc_rad(scan) * edge_px), _LEAST_SAMPLES, _MOST_SAMPLES))
+            tables += [PerRow(times).cells(small, frame) for frame in range(small.frames)]
+        return BeadOperator(self.phantom, tables, small.geometry.detector_shape, self.scans[0].detector_model)
+
+    def masked(self, frames: np.ndarray) -> np.ndarray:
+        return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
+
+    def residual(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
+        """What the phantom, and a smooth background, leave of the frames."""
+        return self._without_background(self.measured - operator.forward(placement))
+
+    def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
+        """The placement (7,) that fits best, from ``start`` on, by Gauss–Newton."""
+        placement = self.start if start is None else start
+        for _ in range(iterations):
+            signals = self._signals(operator, placement)
+            unit = np.array([signal.ravel() for signal in signals], np.float64)
+            step = np.linalg.lstsq(unit.T, self.residual(operator, placement).ravel(), rcond=None)[0]
+            step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
+            placement = placement + step * self._units()
+            if np.abs(step).max() < 1e-3:
+                break
+        return placement
+
+    def off_range(
+        self, operator: BeadOperator, placement: np.ndarray, images: Sequence[np.ndarray], iterations: int
+    ) -> list[np.ndarray]:
+        """What of each image (F, rows, columns) the phantom lying a little elsewhere, or denser, does not explain."""
+        signals = np.array([one.ravel() for one in self._signals(operator, placement)], np.float64)
+        basis, _ = np.linalg.qr(signals.T)
+        left = []
+        for image in images:
+            flat = self._without_background(image).ravel().astype(np.float64)
+            flat -= basis @ (basis.T @ flat)
+            left.append(flat.reshape(image.shape))
+        return left
+
+    def _units(self) -> np.ndarray:
+        """What of each number (7,) of a placement moves a frame by a pixel at its edge, or makes it ten times as dense."""
+        scan = self.scans[0]
+        pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
+        return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
+
+    def _signals(self, operator: BeadOperator, placement: np.ndarray) -> list[np.ndarray]:
+        """Change of the frames by a unit of each number."""
+        found = []
+        for number, unit in enumerate(self._units()):
+            if number == DENSITY:
+                step = np.eye(DENSITY + 1)[number] * placement
+                found.append(self._without_background(operator.forward(placement) / np.float32(step[number])))
+                continue
+            step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit
+            ends = [operator.forward(placement + sign * step) for sign in (1, -1)]
+            found.append(self._without_background((ends[0] - ends[1]) / np.float32(2 * _STEP_PX)))
+        return found
+
+    def _without_background(self, frames: np.ndarray) -> np.ndarray:
+        """Frames without what a few cosines along each side explain."""
+        rows, columns = (_cosines(count) for count in frames.shape[1:])
+        if self.valid is None:
+            inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
+            return (frames - np.einsum("vi,fij,uj->fvu", rows, inner, columns)).astype(np.float32)
+        found = np.zeros(frames.shape, np.float32)
+        cosines = np.einsum("vi,uj->vuij", rows, columns).reshape(-1, _BACKGROUND**2)
+        for into, frame, valid in zip(found, frames, self.valid, strict=True):
+            some = cosines[valid.ravel()]
+            into[valid] = frame[valid] - some @ np.linalg.lstsq(some, frame[valid], rcond=None)[0]
+        return found
+
+
+def _cosines(count: int) -> np.ndarray:
+    """The slowest cosines (count, n) along a side, orthonormal."""
+    order = np.arange(min(_BACKGROUND, count))
+    waves = np.cos(np.pi * order * (np.arange(count)[:, None] + 0.5) / count)
+    found: np.ndarray = waves / np.linalg.norm(waves, axis=0)
+    return found
