@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.calibrate.level import MOST_FRAMES
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.check.coarse import binned, fewer_frames
 from phyradgs_cl.check.questions.timing import exposure_arc_rad
 from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-MOST_FRAMES = 60
 _LEAST_SAMPLES, _MOST_SAMPLES = 4, 24  # of an exposure; the phantom's edge moves by a pixel between two
 _PIXEL_SAMPLES = 2  # along each side: sharp edges within a pixel
 _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
@@ -135,10 +135,12 @@ class BeadLevel:
     start: np.ndarray
 
     @classmethod
-    def of(cls, scans: Sequence[Scan], columns: int, phantom: EllipsoidPhantom, start: np.ndarray) -> "BeadLevel":
+    def of(
+        cls, scans: Sequence[Scan], phantom: EllipsoidPhantom, start: np.ndarray, columns: int, most_frames: int = MOST_FRAMES
+    ) -> "BeadLevel":
         """Blocks such that the longer side has at most ``columns`` of them."""
         block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
-        fewer = [fewer_frames(scan, MOST_FRAMES) for scan in scans]
+        fewer = [fewer_frames(scan, most_frames) for scan in scans]
         small = [binned(scan, block) for scan in fewer]
         measured = np.concatenate([np.asarray(scan.projections, np.float32) for scan in small])
         valid = np.concatenate([scan.valid for scan in small])

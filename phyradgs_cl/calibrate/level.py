@@ -87,8 +87,17 @@ class Level:
             method.step()
         return method.volume
 
-    def off_range(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
-        """What of ``frames`` no volume explains, as far as CGLS gets in ``iterations``."""
+    def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """What a volume leaves of the frames (F, rows, columns)."""
+        return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))
+
+    def off_range(
+        self, operator: RayOperator, volume: np.ndarray, images: Sequence[np.ndarray], iterations: int
+    ) -> list[np.ndarray]:
+        """What of each image (F, rows, columns) no volume, be it this one or another, explains, as far as CGLS gets."""
+        return [self._off_range(operator, image, iterations) for image in images]
+
+    def _off_range(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
         method = Cgls(System(operator, self.masked(frames), self.valid))
         for _ in range(iterations):
             if method.finished:

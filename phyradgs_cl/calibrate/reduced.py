@@ -5,10 +5,12 @@ Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in K
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
 
+from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
 from phyradgs_cl.detector import noise_level
@@ -79,24 +81,23 @@ class Reduced:
 
 
 def reduced(
-    level: Level,
+    level: Level | BeadLevel,
     parameters: Sequence[Parameter],
     at: Mapping[str, float],
     volume: np.ndarray,
     iterations: int,
 ) -> Reduced:
     """The signals of ``parameters`` about the values ``at`` (by name), for the object ``volume``, by central differences."""
-    operator = level.operator(change_of(at))
-    expected = operator.forward(volume)
+    # What a level's operator takes is what it reconstructed.
+    operator: Any = level.operator(change_of(at))
     signals = [_signal(level, one, at, volume) for one in parameters]
-    left = [level.off_range(operator, signal, iterations).ravel() for signal in signals]
+    images = [*signals, level.residual(operator, volume)]
+    *left, beyond = level.off_range(operator, volume, images, iterations)
     sizes = np.array([max(float(np.linalg.norm(signal)), 1e-30) for signal in signals])
     unit = np.array([signal.ravel() / size for signal, size in zip(signals, sizes, strict=True)], np.float64)
-    residual = level.line_integrals(operator, volume) - level.masked(expected)
-    beyond = level.off_range(operator, residual, iterations)
     return Reduced(
         names=tuple(one.name for one in parameters),
-        jacobian=np.array(left, np.float64),
+        jacobian=np.array([one.ravel() for one in left], np.float64),
         sizes=sizes,
         whole=unit @ unit.T,
         residual=beyond.ravel().astype(np.float64),
@@ -105,7 +106,7 @@ def reduced(
     )
 
 
-def _signal(level: Level, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
+def _signal(level: Level | BeadLevel, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
     """Change of the frames (F, rows, columns) by a unit of a parameter."""
     step = one.step(level.scans[0]) * (1 if one.is_timing else level.block)
     ends = []

@@ -2,20 +2,25 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
+from phyradgs_cl.calibrate.placing import bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
@@ -23,6 +28,7 @@ Report = Callable[[int, int, str], None]
 DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
+LEAST_OF_BEADS = 0.02  # of a parameter's signal, of a known shape: voxels explain nothing by accident
 _SETTLED = 0.1  # of a standard deviation
 _OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
@@ -38,6 +44,7 @@ class Stage:
     again: int
 
 
+BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 4, 0, 6, 3))
 STAGES = (Stage(24, 6, 40, 40, 15), Stage(48, 3, 20, 40, 12), Stage(96, 3, 30, 50, 15))
 
 
@@ -71,19 +78,27 @@ def calibrate(
     what: str | None = None,
     others: Sequence[Scan] = (),
     report: Report = lambda done, total, text: None,
+    phantom: EllipsoidPhantom | None = None,
 ) -> Calibration:
     """The scan with its true geometry and timing as far as its frames tell them; ``what``: parameters with commas, None the
-    usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong.
+    usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong. ``phantom``: what the
+    object is, wherever it lies.
 
-    InputError for parameters that there are not, a scan too small, or others that do not fit the first."""
-    parameters, per_view = chosen(what, scan)
+    InputError for parameters that there are not, a scan too small, others that do not fit the first, a phantom that is not
+    what frames show."""
+    parameters, per_view = chosen(what, scan, phantom is not None)
     ready = [prepared(one, InputOptions()) for one in (scan, *others)]
-    _check(ready, per_view)
+    _check(ready, per_view, phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
-    levels = [stage for k, stage in enumerate(STAGES) if k == 0 or _blocks(scan, stage) < _blocks(scan, STAGES[k - 1])]
+    stages = STAGES if phantom is None else BEAD_STAGES
+    levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
+    make = partial(Level.of, rt, ready)
+    if phantom is not None:
+        report(0, len(levels), "where the beads are")
+        make = partial(BeadLevel.of, ready, phantom, _placement(rt, ready, phantom, search))
     for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
-        level = Level.of(rt, ready, stage.columns)
+        level = make(stage.columns)
         _descend(level, stage, parameters, search)
         if not search.known:
             break
@@ -96,7 +111,7 @@ def calibrate(
         wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
         table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
-    level = Level.of(rt, ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
+    level = make(levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
     corrected = moved(scan, change, views) if kept or views is not None else scan
@@ -113,12 +128,29 @@ def _start(rt: Runtime, scan: Scan) -> dict[str, float]:
     return {"offset-u": offset.pixels * pitch_mm} if np.isfinite(offset.pixels) else {}
 
 
+def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, search: _Search) -> np.ndarray:
+    """How the phantom lies (7,), about: of the places where its beads are seen, that which explains the frames best."""
+    bead_centres_mm(phantom)
+    change = change_of(search.at)
+    first = Level.of(rt, scans, STAGES[-1].columns)
+    volume = first.reconstruct(first.operator(change), None, STAGES[-1].first)
+    stage, best = BEAD_STAGES[0], []
+    for place in placements(phantom, volume, first.grid):
+        level = BeadLevel.of(scans, phantom, np.array([*place, 1.0]), stage.columns)
+        operator = level.operator(change)
+        found = level.reconstruct(operator, None, stage.first)
+        best.append((_rms(level.residual(operator, found)), found))
+    return min(best, key=lambda one: one[0])[1]
+
+
 def _blocks(scan: Scan, stage: Stage) -> int:
     return -(-max(scan.geometry.detector_shape) // stage.columns)
 
 
-def _check(scans: Sequence[Scan], per_view: str) -> None:
+def _check(scans: Sequence[Scan], per_view: str, phantom: EllipsoidPhantom | None) -> None:
     first = scans[0]
+    if per_view and phantom is not None:
+        raise InputError(f"--what {per_view}", "with a phantom", "parameters of all views", "leave one of the two out")
     if per_view and len(scans) > 1:
         raise InputError(f"--what {per_view}", "a second scan", "one scan: views are each scan's own", "leave --with out")
     if first.frames < _FEWEST_FRAMES or first.geometry.detector_shape[1] < _FEWEST_COLUMNS:
@@ -133,17 +165,19 @@ def _check(scans: Sequence[Scan], per_view: str) -> None:
             raise InputError("--with: readout axis", other.shutter.axis, f"the first scan's, {first.shutter.axis}")
 
 
-def _descend(level: Level, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:
+def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:
     """Steps on one level until they are small; which parameters the frames tell is asked at each step of the first one."""
     volume: np.ndarray | None = None
     asks = search.problem is None
     search.former = {} if asks else dict(search.at)
     for number in range(stage.steps):
         asked = parameters if asks else [PARAMETERS[name] for name in search.known]
-        volume = level.reconstruct(level.operator(change_of(search.at)), volume, stage.again if number else stage.first)
+        operator: Any = level.operator(change_of(search.at))
+        volume = level.reconstruct(operator, volume, stage.again if number else stage.first)
         problem = reduced(level, asked, search.at, volume, stage.project)
         if asks:
-            _ask(problem, gauge_share(level, search.at, volume, stage.project), search)
+            known_shape = isinstance(level, BeadLevel)
+            _ask(problem, LEAST_OF_BEADS if known_shape else least_share(gauge_share(level, search.at, volume, stage.project)), search)
         search.problem = problem.about(search.at).only(search.known)
         if not search.known:
             return
@@ -157,15 +191,14 @@ def _descend(level: Level, stage: Stage, parameters: Sequence[Parameter], search
             return
 
 
-def _limited(one: Parameter, level: Level, old: float, new: float) -> float:
+def _limited(one: Parameter, level: Level | BeadLevel, old: float, new: float) -> float:
     """``new`` as far as a step from ``old`` may go."""
     most = _MOST_PX * level.block / one.pixels(level.scans[0])
     return max(old + float(np.clip(new - old, -most, most)), one.lowest(level.scans[0]))
 
 
-def _ask(problem: Reduced, gauge: float, search: _Search) -> None:
-    """Which parameters the frames tell, and what they cannot tell apart."""
-    least = least_share(gauge)
+def _ask(problem: Reduced, least: float, search: _Search) -> None:
+    """Which parameters the frames tell, of whose signals ``least`` is left, and what they cannot tell apart."""
     search.known = identifiable(problem, least)
     search.alike = [in_words(weights) for weights in alike(problem, least)]
     search.shares = dict(zip(problem.names, problem.shares.tolist(), strict=True))
@@ -200,11 +233,10 @@ def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: M
     return table
 
 
-def _residual(level: Level, stage: Stage, change: Change, views: Views | Sway | None) -> np.ndarray:
+def _residual(level: Level | BeadLevel, stage: Stage, change: Change, views: Views | Sway | None) -> np.ndarray:
     """What a volume leaves of the frames (F, rows, columns) after a change."""
-    operator = level.operator(change, views)
-    volume = level.reconstruct(operator, None, stage.first)
-    return level.line_integrals(operator, volume) - level.masked(operator.forward(volume))
+    operator: Any = level.operator(change, views)
+    return level.residual(operator, level.reconstruct(operator, None, stage.first))
 
 
 def _rms(values: np.ndarray) -> float:
