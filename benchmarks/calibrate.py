@@ -13,6 +13,8 @@ wide as the volume; the volume is fista-tv's, every line at its own times. Cases
     turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way
     wobble     0.3° and 1 pixel (RMS) per view
     motion     the object turns by up to 2° and moves by up to 2 voxels while it is scanned, about and along all axes
+    beads      a phantom of known shape, which lies anyhow: readout, exposure, offset, roll, tilt and both distances off at
+               once, drawn by the seed, rows read (of no volume)
     draw       columns read; offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %, drawn by the
                seed: how often the stated intervals hold the truth (no volumes are scored)
 """
@@ -26,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 from scans import append, files_of, read_lines
+from scipy.spatial.transform import Rotation
 from tables.case import FLY, SyntheticCase
 
 from phyradgs_cl import __version__
@@ -38,9 +41,10 @@ from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gaug
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import psnr
+from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import volume_scene
+from phyradgs_cl.simulation import phantom_scene, volume_scene
 
 ITERATIONS = 60
 Maker = Callable[..., Scan]
@@ -73,6 +77,7 @@ class Case:
     others: tuple[Scan, ...] = ()
     views: Views | None = None
     is_scored: bool = True
+    phantom: EllipsoidPhantom | None = None
 
 
 def panel(make: Maker, seed: int) -> Case:
@@ -128,6 +133,40 @@ def motion(make: Maker, seed: int) -> Case:
     return Case(replace(shaken, trajectory=scan.trajectory), shaken, "motion", {})
 
 
+def beads(make: Maker, seed: int) -> Case:
+    """Twelve beads and two wires; readout and exposure off by 10 to 20 %, the rest by up to what others draw."""
+    rng = np.random.default_rng(seed)
+    known, lying = drawn_beads(rng)
+    right = make(seed, phantom=lying)
+    pitch_mm, shutter = right.geometry.pixel_size_mm[1], right.shutter
+    size = {
+        "offset-u": 2.5 * pitch_mm, "roll": np.deg2rad(0.5), "tilt-v": np.deg2rad(1.0), "source-distance": 0.1,
+        "detector-distance": 0.05, "readout": 0.2 * shutter.readout_s, "exposure": 0.2 * shutter.exposure_s,
+    }  # fmt: skip
+    planted = {name: most * rng.uniform(0.5, 1) * rng.choice([-1, 1]) for name, most in size.items()}
+    return Case(_without(right, planted), right, None, planted, is_scored=False, phantom=known)
+
+
+def drawn_beads(rng: np.random.Generator) -> tuple[EllipsoidPhantom, EllipsoidPhantom]:
+    """A phantom as its file has it, and the same one turned and shifted, in mm: it is at home in R2-Gaussian's scanner."""
+    centres: list[np.ndarray] = []
+    while len(centres) < 12:
+        place = rng.uniform(-0.7, 0.7, 3)
+        if np.hypot(*place[:2]) < 0.7 and all(np.linalg.norm(place - other) > 0.25 for other in centres):
+            centres.append(place)
+    ends = [np.array([[x, y, -0.7], [-x, y / 2, 0.7]]) for x, y in ((0.6, 0.3), (-0.2, -0.6))]
+    radii = rng.choice([0.05, 0.07], 12)
+    turn = Rotation.from_euler("zyx", [rng.uniform(0, 360), *rng.uniform(-10, 10, 2)], degrees=True)
+    shift_mm = rng.uniform(-0.05, 0.05, 3)
+
+    def placed(move: Callable[[np.ndarray], np.ndarray]) -> EllipsoidPhantom:
+        bodies = [Ellipsoid(tuple(move(at)), (radius,) * 3, 5.0) for at, radius in zip(centres, radii, strict=True)]
+        wires = [Cylinder((tuple(move(one)), tuple(move(two))), 0.025, 5.0) for one, two in ends]
+        return EllipsoidPhantom((*bodies, *wires), "beads")
+
+    return placed(lambda at: at), placed(lambda at: turn.apply(at) + shift_mm)
+
+
 def draw(make: Maker, seed: int) -> Case:
     right, rng = make(seed, axis="columns"), np.random.default_rng(seed)
     most = {
@@ -142,16 +181,19 @@ def _without(scan: Scan, planted: dict[str, float]) -> Scan:
     return moved(scan, change_of({name: -value for name, value in planted.items()}))
 
 
-CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, motion, draw)}
+CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, motion, beads, draw)}
 
 
 def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
     detector = 2 * size
     geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
 
-    def make(seed: int, axis: str = "rows", **plan: object) -> Scan:
-        source = f"volume {path}", geometry, Grid.cube(size, 2.0), size, axis
-        scene = volume_scene(rt, load_attenuation(path), *source)
+    def make(seed: int, axis: str = "rows", phantom: EllipsoidPhantom | None = None, **plan: object) -> Scan:
+        where = geometry, Grid.cube(size, 2.0), size, axis
+        if phantom is None:
+            scene = volume_scene(rt, load_attenuation(path), f"volume {path}", *where)
+        else:
+            scene = phantom_scene(rt, phantom, *where, seed, pixel_samples=2)
         protocol = Planned(views=views, exposure_deg=360.0 / views, **plan)  # type: ignore[arg-type]
         return SyntheticCase(rt, scene, geometry, protocol, axis, seed).scan(FLY)
 
@@ -160,7 +202,7 @@ def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
 
 def run_one(rt: Runtime, case: Case) -> dict[str, object]:
     started, cpu_started = time.perf_counter(), time.process_time()
-    found = calibrate(case.stated, rt, case.what, case.others)
+    found = calibrate(case.stated, rt, case.what, case.others, phantom=case.phantom)
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     scans = {"stated": case.stated, "calibrated": found.scan, "right": case.right}
     if not found.corrected and case.stated is case.right:
@@ -274,7 +316,8 @@ def main() -> None:
     done = {tuple(run[k] for k in key) for run in read_lines(arguments.results)}
     for seed in range(arguments.seeds):
         for case in arguments.cases.split(","):
-            for name, path in files_of(arguments.folder, arguments.only, arguments.size).items():
+            of_volumes = files_of(arguments.folder, arguments.only, arguments.size) if case != "beads" else {case: Path()}
+            for name, path in of_volumes.items():
                 what = (case, name, arguments.size, arguments.views, seed)
                 if what not in done:
                     result = run_one(rt, CASES[case](maker(rt, path, arguments.size, arguments.views), seed))

@@ -1,30 +1,40 @@
 """A scan's true geometry and timing, from the scan itself."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
+from phyradgs_cl.importers import load_beads
+from phyradgs_cl.phantoms import EllipsoidPhantom
 
 
 def calibrate(
-    scan: Scan, what: str | None = None, *, others: Sequence[Scan] = (), device: Device = None
+    scan: Scan,
+    what: str | None = None,
+    *,
+    others: Sequence[Scan] = (),
+    phantom: str | Path | EllipsoidPhantom | None = None,
+    device: Device = None,
 ) -> Calibration:
     """Geometry and timing as the frames tell them (docs/calibrate.md); what they cannot tell stays as stated.
 
     what: names with commas, ``offset,roll,tilt`` and of a fly-scan ``readout,exposure`` when None; also ``distance``,
     ``start`` and ``wobble`` (views one by one). others: more scans of the same object, lying as it did, with the same panel:
-    what is wrong in ``scan`` is taken to be wrong in them. device: what ``--device`` takes, or a Runtime.
+    what is wrong in ``scan`` is taken to be wrong in them. phantom: what was scanned, wherever it lies, if its shape is known:
+    beads and wires, or their TOML file, lengths in mm. device: what ``--device`` takes, or a Runtime.
 
     The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s) and a
     verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals
     before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames.
 
     Raises InputError for names that there are not, timing of a gantry that stands still, fewer than 8 frames or 12 columns,
-    and others that do not fit the first.
+    others that do not fit the first, and a phantom that the frames do not show.
     """
     check_scan(scan)
     scan.check_timing()
-    return run_calibration(scan, runtime_of(device), what, others)
+    shape = load_beads(Path(phantom)) if isinstance(phantom, str | Path) else phantom
+    return run_calibration(scan, runtime_of(device), what, others, phantom=shape)

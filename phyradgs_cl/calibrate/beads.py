@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,6 +23,7 @@ _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
 _BACKGROUND = 4  # cosines along each side of a frame that tell no bead: a holder, scatter, drift of the tube
 _STEP_PX = 0.25
 _MOST_PX = 1.5  # that a step of the placement moves a frame by
+_SETTLED_PX = 0.03  # Gauss–Newton squares what is left
 DENSITY = 6  # of a placement's numbers, the last
 
 
@@ -86,8 +88,6 @@ class _Lines:
         offsets = (np.arange(_PIXEL_SAMPLES) + 0.5) / _PIXEL_SAMPLES - 0.5
         for body in phantom.ellipsoids:
             chosen, start, width = self._shadow(np.array(body.ends_mm), body.reach_mm)
-            if chosen.size == 0:
-                continue
             pixel = start[:, None] + np.arange(width)
             source = self.source[chosen][:, None]
             line_mm = self.line[chosen, None] * self.line_step[chosen]
@@ -101,22 +101,32 @@ class _Lines:
                     total[chosen[:, None], pixel] += value.reshape(pixel.shape) / _PIXEL_SAMPLES**2
         return total
 
+    @cached_property
+    def _onto_panel(self) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Vectors (N, 3) that count distances from the source in the panel's own, lines and pixels, with what they give (N,)
+        of the source and of the first pixel, and their lengths (N,)."""
+        normal = np.cross(self.line_step, self.pixel_step)
+        height = np.sum(normal * (self.first - self.source), -1, keepdims=True)
+        vectors = [normal / height]
+        vectors += [step / np.sum(step**2, -1, keepdims=True) for step in (self.line_step, self.pixel_step)]
+        return tuple((v, np.sum(v * self.source, -1), np.sum(v * self.first, -1), np.linalg.norm(v, axis=-1)) for v in vectors)
+
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(which lines (n,) may see a body, from which pixel on (n,), how many pixels)."""
-        normal = np.cross(self.line_step, self.pixel_step)
-        pitch_mm = [np.linalg.norm(step, axis=-1) for step in (self.line_step, self.pixel_step)]
+        (depth, depth_of_source, *_), *axes = self._onto_panel
         lowest, highest = [], []
         for end_mm in ends_mm:
-            away = end_mm - self.source
-            stretch = np.sum(normal * (self.first - self.source), -1) / np.sum(normal * away, -1)
-            hit = self.source + stretch[:, None] * away - self.first
-            at = [np.sum(hit * s, -1) / p**2 for s, p in zip((self.line_step, self.pixel_step), pitch_mm, strict=True)]
-            reach = [_SLACK * reach_mm * np.abs(stretch) / p + 1 for p in pitch_mm]
-            lowest.append([a - r for a, r in zip(at, reach, strict=True)])
-            highest.append([a + r for a, r in zip(at, reach, strict=True)])
-        (line_from, pixel_from), (line_to, pixel_to) = np.min(lowest, 0), np.max(highest, 0)
-        in_line = (self.line >= line_from) & (self.line <= line_to)
-        chosen = np.flatnonzero(in_line & (pixel_to >= 0) & (pixel_from <= self.pixels - 1))
+            stretch = 1 / (depth @ end_mm - depth_of_source)
+            for vector, of_source, of_first, per_mm in axes:
+                at = of_source - of_first + stretch * (vector @ end_mm - of_source)
+                reach = _SLACK * reach_mm * np.abs(stretch) * per_mm + 1
+                lowest.append(at - reach)
+                highest.append(at + reach)
+        line_from, pixel_from = (np.minimum(lowest[k], lowest[k + 2]) for k in (0, 1))
+        line_to, pixel_to = (np.maximum(highest[k], highest[k + 2]) for k in (0, 1))
+        chosen = np.flatnonzero(
+            (self.line >= line_from) & (self.line <= line_to) & (pixel_to >= 0) & (pixel_from <= self.pixels - 1)
+        )
         first = np.clip(np.floor(pixel_from[chosen]), 0, self.pixels - 1).astype(int)
         last = np.clip(np.ceil(pixel_to[chosen]), 0, self.pixels - 1).astype(int)
         width = int((last - first).max(initial=0)) + 1
@@ -173,7 +183,7 @@ class BeadLevel:
             step = np.linalg.lstsq(unit.T, self.residual(operator, placement).ravel(), rcond=None)[0]
             step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
             placement = placement + step * self._units()
-            if np.abs(step).max() < 1e-3:
+            if np.abs(step).max() < _SETTLED_PX:
                 break
         return placement
 

@@ -44,7 +44,7 @@ class Stage:
     again: int
 
 
-BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 4, 0, 6, 3))
+BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 10, 0, 6, 3))
 STAGES = (Stage(24, 6, 40, 40, 15), Stage(48, 3, 20, 40, 12), Stage(96, 3, 30, 50, 15))
 
 
