@@ -52,10 +52,11 @@ Maker = Callable[..., Scan]
 
 @dataclass(frozen=True)
 class Planned(Protocol):
-    """A protocol whose gantry turns the other way, or wobbles."""
+    """A protocol whose gantry turns the other way, wobbles, or is not built as it says."""
 
     is_backwards: bool = False
     views_off: Views | Sway | None = None
+    off: Change = Change()
 
     def orbit(self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None):  # type: ignore[no-untyped-def]
         path = super().orbit(geometry, jitter_deg, rng)
@@ -63,7 +64,9 @@ class Planned(Protocol):
             sweeps = path.kinematics
             first, last = -sweeps.angle_start_rad, -sweeps.angle_end_rad
             path = CircularOrbit(geometry, replace(sweeps, angle_start_rad=first, angle_end_rad=last))
-        return path if self.views_off is None else Moved(path, geometry.detector_shape, Change(), self.views_off)
+        if self.views_off is None and self.off == Change():
+            return path
+        return Moved(path, geometry.detector_shape, self.off, self.views_off)
 
 
 @dataclass(frozen=True)
@@ -137,14 +140,16 @@ def beads(make: Maker, seed: int) -> Case:
     """Twelve beads and two wires; readout and exposure off by 10 to 20 %, the rest by up to what others draw."""
     rng = np.random.default_rng(seed)
     known, lying = drawn_beads(rng)
-    right = make(seed, phantom=lying)
-    pitch_mm, shutter = right.geometry.pixel_size_mm[1], right.shutter
     size = {
-        "offset-u": 2.5 * pitch_mm, "roll": np.deg2rad(0.5), "tilt-v": np.deg2rad(1.0), "source-distance": 0.1,
-        "detector-distance": 0.05, "readout": 0.2 * shutter.readout_s, "exposure": 0.2 * shutter.exposure_s,
+        "offset-u": 0.1, "roll": np.deg2rad(0.5), "tilt-v": np.deg2rad(1.0), "source-distance": 0.1,
+        "detector-distance": 0.05, "readout": 0.172, "exposure": 0.2,
     }  # fmt: skip
     planted = {name: most * rng.uniform(0.5, 1) * rng.choice([-1, 1]) for name, most in size.items()}
-    return Case(_without(right, planted), right, None, planted, is_scored=False, phantom=known)
+    times = {name: planted[name] for name in ("readout", "exposure")}
+    off = change_of({name: size for name, size in planted.items() if name not in times})
+    right = make(seed, phantom=lying, off=off)
+    stated = replace(right, trajectory=right.trajectory.base)  # type: ignore[attr-defined]
+    return Case(_without(stated, times), right, None, planted, is_scored=False, phantom=known)
 
 
 def drawn_beads(rng: np.random.Generator) -> tuple[EllipsoidPhantom, EllipsoidPhantom]:

@@ -332,8 +332,8 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom, one's own or by its name, in the scanner's box, with ``size`` voxels per side. Closed forms are integrated exactly;
-    procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
+    """A phantom, one's own or by its name, in the scanner's box, with ``size`` voxels per side. Closed forms are integrated
+    exactly; procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
     ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of

@@ -24,8 +24,8 @@ def calibrate(
 
     what: names with commas, ``offset,roll,tilt`` and of a fly-scan ``readout,exposure`` when None; also ``distance``,
     ``start`` and ``wobble`` (views one by one). others: more scans of the same object, lying as it did, with the same panel:
-    what is wrong in ``scan`` is taken to be wrong in them. phantom: what was scanned, wherever it lies, if its shape is known:
-    beads and wires, or their TOML file, lengths in mm. device: what ``--device`` takes, or a Runtime.
+    what is wrong in ``scan`` is taken to be wrong in them. phantom: what was scanned, wherever it lies, where that
+    is known: beads and wires, or their TOML file, lengths in mm. device: what ``--device`` takes, or a Runtime.
 
     The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s) and a
     verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals

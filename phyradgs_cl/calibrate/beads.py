@@ -1,4 +1,4 @@
-"""Frames of a phantom of known shape at one coarseness: what is left to find is how it lies, how dense it is, a background."""
+"""Frames of a phantom of known shape at one coarseness: what is left to find is how it lies, its density, a background."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
 _BACKGROUND = 4  # cosines along each side of a frame that tell no bead: a holder, scatter, drift of the tube
 _STEP_PX = 0.25
 _MOST_PX = 1.5  # that a step of the placement moves a frame by
-_SETTLED_PX = 0.03  # Gauss–Newton squares what is left
+_SETTLED_PX, _STRAIGHT_PX = 0.01, 0.3  # a step that is the last; one up to which signals are straight lines
 DENSITY = 6  # of a placement's numbers, the last
 
 
@@ -72,8 +72,8 @@ def _by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """Lines of a panel as the phantom sees them, each at one time: source and middle of the panel's first pixel (N, 3), steps
-    to the next line and to the next pixel in it, mm; which ``line`` (N,) it is, of ``pixels`` each."""
+    """Lines of a panel as the phantom sees them, each at one time: source and middle of the panel's first pixel (N, 3),
+    steps to the next line and to the next pixel in it, mm; which ``line`` (N,) it is, of ``pixels`` each."""
 
     source: np.ndarray
     first: np.ndarray
@@ -109,7 +109,8 @@ class _Lines:
         height = np.sum(normal * (self.first - self.source), -1, keepdims=True)
         vectors = [normal / height]
         vectors += [step / np.sum(step**2, -1, keepdims=True) for step in (self.line_step, self.pixel_step)]
-        return tuple((v, np.sum(v * self.source, -1), np.sum(v * self.first, -1), np.linalg.norm(v, axis=-1)) for v in vectors)
+        at = [[np.sum(vector * point, -1) for point in (self.source, self.first)] for vector in vectors]
+        return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, at, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(which lines (n,) may see a body, from which pixel on (n,), how many pixels)."""
@@ -135,7 +136,7 @@ class _Lines:
 
 @dataclass(frozen=True, eq=False)
 class BeadLevel:
-    """As ``Level``, of a phantom that lies about as ``start`` (7,) says: ``measured`` (F, rows, columns) are frames in blocks."""
+    """As ``Level``, of a phantom that lies about as ``start`` (7,) says; measured (F, rows, columns): frames in blocks."""
 
     scans: Sequence[Scan]
     block: int
@@ -146,7 +147,12 @@ class BeadLevel:
 
     @classmethod
     def of(
-        cls, scans: Sequence[Scan], phantom: EllipsoidPhantom, start: np.ndarray, columns: int, most_frames: int = MOST_FRAMES
+        cls,
+        scans: Sequence[Scan],
+        phantom: EllipsoidPhantom,
+        start: np.ndarray,
+        columns: int,
+        most_frames: int = MOST_FRAMES,
     ) -> "BeadLevel":
         """Blocks such that the longer side has at most ``columns`` of them."""
         block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
@@ -174,17 +180,24 @@ class BeadLevel:
         """What the phantom, and a smooth background, leave of the frames."""
         return self._without_background(self.measured - operator.forward(placement))
 
+    def noise(self, residual: np.ndarray) -> float:
+        """Standard deviation of a pixel's noise and of what the model misses."""
+        return float(np.std(residual if self.valid is None else residual[self.valid]))
+
     def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
         """The placement (7,) that fits best, from ``start`` on, by Gauss–Newton."""
         placement = self.start if start is None else start
+        inverse = None
         for _ in range(iterations):
-            signals = self._signals(operator, placement)
-            unit = np.array([signal.ravel() for signal in signals], np.float64)
-            step = np.linalg.lstsq(unit.T, self.residual(operator, placement).ravel(), rcond=None)[0]
+            if inverse is None:
+                inverse = np.linalg.pinv([one.ravel() for one in self._signals(operator, placement)])
+            step = self.residual(operator, placement).ravel() @ inverse
             step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
             placement = placement + step * self._units()
             if np.abs(step).max() < _SETTLED_PX:
                 break
+            if np.abs(step).max() > _STRAIGHT_PX:
+                inverse = None
         return placement
 
     def off_range(

@@ -10,6 +10,7 @@ from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.check.coarse import binned, coarse_grid, fewer_frames, smooth
 from phyradgs_cl.check.questions.timing import exposure_arc_rad
+from phyradgs_cl.detector import noise_level
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.operators.rays.operator import RayOperator
@@ -90,6 +91,10 @@ class Level:
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
         """What a volume leaves of the frames (F, rows, columns)."""
         return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))
+
+    def noise(self, residual: np.ndarray) -> float:
+        """Standard deviation of a pixel's noise; a volume fits some of it, so that the residual would say too little."""
+        return noise_level(self.measured, self.valid)
 
     def off_range(
         self, operator: RayOperator, volume: np.ndarray, images: Sequence[np.ndarray], iterations: int

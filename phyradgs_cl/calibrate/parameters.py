@@ -122,8 +122,8 @@ WOBBLE, MOTION = "wobble", "motion"
 
 def chosen(what: str | None, scan: Scan, knows_shape: bool = False) -> tuple[list[Parameter], str]:
     """(the parameters that ``what`` names with commas; whether views are asked for one by one or the object's motion, as
-    named); None: those of the panel and, of a fly-scan, readout and exposure, of an object of known shape distances too. InputError for a name that there is not, both
-    of the latter, or timing of a gantry at rest."""
+    named); None: those of the panel, of an object of known shape distances and, of a fly-scan, readout and exposure.
+    InputError for a name that there is not, views and motion, or timing of a gantry at rest."""
     words = [word.strip() for word in (_usual(scan) + ",distance" * knows_shape if what is None else what).split(",")]
     names: list[str] = []
     for word in words:

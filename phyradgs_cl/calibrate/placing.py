@@ -1,4 +1,4 @@
-"""Where a phantom of known shape lies: bead centres in a first volume, and the rigid motion that takes the known ones there."""
+"""Where a phantom of known shape lies: bright spots of a first volume, and the rigid motion that takes known beads there."""
 
 from collections.abc import Iterator
 

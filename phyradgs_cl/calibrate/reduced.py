@@ -13,7 +13,6 @@ import scipy
 from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
-from phyradgs_cl.detector import noise_level
 
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
 _MISMATCH = 2.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
@@ -102,7 +101,7 @@ def reduced(
         whole=unit @ unit.T,
         residual=beyond.ravel().astype(np.float64),
         frames=len(beyond),
-        noise=noise_level(level.measured, level.valid),
+        noise=level.noise(beyond),
     )
 
 

@@ -176,8 +176,10 @@ def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parame
         volume = level.reconstruct(operator, volume, stage.again if number else stage.first)
         problem = reduced(level, asked, search.at, volume, stage.project)
         if asks:
-            known_shape = isinstance(level, BeadLevel)
-            _ask(problem, LEAST_OF_BEADS if known_shape else least_share(gauge_share(level, search.at, volume, stage.project)), search)
+            least = LEAST_OF_BEADS
+            if isinstance(level, Level):
+                least = least_share(gauge_share(level, search.at, volume, stage.project))
+            _ask(problem, least, search)
         search.problem = problem.about(search.at).only(search.known)
         if not search.known:
             return

@@ -27,6 +27,7 @@ from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
 _NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION]
 _WHAT = f"What to look for, with commas: {', '.join(_NAMES)}."
+_USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
 _OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."
 _PHANTOM = "What was scanned: a TOML file of beads and wires (docs/formats.md), wherever they lie."
 _WITH = "Another scan of the same object, which lies as it did: turned the other way, it tells readout and exposure."
@@ -35,7 +36,7 @@ _WITH = "Another scan of the same object, which lies as it did: turned the other
 def calibrate_command(
     scan: Scan,
     output: Annotated[Path | None, file_option(_OUTPUT, "--output", "-o", default="none is written")] = None,
-    what: Annotated[str | None, option(_WHAT, "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance")] = None,
+    what: Annotated[str | None, option(_WHAT, _USUAL)] = None,
     other: Annotated[Path | None, file_option(_WITH, "--with", default=False)] = None,
     phantom: Annotated[Path | None, file_option(_PHANTOM, "--phantom", default=False)] = None,
     picture: Annotated[

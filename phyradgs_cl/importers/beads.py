@@ -16,14 +16,17 @@ _KEYS = {
 
 
 def load_beads(path: Path) -> EllipsoidPhantom:
-    """The beads, then the wires, of a TOML file, called as it is. InputError: not TOML; keys that are unknown, missing or wrong;
-    no bead; more than a thousand bodies."""
+    """The beads, then the wires, of a TOML file, called as it is. InputError: not TOML; keys that are unknown, missing or
+    wrong; no bead; more than a thousand bodies."""
     content = read_toml(path)
     refuse_unknown(str(path), content, ("title", _COMMON, *_KEYS))
     top = Fields(str(path), content)
-    beads = [Ellipsoid(_place(one, "centre_mm"), (_radius(one),) * 3, _attenuation(one, top)) for one in _bodies(top, "bead")]
+    beads = [
+        Ellipsoid(_place(one, "centre_mm"), (one.length("radius_mm"),) * 3, _attenuation(one, top))
+        for one in _bodies(top, "bead")
+    ]
     wires = [
-        Cylinder((_place(one, "from_mm"), _place(one, "to_mm")), _radius(one), _attenuation(one, top))
+        Cylinder((_place(one, "from_mm"), _place(one, "to_mm")), one.length("radius_mm"), _attenuation(one, top))
         for one in (_bodies(top, "wire") if top.has("wire") else ())
     ]
     if len(beads) + len(wires) > _MOST_BODIES:
@@ -38,10 +41,6 @@ def _bodies(top: Fields, kind: str) -> list[Fields]:
 def _place(body: Fields, key: str) -> tuple[float, float, float]:
     x, y, z = body.numbers(key, 3, _LARGEST_MM).tolist()
     return x, y, z
-
-
-def _radius(body: Fields) -> float:
-    return body.length("radius_mm")
 
 
 def _attenuation(body: Fields, top: Fields) -> float:
