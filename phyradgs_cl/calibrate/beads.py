@@ -1,11 +1,13 @@
 """Frames of a phantom of known shape at one coarseness: what is left to find is how it lies, its density, a background."""
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import PerRow, Scan
@@ -14,11 +16,12 @@ from phyradgs_cl.calibrate.level import MOST_FRAMES
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.check.coarse import binned, fewer_frames
 from phyradgs_cl.check.questions.timing import exposure_arc_rad
-from phyradgs_cl.detector import intensity_average
+from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
 _LEAST_SAMPLES, _MOST_SAMPLES = 4, 24  # of an exposure; the phantom's edge moves by a pixel between two
 _PIXEL_SAMPLES = 2  # along each side: sharp edges within a pixel
+_BLUR_PX = 0.8  # beyond it rays that are half a pixel apart show in the differences of sharp edges
 _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
 _BACKGROUND = 4  # cosines along each side of a frame that tell no bead: a holder, scatter, drift of the tube
 _STEP_PX = 0.25
@@ -51,9 +54,11 @@ class BeadOperator:
             line=np.tile(np.repeat(np.arange(lines), samples), frames),
             pixels=self.shape[1] if is_rows else self.shape[0],
         )
-        p = placement[DENSITY] * seen.integrals(self.phantom).reshape(frames, lines, samples, -1)
-        parts = np.moveaxis(p, 2, 0), np.moveaxis(weight, 2, 0)[..., None]
-        found = sum(w * q for q, w in zip(*parts, strict=True)) if self.model == "log" else intensity_average(*parts)[0]
+        total = np.zeros((frames, lines, seen.pixels))
+        for p in seen.integrals(self.phantom):
+            p = placement[DENSITY] * p.reshape(frames, lines, samples, -1)
+            total += np.einsum("fls,flsp->flp", weight, p if self.model == "log" else np.exp(-p)) / _PIXEL_SAMPLES**2
+        found = total if self.model == "log" else -np.log(np.maximum(total, TRANSMISSION_FLOOR))
         return np.ascontiguousarray(found if is_rows else found.swapaxes(1, 2), np.float32)
 
 
@@ -82,24 +87,22 @@ class _Lines:
     line: np.ndarray
     pixels: int
 
-    def integrals(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Line integrals (N, pixels), float32, of rays to the pixels' areas."""
-        total = np.zeros((len(self.line), self.pixels), np.float32)
+    def integrals(self, phantom: EllipsoidPhantom) -> Iterator[np.ndarray]:
+        """Line integrals (N, pixels), float32, of rays to a few points of every pixel's area, one after the other."""
+        shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
         offsets = (np.arange(_PIXEL_SAMPLES) + 0.5) / _PIXEL_SAMPLES - 0.5
-        for body in phantom.ellipsoids:
-            chosen, start, width = self._shadow(np.array(body.ends_mm), body.reach_mm)
-            pixel = start[:, None] + np.arange(width)
-            source = self.source[chosen][:, None]
-            line_mm = self.line[chosen, None] * self.line_step[chosen]
-            to_pixel = (self.first[chosen] + line_mm)[:, None] + pixel[..., None] * self.pixel_step[chosen][:, None] - source
-            for across in offsets:
-                for along in offsets:
-                    step = to_pixel + (across * self.line_step[chosen] + along * self.pixel_step[chosen])[:, None]
-                    flat = step.reshape(-1, 3)
-                    part = body.chord_fraction(np.broadcast_to(source, step.shape).reshape(-1, 3), flat)
-                    value = body.attenuation_per_mm * part * np.sqrt(np.einsum("ij,ij->i", flat, flat))
-                    total[chosen[:, None], pixel] += value.reshape(pixel.shape) / _PIXEL_SAMPLES**2
-        return total
+        for across, along in itertools.product(offsets, offsets):
+            total = np.zeros((len(self.line), self.pixels), np.float32)
+            for body, chosen, start, width in shadows:
+                pixel = start[:, None] + np.arange(width)
+                source = self.source[chosen]
+                first = self.first[chosen] + (self.line[chosen, None] + across) * self.line_step[chosen] - source
+                step = first[:, None] + (pixel[..., None] + along) * self.pixel_step[chosen][:, None]
+                flat = step.reshape(-1, 3)
+                part = body.chord_fraction(np.repeat(source, width, axis=0), flat)
+                value = body.attenuation_per_mm * part * np.sqrt(np.einsum("ij,ij->i", flat, flat))
+                total[chosen[:, None], pixel] += value.reshape(pixel.shape)
+            yield total
 
     @cached_property
     def _onto_panel(self) -> tuple[tuple[np.ndarray, ...], ...]:
@@ -193,7 +196,7 @@ class BeadLevel:
                 inverse = np.linalg.pinv([one.ravel() for one in self._signals(operator, placement)])
             step = self.residual(operator, placement).ravel() @ inverse
             step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
-            placement = placement + step * self._units()
+            placement = _further(placement, step * self._units())
             if np.abs(step).max() < _SETTLED_PX:
                 break
             if np.abs(step).max() > _STRAIGHT_PX:
@@ -223,12 +226,8 @@ class BeadLevel:
         """Change of the frames by a unit of each number."""
         found = []
         for number, unit in enumerate(self._units()):
-            if number == DENSITY:
-                step = np.eye(DENSITY + 1)[number] * placement
-                found.append(self._without_background(operator.forward(placement) / np.float32(step[number])))
-                continue
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit
-            ends = [operator.forward(placement + sign * step) for sign in (1, -1)]
+            ends = [operator.forward(_further(placement, sign * step)) for sign in (1, -1)]
             found.append(self._without_background((ends[0] - ends[1]) / np.float32(2 * _STEP_PX)))
         return found
 
@@ -237,13 +236,25 @@ class BeadLevel:
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
-            return (frames - np.einsum("vi,fij,uj->fvu", rows, inner, columns)).astype(np.float32)
+            return _blurred(frames - np.einsum("vi,fij,uj->fvu", rows, inner, columns))
         found = np.zeros(frames.shape, np.float32)
         cosines = np.einsum("vi,uj->vuij", rows, columns).reshape(-1, _BACKGROUND**2)
         for into, frame, valid in zip(found, frames, self.valid, strict=True):
             some = cosines[valid.ravel()]
             into[valid] = frame[valid] - some @ np.linalg.lstsq(some, frame[valid], rcond=None)[0]
-        return found
+        return _blurred(found)
+
+
+def _further(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """A placement (7,) after another turn about the world's axes, shift, and density added."""
+    turn = Rotation.from_rotvec(step[:3])
+    turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
+    return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])
+
+
+def _blurred(frames: np.ndarray) -> np.ndarray:
+    """Frames and what is compared with them without what is finer than the few rays per pixel."""
+    return gaussian_filter(frames.astype(np.float32), (0, _BLUR_PX, _BLUR_PX))
 
 
 def _cosines(count: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.errors import InputError
@@ -12,6 +12,7 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 FEWEST_BEADS = 4
 _LEAST_SHARE = 0.6  # of the beads that have to be found
+_SMOOTH = 0.5  # of a bead's radius: one of many voxels has one middle then
 _OVER = 2.0  # peaks that are looked for, per bead
 _TOLERANCE_VOXELS = 1.5
 _TRIANGLES = 40  # of known beads that are tried
@@ -33,7 +34,9 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     """Turns (rotation vectors, rad) and shifts (mm), (6,) each, that take the most of the known beads to bright spots of a
     volume (z, y, x), the best first. InputError where none does."""
     known = bead_centres_mm(phantom)
-    seen = _peaks_mm(volume, grid, int(_OVER * len(known)) + FEWEST_BEADS)
+    radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
+    smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
+    seen = _peaks_mm(smooth, grid, int(_OVER * len(known)) + FEWEST_BEADS)
     within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
     found: list[tuple[int, float, np.ndarray]] = []
     for three, corners in _alike(known, seen, within_mm):

@@ -44,14 +44,14 @@ class Stage:
     again: int
 
 
-BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 10, 0, 6, 3))
+BEAD_STAGES = (Stage(48, 3, 0, 8, 4), Stage(128, 10, 0, 6, 3))
 STAGES = (Stage(24, 6, 40, 40, 15), Stage(48, 3, 20, 40, 12), Stage(96, 3, 30, 50, 15))
 
 
 @dataclass(eq=False)
 class _Search:
-    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before; ``known``: those that
-    the frames tell; the last stage's problem."""
+    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before, where that is of voxels;
+    ``known``: those that the frames tell; the last stage's problem."""
 
     at: dict[str, float] = field(default_factory=dict)
     former: dict[str, float] = field(default_factory=dict)
@@ -169,7 +169,7 @@ def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parame
     """Steps on one level until they are small; which parameters the frames tell is asked at each step of the first one."""
     volume: np.ndarray | None = None
     asks = search.problem is None
-    search.former = {} if asks else dict(search.at)
+    search.former = {} if asks or isinstance(level, BeadLevel) else dict(search.at)
     for number in range(stage.steps):
         asked = parameters if asks else [PARAMETERS[name] for name in search.known]
         operator: Any = level.operator(change_of(search.at))

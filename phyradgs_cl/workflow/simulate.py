@@ -23,8 +23,7 @@ _TOML = ".toml"
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """What to simulate: a phantom by name or TOML file, or a volume file, on which scanner, with how many voxels and rays per
-    pixel."""
+    """What to simulate, a phantom by name or TOML file or a volume file, on which scanner; voxels and rays per pixel."""
 
     output: Path
     phantom: str | None = None
