@@ -173,7 +173,8 @@ class BeadLevel:
             small = binned(moved(scan, change, views), self.block)
             edge_px = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification / min(small.geometry.pixel_size_mm)
             times = int(np.clip(math.ceil(exposure_arc_rad(scan) * edge_px), _LEAST_SAMPLES, _MOST_SAMPLES))
-            tables += [PerRow(times).cells(small, frame) for frame in range(small.frames)]
+            spread = _as_wide(small, times)
+            tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
         return BeadOperator(self.phantom, tables, small.geometry.detector_shape, self.scans[0].detector_model)
 
     def masked(self, frames: np.ndarray) -> np.ndarray:
@@ -193,8 +194,8 @@ class BeadLevel:
         inverse = None
         for _ in range(iterations):
             if inverse is None:
-                inverse = np.linalg.pinv([one.ravel() for one in self._signals(operator, placement)])
-            step = self.residual(operator, placement).ravel() @ inverse
+                inverse = np.linalg.pinv(self._signals(operator, placement))
+            step = self._compared(self.residual(operator, placement)) @ inverse
             step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
             placement = _further(placement, step * self._units())
             if np.abs(step).max() < _SETTLED_PX:
@@ -207,14 +208,10 @@ class BeadLevel:
         self, operator: BeadOperator, placement: np.ndarray, images: Sequence[np.ndarray], iterations: int
     ) -> list[np.ndarray]:
         """What of each image (F, rows, columns) the phantom lying a little elsewhere, or denser, does not explain."""
-        signals = np.array([one.ravel() for one in self._signals(operator, placement)], np.float64)
-        basis, _ = np.linalg.qr(signals.T)
-        left = []
-        for image in images:
-            flat = self._without_background(image).ravel().astype(np.float64)
-            flat -= basis @ (basis.T @ flat)
-            left.append(flat.reshape(image.shape))
-        return left
+        basis, _ = np.linalg.qr(self._signals(operator, placement).T)
+        compared = np.array([self._compared(image) for image in images])
+        left = compared - compared @ basis @ basis.T
+        return list(left.reshape(len(images), *self.measured.shape))
 
     def _units(self) -> np.ndarray:
         """What of each number (7,) of a placement moves a frame by a pixel at its edge, or makes it ten times as dense."""
@@ -222,27 +219,43 @@ class BeadLevel:
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
-    def _signals(self, operator: BeadOperator, placement: np.ndarray) -> list[np.ndarray]:
-        """Change of the frames by a unit of each number."""
+    def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
+        """Change of what is compared (7, F · pixels) by a unit of each number."""
         found = []
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit
             ends = [operator.forward(_further(placement, sign * step)) for sign in (1, -1)]
-            found.append(self._without_background((ends[0] - ends[1]) / np.float32(2 * _STEP_PX)))
-        return found
+            found.append(self._compared((ends[0] - ends[1]) / np.float32(2 * _STEP_PX)))
+        return np.array(found)
+
+    def _compared(self, frames: np.ndarray) -> np.ndarray:
+        """Frames (F · pixels), float64, without background and without what is finer than the few rays per pixel."""
+        blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
+        return blurred.ravel()
 
     def _without_background(self, frames: np.ndarray) -> np.ndarray:
         """Frames without what a few cosines along each side explain."""
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
-            return _blurred(frames - np.einsum("vi,fij,uj->fvu", rows, inner, columns))
+            return (frames - np.einsum("vi,fij,uj->fvu", rows, inner, columns)).astype(np.float32)
         found = np.zeros(frames.shape, np.float32)
         cosines = np.einsum("vi,uj->vuij", rows, columns).reshape(-1, _BACKGROUND**2)
         for into, frame, valid in zip(found, frames, self.valid, strict=True):
             some = cosines[valid.ravel()]
             into[valid] = frame[valid] - some @ np.linalg.lstsq(some, frame[valid], rcond=None)[0]
-        return _blurred(found)
+        return found
+
+
+def _as_wide(scan: Scan, times: int) -> Scan:
+    """The scan with lines open so much longer, about the same middle, that ``times`` moments of that are spread (standard
+    deviation) as all of the exposure is: else few would pass for a shorter one. A pulse is left as it is."""
+    if scan.shutter.pulse_s is not None:
+        return scan
+    exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
+    early_s = (exposure_s - scan.shutter.exposure_s) / 2
+    shutter = replace(scan.shutter, exposure_s=exposure_s)
+    return replace(scan, shutter=shutter, frame_start_s=np.asarray(scan.frame_start_s) - early_s)
 
 
 def _further(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -250,11 +263,6 @@ def _further(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
     turn = Rotation.from_rotvec(step[:3])
     turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
     return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])
-
-
-def _blurred(frames: np.ndarray) -> np.ndarray:
-    """Frames and what is compared with them without what is finer than the few rays per pixel."""
-    return gaussian_filter(frames.astype(np.float32), (0, _BLUR_PX, _BLUR_PX))
 
 
 def _cosines(count: int) -> np.ndarray:

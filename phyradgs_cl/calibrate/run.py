@@ -44,13 +44,13 @@ class Stage:
     again: int
 
 
-BEAD_STAGES = (Stage(48, 3, 0, 8, 4), Stage(128, 10, 0, 6, 3))
+BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 6, 0, 6, 4))
 STAGES = (Stage(24, 6, 40, 40, 15), Stage(48, 3, 20, 40, 12), Stage(96, 3, 30, 50, 15))
 
 
 @dataclass(eq=False)
 class _Search:
-    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before, where that is of voxels;
+    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before, if of voxels;
     ``known``: those that the frames tell; the last stage's problem."""
 
     at: dict[str, float] = field(default_factory=dict)
