@@ -19,7 +19,7 @@ from phyradgs_cl.check.questions.timing import exposure_arc_rad
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-_LEAST_SAMPLES, _MOST_SAMPLES = 4, 24  # of an exposure; the phantom's edge moves by a pixel between two
+_LEAST_SAMPLES, _MOST_SAMPLES = 6, 24  # of an exposure; the phantom's edge moves by a pixel between two
 _PIXEL_SAMPLES = 2  # along each side: sharp edges within a pixel
 _BLUR_PX = 0.8  # beyond it rays that are half a pixel apart show in the differences of sharp edges
 _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
@@ -188,6 +188,11 @@ class BeadLevel:
         """Standard deviation of a pixel's noise and of what the model misses."""
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
+    def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
+        """Share of the frames' squares, of what is compared, that the phantom explains; 0 where it would have to add light."""
+        left, whole = (self.compared(one) for one in (self.residual(operator, placement), self.masked(self.measured)))
+        return float(1 - left @ left / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
+
     def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
         """The placement (7,) that fits best, from ``start`` on, by Gauss–Newton."""
         placement = self.start if start is None else start
@@ -195,7 +200,7 @@ class BeadLevel:
         for _ in range(iterations):
             if inverse is None:
                 inverse = np.linalg.pinv(self._signals(operator, placement))
-            step = self._compared(self.residual(operator, placement)) @ inverse
+            step = self.compared(self.residual(operator, placement)) @ inverse
             step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
             placement = _further(placement, step * self._units())
             if np.abs(step).max() < _SETTLED_PX:
@@ -209,7 +214,7 @@ class BeadLevel:
     ) -> list[np.ndarray]:
         """What of each image (F, rows, columns) the phantom lying a little elsewhere, or denser, does not explain."""
         basis, _ = np.linalg.qr(self._signals(operator, placement).T)
-        compared = np.array([self._compared(image) for image in images])
+        compared = np.array([self.compared(image) for image in images])
         left = compared - compared @ basis @ basis.T
         return list(left.reshape(len(images), *self.measured.shape))
 
@@ -225,10 +230,10 @@ class BeadLevel:
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit
             ends = [operator.forward(_further(placement, sign * step)) for sign in (1, -1)]
-            found.append(self._compared((ends[0] - ends[1]) / np.float32(2 * _STEP_PX)))
+            found.append(self.compared((ends[0] - ends[1]) / np.float32(2 * _STEP_PX)))
         return np.array(found)
 
-    def _compared(self, frames: np.ndarray) -> np.ndarray:
+    def compared(self, frames: np.ndarray) -> np.ndarray:
         """Frames (F · pixels), float64, without background and without what is finer than the few rays per pixel."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()

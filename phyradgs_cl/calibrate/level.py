@@ -88,6 +88,10 @@ class Level:
             method.step()
         return method.volume
 
+    def compared(self, frames: np.ndarray) -> np.ndarray:
+        """What of frames is compared with the measured ones (F · pixels)."""
+        return self.masked(frames).ravel()
+
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
         """What a volume leaves of the frames (F, rows, columns)."""
         return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))

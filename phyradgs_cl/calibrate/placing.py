@@ -11,7 +11,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 FEWEST_BEADS = 4
-_LEAST_SHARE = 0.6  # of the beads that have to be found
+WRONG_PHANTOM = "is it this one, is all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
+_LEAST_SHARE = 0.75  # of the beads that have to be found
 _SMOOTH = 0.5  # of a bead's radius: one of many voxels has one middle then
 _OVER = 2.0  # peaks that are looked for, per bead
 _TOLERANCE_VOXELS = 1.5
@@ -51,8 +52,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     found.sort(key=lambda one: one[:2])
     most = -found[0][0] if found else 0
     if most < max(_LEAST_SHARE * len(known), FEWEST_BEADS - 1):
-        remedy = "is it this phantom, is all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-        raise InputError("--phantom", f"{most} of {len(known)} beads where they should be", "most of them", remedy)
+        raise InputError("--phantom", f"{most} of {len(known)} beads where they should be", "most of them", WRONG_PHANTOM)
     best: list[np.ndarray] = []
     for count, _, place in found:
         if -count < most - 1 or len(best) == _MOST:

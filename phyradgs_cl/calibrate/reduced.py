@@ -92,8 +92,9 @@ def reduced(
     signals = [_signal(level, one, at, volume) for one in parameters]
     images = [*signals, level.residual(operator, volume)]
     *left, beyond = level.off_range(operator, volume, images, iterations)
-    sizes = np.array([max(float(np.linalg.norm(signal)), 1e-30) for signal in signals])
-    unit = np.array([signal.ravel() / size for signal, size in zip(signals, sizes, strict=True)], np.float64)
+    compared = np.array([level.compared(signal) for signal in signals], np.float64)
+    sizes = np.maximum(np.linalg.norm(compared, axis=1), 1e-30)
+    unit = compared / sizes[:, None]
     return Reduced(
         names=tuple(one.name for one in parameters),
         jacobian=np.array([one.ravel() for one in left], np.float64),

@@ -14,7 +14,7 @@ from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibr
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
-from phyradgs_cl.calibrate.placing import bead_centres_mm, placements
+from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
@@ -29,6 +29,7 @@ DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
 LEAST_OF_BEADS = 0.02  # of a parameter's signal, of a known shape: voxels explain nothing by accident
+_LEAST_EXPLAINED = 0.3  # of the frames' variance, by beads that lie best, before anything is put right
 _SETTLED = 0.1  # of a standard deviation
 _OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
@@ -139,8 +140,11 @@ def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, se
         level = BeadLevel.of(scans, phantom, np.array([*place, 1.0]), stage.columns)
         operator = level.operator(change)
         found = level.reconstruct(operator, None, stage.first)
-        best.append((_rms(level.residual(operator, found)), found))
-    return min(best, key=lambda one: one[0])[1]
+        best.append((level.explained(operator, found), found))
+    share, placement = max(best, key=lambda one: one[0])
+    if share < _LEAST_EXPLAINED:
+        raise InputError("--phantom", f"beads that explain {100 * share:.0f} % of the frames", "most", WRONG_PHANTOM)
+    return placement
 
 
 def _blocks(scan: Scan, stage: Stage) -> int:
