@@ -151,9 +151,9 @@ class BeadLevel:
     @classmethod
     def of(
         cls,
-        scans: Sequence[Scan],
         phantom: EllipsoidPhantom,
         start: np.ndarray,
+        scans: Sequence[Scan],
         columns: int,
         most_frames: int = MOST_FRAMES,
     ) -> "BeadLevel":
@@ -189,7 +189,7 @@ class BeadLevel:
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Share of the frames' squares, of what is compared, that the phantom explains; 0 where it would have to add light."""
+        """Share of the squares of what is compared that the phantom explains; 0 where it would have to add light."""
         left, whole = (self.compared(one) for one in (self.residual(operator, placement), self.masked(self.measured)))
         return float(1 - left @ left / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
 

@@ -13,23 +13,27 @@ from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
-from phyradgs_cl.calibrate.parameters import PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
+from phyradgs_cl.calibrate.parameters import DIRECTION, PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
+from phyradgs_cl.check.statistics import residual_ratio, t_statistic
+from phyradgs_cl.check.variants import reversed_readout
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
+Maker = Callable[..., Level | BeadLevel]
 Report = Callable[[int, int, str], None]
 DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
 LEAST_OF_BEADS = 0.02  # of a parameter's signal, of a known shape: voxels explain nothing by accident
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by beads that lie best, before anything is put right
+_ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other order's residual, as ``check`` has them
 _SETTLED = 0.1  # of a standard deviation
 _OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
@@ -87,32 +91,35 @@ def calibrate(
 
     InputError for parameters that there are not, a scan too small, others that do not fit the first, a phantom that is not
     what frames show."""
-    parameters, per_view = chosen(what, scan, phantom is not None)
+    parameters, per_view, asks_direction = chosen(what, scan, phantom is not None)
     ready = [prepared(one, InputOptions()) for one in (scan, *others)]
     _check(ready, per_view, phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     stages = STAGES if phantom is None else BEAD_STAGES
     levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
-    make = partial(Level.of, rt, ready)
+    make: Maker = partial(Level.of, rt)
     if phantom is not None:
         report(0, len(levels), "where the beads are")
-        make = partial(BeadLevel.of, ready, phantom, _placement(rt, ready, phantom, search))
+        make = partial(BeadLevel.of, phantom, _placement(rt, ready, phantom, search))
+    order = _order(make, ready, levels[min(1, len(levels) - 1)], search) if asks_direction else None
+    if order is not None and order.verdict == CORRECTED:
+        scan, ready = reversed_readout(scan), [reversed_readout(one) for one in ready]
     for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
-        level = make(stage.columns)
+        level = make(ready, stage.columns)
         _descend(level, stage, parameters, search)
         if not search.known:
             break
     kept = _corrections(search)
     change, views = change_of(kept), None
-    table = _table(scan, parameters, search, kept)
+    table = ([] if order is None else [order]) + _table(scan, parameters, search, kept)
     if per_view:
         report(len(levels), len(levels), "views")
         find = find_wobble if per_view == WOBBLE else find_sway
         wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
         table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
-    level = make(levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
+    level = make(ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
     corrected = moved(scan, change, views) if kept or views is not None else scan
@@ -137,7 +144,7 @@ def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, se
     volume = first.reconstruct(first.operator(change), None, STAGES[-1].first)
     stage, best = BEAD_STAGES[0], []
     for place in placements(phantom, volume, first.grid):
-        level = BeadLevel.of(scans, phantom, np.array([*place, 1.0]), stage.columns)
+        level = BeadLevel.of(phantom, np.array([*place, 1.0]), scans, stage.columns)
         operator = level.operator(change)
         found = level.reconstruct(operator, None, stage.first)
         best.append((level.explained(operator, found), found))
@@ -145,6 +152,21 @@ def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, se
     if share < _LEAST_EXPLAINED:
         raise InputError("--phantom", f"beads that explain {100 * share:.0f} % of the frames", "most", WRONG_PHANTOM)
     return placement
+
+
+def _order(make: Maker, scans: Sequence[Scan], stage: Stage, search: _Search) -> Found:
+    """Are lines read from the stated end? Told by four standard errors of the frames' residuals, and a share; the deviation
+    is that by which 1 and −1 differ as they do."""
+    stated, other = (
+        np.mean(np.square(_residual(make(some, stage.columns), stage, change_of(search.at), None), dtype=np.float64), (1, 2))
+        for some in (scans, [reversed_readout(scan) for scan in scans])
+    )
+    errors, ratio = t_statistic(stated, other), residual_ratio(stated, other)
+    direction, share = float(scans[0].shutter.direction), abs(1 - min(ratio, 1 / ratio))
+    if abs(errors) < _ORDER_ERRORS or max(ratio, 1 / ratio) < _ORDER_RATIO:
+        return Found(DIRECTION, "", direction, None, None, share, CANNOT_TELL)
+    verdict, found = (AGREES, direction) if errors > 0 else (CORRECTED, -direction)
+    return Found(DIRECTION, "", direction, found, 2 / abs(errors), share, verdict)
 
 
 def _blocks(scan: Scan, stage: Stage) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, Found, calibrate
-from phyradgs_cl.calibrate.parameters import GROUPS, MOTION, PARAMETERS, WOBBLE
+from phyradgs_cl.calibrate.parameters import DIRECTION, GROUPS, MOTION, PARAMETERS, WOBBLE
 from phyradgs_cl.calibrate.picture import residual_picture
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
@@ -25,7 +25,7 @@ from phyradgs_cl.settings import device_wish
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
-_NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION]
+_NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION, DIRECTION]
 _WHAT = f"What to look for, with commas: {', '.join(_NAMES)}."
 _USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
 _OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."

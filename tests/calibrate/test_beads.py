@@ -41,7 +41,7 @@ centre_mm = [0.2, -0.6, -0.1]
 radius_mm = 0.1
 
 [[bead]]
-centre_mm = [0.6, 0.1, -0.5]
+centre_mm = [0.55, -0.35, -0.55]
 radius_mm = 0.08
 
 [[bead]]
@@ -100,7 +100,7 @@ def scanned(rt, phantom, axis="rows", model="log", noise="none", is_fly=True, vi
 def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> None:
     """Of bodies that are turned and shifted there, and poses that are here; two thirds as dense."""
     scan = scanned(rt, lying(known), axis, model, is_fly=is_fly, views=3)
-    level = BeadLevel.of([scan], known, np.array([*LYING, 1.0]), 128)
+    level = BeadLevel.of(known, np.array([*LYING, 1.0]), [scan], 128)
     found = level.operator(Change()).forward(level.start)
     largest = scan.projections.max()
     np.testing.assert_allclose(found, scan.projections, atol=0.05 * largest)
@@ -117,7 +117,7 @@ def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
     mask[10:14, 5:20] = True
     for masked in (None, mask):
         scan = replace(scan, projections=np.asarray(scan.projections) + slope, pixel_mask=masked)
-        level = BeadLevel.of([scan], known, np.array([*LYING, 1.0]) + 0.03, 128)
+        level = BeadLevel.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], 128)
         operator = level.operator(Change())
         found = level.reconstruct(operator, None, 10)
         np.testing.assert_allclose(found[:6], LYING, atol=3e-3)

@@ -179,3 +179,17 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
 def test_views_in_a_result_are_its_trajectory(right) -> None:
     views = Views.none(15)
     assert not isinstance(moved(right, Change(), views).trajectory, CircularOrbit)
+
+
+def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turned, tmp_path, capsys) -> None:
+    """Columns bend it; rows twist it, which two turns tell and one does not."""
+    words = ["--what", "direction", "--json"]
+    for name, scan in (("on", turned()), ("back", turned(back=True)), ("columns", turned(axis="columns"))):
+        write_scan(tmp_path / name, replace(scan, shutter=replace(scan.shutter, direction=-1)))
+    on, out = tmp_path / "on", tmp_path / "out.h5"
+    for asked, verdict in (([on], CANNOT_TELL), ([on, "--with", tmp_path / "back"], CORRECTED), ([tmp_path / "columns"], CORRECTED)):
+        assert cli.run([*map(str, ["calibrate", *asked, "-o", out]), *words]) == 0
+        (one,) = json.loads(capsys.readouterr().out)["parameters"]
+        assert one["verdict"] == verdict, (asked, one)
+        assert load_scan(out).shutter.direction == (1 if verdict == CORRECTED else -1)
+        assert one["found"] is None if verdict == CANNOT_TELL else 0 < one["deviation"] <= 0.5

@@ -53,6 +53,9 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
             detector = entry[schema.DETECTOR]
             _replace(detector, "count_time", scan.shutter.exposure_s, "s")
             _replace(detector, "detector_readout_time", scan.shutter.readout_s, "s")
+            if scan.shutter.direction != stated.shutter.direction:
+                _remove(entry[schema.EXTRA], "readout_direction")
+                write_number(entry[schema.EXTRA], "readout_direction", scan.shutter.direction)
             if starts_s is not None:
                 starts_s[header.image_key == schema.PROJECTION] += later_s
                 _replace(detector, "frame_start_time", starts_s, "s")
