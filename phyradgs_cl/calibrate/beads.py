@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+import scipy
+from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import PerRow, Scan
@@ -23,6 +24,7 @@ _LEAST_SAMPLES, _MOST_SAMPLES = 6, 24  # of an exposure; the phantom's edge move
 _PIXEL_SAMPLES = 2  # along each side: sharp edges within a pixel
 _BLUR_PX = 0.8  # beyond it rays that are half a pixel apart show in the differences of sharp edges
 _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
+_LEAST_ZEROS, _BLOCK = 0.2, 5  # of all pixels, where noise about air was cut off at 0; pixels along a side
 _BACKGROUND = 4  # cosines along each side of a frame that tell no bead: a holder, scatter, drift of the tube
 _STEP_PX = 0.25
 _MOST_PX = 1.5  # that a step of the placement moves a frame by
@@ -32,12 +34,14 @@ DENSITY = 6  # of a placement's numbers, the last
 
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
-    """Frames (F, rows, columns) of a phantom where ``tables`` say that its lines look, ``model`` being the detector's."""
+    """Frames (F, rows, columns) of a phantom where ``tables`` say that its lines look, ``model`` being the detector's.
+    ``cut``: standard deviation of noise of which the part below 0 was cut off, 0 where none was."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
     shape: tuple[int, int]
     model: str
+    cut: float = 0.0
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
         """Line integrals of the phantom turned (rotation vector, rad), shifted (mm) and of a density: seven numbers (7,)."""
@@ -59,6 +63,9 @@ class BeadOperator:
             p = placement[DENSITY] * p.reshape(frames, lines, samples, -1)
             total += np.einsum("fls,flsp->flp", weight, p if self.model == "log" else np.exp(-p)) / _PIXEL_SAMPLES**2
         found = total if self.model == "log" else -np.log(np.maximum(total, TRANSMISSION_FLOOR))
+        if self.cut > 0:  # the mean of what is left: faint ends of a shadow are raised less than air
+            sure = found / self.cut
+            found = found * scipy.special.ndtr(sure) + self.cut * np.exp(-(sure**2) / 2) / math.sqrt(2 * math.pi)
         return np.ascontiguousarray(found if is_rows else found.swapaxes(1, 2), np.float32)
 
 
@@ -147,6 +154,7 @@ class BeadLevel:
     valid: np.ndarray | None
     phantom: EllipsoidPhantom
     start: np.ndarray
+    cut: float
 
     @classmethod
     def of(
@@ -164,7 +172,7 @@ class BeadLevel:
         measured = np.concatenate([np.asarray(scan.projections, np.float32) for scan in small])
         valid = np.concatenate([scan.valid for scan in small])
         bare = [replace(s, projections=np.broadcast_to(np.float32(0), s.projections.shape)) for s in fewer]
-        return cls(bare, block, measured, None if valid.all() else valid, phantom, start)
+        return cls(bare, block, measured, None if valid.all() else valid, phantom, start, _cut_noise(fewer))
 
     def operator(self, change: Change, views: Views | Sway | None = None) -> BeadOperator:
         """The frames of the phantom after a change."""
@@ -175,7 +183,7 @@ class BeadLevel:
             times = int(np.clip(math.ceil(exposure_arc_rad(scan) * edge_px), _LEAST_SAMPLES, _MOST_SAMPLES))
             spread = _as_wide(small, times)
             tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
-        return BeadOperator(self.phantom, tables, small.geometry.detector_shape, self.scans[0].detector_model)
+        return BeadOperator(self.phantom, tables, small.geometry.detector_shape, self.scans[0].detector_model, self.cut)
 
     def masked(self, frames: np.ndarray) -> np.ndarray:
         return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
@@ -250,6 +258,16 @@ class BeadLevel:
             some = cosines[valid.ravel()]
             into[valid] = frame[valid] - some @ np.linalg.lstsq(some, frame[valid], rcond=None)[0]
         return found
+
+
+def _cut_noise(scans: Sequence[Scan]) -> float:
+    """Standard deviation of noise about air of which what was below 0 is 0, from means of small blocks; 0 where few are."""
+    values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
+    valid = np.concatenate([scan.valid for scan in scans])
+    if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
+        return 0.0
+    means = uniform_filter(np.where(valid, values, 0), (0, _BLOCK, _BLOCK)) * math.sqrt(2 * math.pi)
+    return float(np.median(means[valid]))
 
 
 def _as_wide(scan: Scan, times: int) -> Scan:

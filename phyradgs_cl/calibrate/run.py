@@ -13,7 +13,15 @@ from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
-from phyradgs_cl.calibrate.parameters import DIRECTION, PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
+from phyradgs_cl.calibrate.parameters import (
+    DIRECTION,
+    PARAMETERS,
+    WOBBLE,
+    Parameter,
+    change_of,
+    chosen,
+    in_words,
+)
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_sway, find_wobble

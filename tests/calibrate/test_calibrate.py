@@ -187,7 +187,8 @@ def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turne
     for name, scan in (("on", turned()), ("back", turned(back=True)), ("columns", turned(axis="columns"))):
         write_scan(tmp_path / name, replace(scan, shutter=replace(scan.shutter, direction=-1)))
     on, out = tmp_path / "on", tmp_path / "out.h5"
-    for asked, verdict in (([on], CANNOT_TELL), ([on, "--with", tmp_path / "back"], CORRECTED), ([tmp_path / "columns"], CORRECTED)):
+    back, columns = ["--with", tmp_path / "back"], [tmp_path / "columns"]
+    for asked, verdict in (([on], CANNOT_TELL), ([on, *back], CORRECTED), (columns, CORRECTED)):
         assert cli.run([*map(str, ["calibrate", *asked, "-o", out]), *words]) == 0
         (one,) = json.loads(capsys.readouterr().out)["parameters"]
         assert one["verdict"] == verdict, (asked, one)
