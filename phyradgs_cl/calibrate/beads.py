@@ -185,6 +185,10 @@ class BeadLevel:
             tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
         return BeadOperator(self.phantom, tables, small.geometry.detector_shape, self.scans[0].detector_model, self.cut)
 
+    def at(self, change: Change) -> "BeadLevel":
+        """Itself: a background takes a drift, and lag is not looked for."""
+        return self
+
     def masked(self, frames: np.ndarray) -> np.ndarray:
         return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
 

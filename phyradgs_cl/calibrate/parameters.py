@@ -14,6 +14,7 @@ from phyradgs_cl.text import near_miss
 
 _STEP_PX = 0.25  # how far a derivative's differences move the image at its edge
 _TIMING_STEP, _LEAST_TIME = 0.1, 0.7  # of the time that is stated: of a difference, and what may be taken off
+_PER_ONE = 50.0  # what moves nothing is tried by half a percent, and stepped by four at most
 _MOST_TILT_RAD = math.radians(2.0)
 
 
@@ -107,6 +108,8 @@ PARAMETERS = {
             lambda s: s.shutter.exposure_s, _timing_pixels, is_timing=True,
         ),
         Parameter("start", "start_s", "s", _TURN, lambda s: 0.0, _timing_pixels, is_timing=True),
+        Parameter("lag", "lag", "%", "an object that is turned and blurred", lambda s: s.lag, lambda s: _PER_ONE, 100.0),
+        Parameter("drift", "drift", "%", "an object denser at one side", lambda s: 0.0, lambda s: _PER_ONE, 100.0),
     )
 }  # fmt: skip
 GAUGE = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, lambda s: _roll_pixels(s), _DEGREES)

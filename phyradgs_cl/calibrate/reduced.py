@@ -90,7 +90,7 @@ def reduced(
     # What a level's operator takes is what it reconstructed.
     operator: Any = level.operator(change_of(at))
     signals = [_signal(level, one, at, volume) for one in parameters]
-    images = [*signals, level.residual(operator, volume)]
+    images = [*signals, level.at(change_of(at)).residual(operator, volume)]
     *left, beyond = level.off_range(operator, volume, images, iterations)
     compared = np.array([level.compared(signal) for signal in signals], np.float64)
     sizes = np.maximum(np.linalg.norm(compared, axis=1), 1e-30)
@@ -107,12 +107,13 @@ def reduced(
 
 
 def _signal(level: Level | BeadLevel, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
-    """Change of the frames (F, rows, columns) by a unit of a parameter."""
+    """Change of what is expected over what is measured (F, rows, columns) by a unit of a parameter."""
     step = one.step(level.scans[0]) * (1 if one.is_timing else level.block)
     ends = []
     for sign in (1, -1):
-        there = {**at, one.name: at.get(one.name, 0.0) + sign * step}
-        ends.append(level.operator(change_of(there)).forward(volume))
+        there = change_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
+        operator: Any = level.operator(there)
+        ends.append(operator.forward(volume) - level.at(there).measured)
     return level.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 

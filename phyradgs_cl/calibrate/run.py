@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
-from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, evenly_lit, moved
 from phyradgs_cl.calibrate.parameters import (
     DIRECTION,
     PARAMETERS,
@@ -42,6 +42,7 @@ _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
 LEAST_OF_BEADS = 0.02  # of a parameter's signal, of a known shape: voxels explain nothing by accident
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by beads that lie best, before anything is put right
 _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other order's residual, as ``check`` has them
+_OF_FRAMES = ("lag", "drift")  # what is no matter of poses
 _SETTLED = 0.1  # of a standard deviation
 _OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
@@ -100,12 +101,13 @@ def calibrate(
     InputError for parameters that there are not, a scan too small, others that do not fit the first, a phantom that is not
     what frames show."""
     parameters, per_view, asks_direction = chosen(what, scan, phantom is not None)
-    ready = [prepared(one, InputOptions()) for one in (scan, *others)]
-    _check(ready, per_view, phantom)
+    asks_lag = any(one.name == "lag" for one in parameters)
+    ready = [prepared(one, InputOptions(ignore_lag=asks_lag)) for one in (scan, *others)]
+    _check(ready, [one.name for one in parameters], per_view, phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     stages = STAGES if phantom is None else BEAD_STAGES
     levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
-    make: Maker = partial(Level.of, rt)
+    make: Maker = partial(Level.of, rt, asks_lag)
     if phantom is not None:
         report(0, len(levels), "where the beads are")
         make = partial(BeadLevel.of, phantom, _placement(rt, ready, phantom, search))
@@ -131,6 +133,7 @@ def calibrate(
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
     corrected = moved(scan, change, views) if kept or views is not None else scan
+    corrected = evenly_lit(corrected, change.drift) if change.drift else corrected
     calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
     told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
     return replace(calibration, scan=replace(corrected, provenance=told))
@@ -148,7 +151,7 @@ def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, se
     """How the phantom lies (7,), about: of the places where its beads are seen, that which explains the frames best."""
     bead_centres_mm(phantom)
     change = change_of(search.at)
-    first = Level.of(rt, scans, STAGES[-1].columns)
+    first = Level.of(rt, False, scans, STAGES[-1].columns)
     volume = first.reconstruct(first.operator(change), None, STAGES[-1].first)
     stage, best = BEAD_STAGES[0], []
     for place in placements(phantom, volume, first.grid):
@@ -181,17 +184,21 @@ def _blocks(scan: Scan, stage: Stage) -> int:
     return -(-max(scan.geometry.detector_shape) // stage.columns)
 
 
-def _check(scans: Sequence[Scan], per_view: str, phantom: EllipsoidPhantom | None) -> None:
+def _check(scans: Sequence[Scan], names: Sequence[str], per_view: str, phantom: EllipsoidPhantom | None) -> None:
     first = scans[0]
-    if per_view and phantom is not None:
-        raise InputError(f"--what {per_view}", "with a phantom", "parameters of all views", "leave one of the two out")
+    unsuited = [per_view] * bool(per_view) + [name for name in _OF_FRAMES if name in names]
+    if unsuited and phantom is not None:
+        expected = "parameters of geometry and timing, of all views"
+        raise InputError(f"--what {unsuited[0]}", "with a phantom", expected, "leave one of the two out")
+    if per_view and "lag" in names:
+        raise InputError(f"--what {per_view}", "with lag", "one of the two at a time", "ask twice")
     if per_view and len(scans) > 1:
         raise InputError(f"--what {per_view}", "a second scan", "one scan: views are each scan's own", "leave --with out")
     if first.frames < _FEWEST_FRAMES or first.geometry.detector_shape[1] < _FEWEST_COLUMNS:
         found = f"{first.frames} frames of {first.geometry.detector_shape[1]} columns"
         raise InputError("scan", found, f"at least {_FEWEST_FRAMES} frames of {_FEWEST_COLUMNS} columns")
     for other in scans[1:]:
-        for name in ("geometry", "grid", "detector_model"):
+        for name in ("geometry", "grid", "detector_model", "lag"):
             if getattr(other, name) != getattr(first, name):
                 found = str(getattr(other, name))
                 raise InputError(f"--with: {name}", found, f"the first scan's, {getattr(first, name)}")
@@ -207,7 +214,8 @@ def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parame
     for number in range(stage.steps):
         asked = parameters if asks else [PARAMETERS[name] for name in search.known]
         operator: Any = level.operator(change_of(search.at))
-        volume = level.reconstruct(operator, volume, stage.again if number else stage.first)
+        here = level.at(change_of(search.at))
+        volume = here.reconstruct(operator, volume, stage.again if number else stage.first)
         problem = reduced(level, asked, search.at, volume, stage.project)
         if asks:
             least = LEAST_OF_BEADS
@@ -272,6 +280,7 @@ def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: M
 def _residual(level: Level | BeadLevel, stage: Stage, change: Change, views: Views | Sway | None) -> np.ndarray:
     """What a volume leaves of the frames (F, rows, columns) after a change."""
     operator: Any = level.operator(change, views)
+    level = level.at(change)
     return level.residual(operator, level.reconstruct(operator, None, stage.first))
 
 

@@ -74,7 +74,7 @@ def _found(
     names: Sequence[tuple[str, str, float]],
 ) -> Wobble:
     for (columns, first, again), asked in zip(stages, kinds, strict=True):
-        level, volume = Level.of(rt, [scan], columns, scan.frames), None
+        level, volume = Level.of(rt, False, [scan], columns, scan.frames), None
         for _ in range(_STEPS):
             operator = numbers.operator(level, change)
             volume = level.reconstruct(operator, volume, first if volume is None else again)

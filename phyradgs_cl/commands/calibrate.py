@@ -57,8 +57,8 @@ def calibrate_command(
         ticker.stage(f"reading {scan}")
         shape = None if phantom is None else load_beads(phantom)
         loaded, others = load_scan(scan), [] if other is None else [load_scan(other)]
-        if output is not None and WOBBLE in (what or ""):
-            _check_storable(loaded)
+        if output is not None:
+            _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
         report = lambda done, total, at: ticker.show(done, total, f"  {at}")  # noqa: E731
         found = calibrate(loaded, Runtime(wish), what, others, report, shape)
     if output is not None:
@@ -73,8 +73,14 @@ def calibrate_command(
         say(f"{output}: {said} corrected")
 
 
-def _check_storable(scan: Loaded) -> None:
-    """InputError where a table of poses over time has no place for views of their own."""
+def _check_storable(scan: Loaded, asked: list[str]) -> None:
+    """InputError where a file has no place: for another light of its frames, or in a table of poses over time for views of
+    their own."""
+    if "drift" in asked:
+        remedy = "leave -o out, and normalise frames by 'phyradgs prepare --steps air'"
+        raise InputError("--what drift", "with -o", "a copy whose frames stay as they are", remedy)
+    if WOBBLE not in asked:
+        return
     closest_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))
     if scan.is_fly and closest_s <= scan.shutter.span_s:
         found = f"frames of {scan.shutter.span_s:.4g} s that begin every {closest_s:.4g} s"
