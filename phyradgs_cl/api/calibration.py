@@ -9,7 +9,6 @@ from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
 from phyradgs_cl.importers import load_beads
-from phyradgs_cl.phantoms import EllipsoidPhantom
 
 
 def calibrate(
@@ -17,7 +16,7 @@ def calibrate(
     what: str | None = None,
     *,
     others: Sequence[Scan] = (),
-    phantom: str | Path | EllipsoidPhantom | None = None,
+    phantom: str | Path | None = None,
     device: Device = None,
 ) -> Calibration:
     """Geometry and timing as the frames tell them (docs/calibrate.md); what they cannot tell stays as stated.
@@ -25,7 +24,7 @@ def calibrate(
     what: names with commas, ``offset,roll,tilt`` and of a fly-scan ``readout,exposure`` when None; also ``distance``,
     ``start`` and ``wobble`` (views one by one). others: more scans of the same object, lying as it did, with the same panel:
     what is wrong in ``scan`` is taken to be wrong in them. phantom: what was scanned, wherever it lies, where that
-    is known: beads and wires, or their TOML file, lengths in mm. device: what ``--device`` takes, or a Runtime.
+    is known: a TOML file of beads and wires (docs/formats.md). device: what ``--device`` takes, or a Runtime.
 
     The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s) and a
     verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals
@@ -36,5 +35,5 @@ def calibrate(
     """
     check_scan(scan)
     scan.check_timing()
-    shape = load_beads(Path(phantom)) if isinstance(phantom, str | Path) else phantom
+    shape = None if phantom is None else load_beads(Path(phantom))
     return run_calibration(scan, runtime_of(device), what, others, phantom=shape)
