@@ -22,12 +22,13 @@ def calibrate(
     """Geometry and timing as the frames tell them (docs/calibrate.md); what they cannot tell stays as stated.
 
     what: names with commas, ``offset,roll,tilt`` and of a fly-scan ``readout,exposure`` when None; also ``distance``,
-    ``start`` and ``wobble`` (views one by one). others: more scans of the same object, lying as it did, with the same panel:
-    what is wrong in ``scan`` is taken to be wrong in them. phantom: what was scanned, wherever it lies, where that
-    is known: a TOML file of beads and wires (docs/formats.md). device: what ``--device`` takes, or a Runtime.
+    ``start``, ``direction``, ``lag``, ``drift``, ``motion`` and ``wobble`` (views one by one). others: more scans of the
+    same object, lying as it did, with the same panel: what is wrong in ``scan`` is taken to be wrong in them. phantom: what
+    was scanned, wherever it lies, where that is known: a TOML file of beads and wires (docs/formats.md). device: what
+    ``--device`` takes, or a Runtime.
 
-    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s) and a
-    verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals
+    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s, %), and
+    a verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals
     before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames.
 
     Raises InputError for names that there are not, timing of a gantry that stands still, fewer than 8 frames or 12 columns,

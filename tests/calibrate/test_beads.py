@@ -138,20 +138,20 @@ def test_beads_are_told_from_spots_that_are_none_and_from_their_mirror_image(kno
 
 
 def test_a_scanner_is_found_by_what_it_shows_of_beads(cli, rt, file, known, tmp_path, capsys) -> None:
-    """Rows read, one turn; another start of all frames is the phantom turned."""
-    scan = scanned(rt, lying(known), noise="tigre")
-    planted = {"readout": 0.09, "exposure": -0.17, "offset-u": 0.15, "detector-distance": -0.05}
+    """Rows read, from the other end than stated, one turn; another start of all frames is the phantom turned."""
+    scan = scanned(rt, lying(known), noise="tigre", views=10)
+    planted = {"readout": 0.09, "exposure": -0.17, "offset-u": 0.15, "detector-distance": -0.05, "direction": 2.0}
     off = Change(readout_s=0.09, exposure_s=-0.17, offset_u_mm=0.15, detector_distance_mm=-0.05)
     stated = moved(scan, Change(**{name: -value for name, value in vars(off).items()}))
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
-    write_scan(path, stated)
-    what = "offset-u,roll,distance,readout,exposure"
+    write_scan(path, replace(stated, shutter=replace(stated.shutter, direction=-1)))
+    what = "direction,offset-u,roll,distance,readout,exposure"
     assert cli.run(["calibrate", str(path), "--phantom", str(file), "--what", what, "-o", str(out), "--json"]) == 0
     lines = {one["name"]: one for one in json.loads(capsys.readouterr().out)["parameters"]}
     for name, one in lines.items():
         error = one["found"] - one["stated"] - planted.get(name, 0.0)
         assert one["deviation"] > 0 and abs(error) < 3 * one["deviation"], one
-    for name in ("readout", "exposure"):
+    for name in ("direction", "readout", "exposure"):
         one = lines[name]
         assert one["verdict"] == CORRECTED and one["deviation"] < 0.05 * one["found"], one
     read = load_scan(out)
