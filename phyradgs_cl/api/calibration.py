@@ -27,9 +27,9 @@ def calibrate(
     was scanned, wherever it lies, where that is known: a TOML file of beads and wires (docs/formats.md). device: what
     ``--device`` takes, or a Runtime.
 
-    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s, %), and
-    a verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals
-    before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames.
+    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s, %),
+    and a verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line
+    integrals before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames.
 
     Raises InputError for names that there are not, timing of a gantry that stands still, fewer than 8 frames or 12 columns,
     others that do not fit the first, and a phantom that the frames do not show.
