@@ -291,7 +291,7 @@ def table(path: Path) -> str:
             cells[1] = f"{np.mean([one['deviation'] for one in known]):.2g}"
             cells[2] = f"{max(abs(one['z']) for one in known):.1f}"
             cells[3] = f"{sum(abs(one['z']) <= 2 for one in known)} of {len(known)}"
-        is_drawn = len({one["truth"] for one in found}) > 1
+        is_drawn = np.ptp([one["truth"] for one in found]) > 1e-9
         shown = f"{'drawn' if is_drawn else format(found[0]['truth'], '.4g')} {found[0]['unit']}"
         text.append(f"| {case} | {size}, {views} | {name} | {shown} | {' | '.join(cells)} | {verdicts} | {len(found)} |")
     text += ["", "| case | volume³, views | PSNR stated | calibrated | right | worst calibrated - right | seconds |"]

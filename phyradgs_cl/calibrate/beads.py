@@ -21,7 +21,7 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
 _LEAST_SAMPLES, _MOST_SAMPLES = 6, 24  # of an exposure; the phantom's edge moves by a pixel between two
-_PIXEL_SAMPLES = 2  # along each side: sharp edges within a pixel
+_PIXEL_SAMPLES, _MOST_PIXEL_SAMPLES = 2, 6  # rays along each side of a pixel, or a block, and along a bead's radius
 _BLUR_PX = 0.8  # beyond it rays that are half a pixel apart show in the differences of sharp edges
 _SLACK = 1.2  # of a bead's shadow, beside its size over the panel's pitch
 _LEAST_ZEROS, _BLOCK = 0.2, 5  # of all pixels, where noise about air was cut off at 0; pixels along a side
@@ -35,13 +35,15 @@ DENSITY = 6  # of a placement's numbers, the last
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
     """Frames (F, rows, columns) of a phantom where ``tables`` say that its lines look, ``model`` being the detector's.
-    ``cut``: standard deviation of noise of which the part below 0 was cut off, 0 where none was."""
+    ``samples``: rays along each side of a pixel. ``cut``: standard deviation of noise of which the part below 0 was cut off,
+    0 where none was."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
     shape: tuple[int, int]
     model: str
-    cut: float = 0.0
+    samples: int
+    cut: float
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
         """Line integrals of the phantom turned (rotation vector, rad), shifted (mm) and of a density: seven numbers (7,)."""
@@ -59,9 +61,9 @@ class BeadOperator:
             pixels=self.shape[1] if is_rows else self.shape[0],
         )
         total = np.zeros((frames, lines, seen.pixels))
-        for p in seen.integrals(self.phantom):
+        for p in seen.integrals(self.phantom, self.samples):
             p = placement[DENSITY] * p.reshape(frames, lines, samples, -1)
-            total += np.einsum("fls,flsp->flp", weight, p if self.model == "log" else np.exp(-p)) / _PIXEL_SAMPLES**2
+            total += np.einsum("fls,flsp->flp", weight, p if self.model == "log" else np.exp(-p)) / self.samples**2
         found = total if self.model == "log" else -np.log(np.maximum(total, TRANSMISSION_FLOOR))
         if self.cut > 0:  # the mean of what is left: faint ends of a shadow are raised less than air
             sure = found / self.cut
@@ -94,10 +96,10 @@ class _Lines:
     line: np.ndarray
     pixels: int
 
-    def integrals(self, phantom: EllipsoidPhantom) -> Iterator[np.ndarray]:
-        """Line integrals (N, pixels), float32, of rays to a few points of every pixel's area, one after the other."""
+    def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
+        """Line integrals (N, pixels), float32, of rays to samples² points of every pixel's area, one after the other."""
         shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
-        offsets = (np.arange(_PIXEL_SAMPLES) + 0.5) / _PIXEL_SAMPLES - 0.5
+        offsets = (np.arange(samples) + 0.5) / samples - 0.5
         for across, along in itertools.product(offsets, offsets):
             total = np.zeros((len(self.line), self.pixels), np.float32)
             for body, chosen, start, width in shadows:
@@ -183,7 +185,11 @@ class BeadLevel:
             times = int(np.clip(math.ceil(exposure_arc_rad(scan) * edge_px), _LEAST_SAMPLES, _MOST_SAMPLES))
             spread = _as_wide(small, times)
             tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
-        return BeadOperator(self.phantom, tables, small.geometry.detector_shape, self.scans[0].detector_model, self.cut)
+        radius_mm = float(np.median([body.reach_mm for body in self.phantom.ellipsoids])) * small.geometry.magnification
+        per_pixel = math.ceil(_PIXEL_SAMPLES * min(small.geometry.pixel_size_mm) / radius_mm)
+        samples = int(np.clip(per_pixel, _PIXEL_SAMPLES, _MOST_PIXEL_SAMPLES))
+        model = self.scans[0].detector_model
+        return BeadOperator(self.phantom, tables, small.geometry.detector_shape, model, samples, self.cut)
 
     def at(self, change: Change) -> "BeadLevel":
         """Itself: a background takes a drift, and lag is not looked for."""
