@@ -326,6 +326,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=32)
     parser.add_argument("--views", type=int, default=25)
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--device", default=None)
     parser.add_argument("--table", action="store_true", help="print the tables of the results file given as FOLDER")
     arguments = parser.parse_args()
@@ -335,7 +336,7 @@ def main() -> None:
     rt = Runtime(arguments.device)
     key = ("case", "volume", "size", "views", "seed")
     done = {tuple(run[k] for k in key) for run in read_lines(arguments.results)}
-    for seed in range(arguments.seeds):
+    for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
         for case in arguments.cases.split(","):
             of_volumes = files_of(arguments.folder, arguments.only, arguments.size) if case != "beads" else {case: Path()}
             for name, path in of_volumes.items():
