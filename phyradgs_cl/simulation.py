@@ -134,7 +134,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
 
 def simulated_scan(
     rt: Runtime,
-    of: str | LoadedVolume,
+    of: str | LoadedVolume | EllipsoidPhantom,
     scanner: Scanner,
     options: SimulationOptions,
     *,
@@ -143,13 +143,14 @@ def simulated_scan(
     name: str = "volume",
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
-    """What a scanner records of a phantom, by its name, or of a volume, called ``name``; the truth is its reference.
+    """What a scanner records of a phantom, by its name or of one's own, or of a volume, called ``name``; the truth is its
+    reference.
     size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples:
     rays along each side of a pixel. Warns of an inverse crime."""
     if size is not None:
-        checks.within("--size", size, SMALLEST_PHANTOM if isinstance(of, str) else 1, LARGEST_GRID)
+        checks.within("--size", size, 1 if isinstance(of, LoadedVolume) else SMALLEST_PHANTOM, LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
-    if isinstance(of, str):
+    if not isinstance(of, LoadedVolume):
         count = size or max(scanner.grid.shape)
         scene = phantom_scene(rt, of, *where, count, axis, options.seed, pixel_samples)
     else:
@@ -323,7 +324,7 @@ class Scene:
 
 def phantom_scene(
     rt: Runtime,
-    name: str,
+    of: str | EllipsoidPhantom,
     geometry: ConeGeometry,
     box: Grid,
     size: int,
@@ -331,23 +332,23 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom in the scanner's box, with ``size`` voxels per side. Closed forms are integrated exactly;
-    procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
+    """A phantom, one's own or by its name, in the scanner's box, with ``size`` voxels per side. Closed forms are integrated
+    exactly; procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
     ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
-    phantom = make_phantom(name, half_size_mm, 2 * size, seed)
+    phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, EllipsoidPhantom):
         grid = _resized(box, size)
         source = _on_panel(geometry, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
-        return Scene(source, grid, phantom.voxelise(grid, 4), f"phantom {name}")
+        return Scene(source, grid, phantom.voxelise(grid, 4), f"phantom {phantom.name}")
     fine = Grid.cube(2 * size, 2 * half_size_mm)
     if not (np.allclose(box.size_mm, fine.size_mm) and np.allclose(box.offset_mm, 0)):
         text = "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
-        log.warning(text + "are not used", name, 2 * half_size_mm)
+        log.warning(text + "are not used", of, 2 * half_size_mm)
     volume = phantom.voxelise(fine)
     source, bone = _voxel_sources(rt, volume, fine, geometry, axis, pixel_samples)
     truth = block_mean(volume, (size,) * 3)
-    return Scene(source, Grid.cube(size, 2 * half_size_mm), truth, f"phantom {name}", bone=bone)
+    return Scene(source, Grid.cube(size, 2 * half_size_mm), truth, f"phantom {of}", bone=bone)
 
 
 def volume_scene(

@@ -11,7 +11,8 @@ QUICK = (
     # options of every method, the loop, the whole gradient, FDK, what a GPU would run
     "reconstructors/test_registry.py", "reconstructors/test_loop.py", "reconstructors/test_whole_objective.py",
     "reconstructors/test_fdk", "reconstructors/test_gpu_shape.py", "reconstructors/test_without_pytorch.py",
-    "calibrate/test_moved.py", "check/test_plain_questions.py", "check/test_variants.py",
+    "calibrate/test_moved.py", "calibrate/test_beads.py::test_frames_are", "calibrate/test_beads.py::test_files_of",
+    "check/test_plain_questions.py", "check/test_variants.py",
     "io/test_atomic.py", "io/test_checkpoint_file.py", "io/test_scan_round_trip.py", "io/test_volume_file.py",
     # every command; a kill and a resume; a full disk; hostile files of each kind
     "cli/test_smoke.py", "cli/test_settings.py", "cli/test_startup.py",

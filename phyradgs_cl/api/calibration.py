@@ -1,30 +1,40 @@
 """A scan's true geometry and timing, from the scan itself."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
+from phyradgs_cl.importers import load_beads
 
 
 def calibrate(
-    scan: Scan, what: str | None = None, *, others: Sequence[Scan] = (), device: Device = None
+    scan: Scan,
+    what: str | None = None,
+    *,
+    others: Sequence[Scan] = (),
+    phantom: str | Path | None = None,
+    device: Device = None,
 ) -> Calibration:
     """Geometry and timing as the frames tell them (docs/calibrate.md); what they cannot tell stays as stated.
 
     what: names with commas, ``offset,roll,tilt`` and of a fly-scan ``readout,exposure`` when None; also ``distance``,
-    ``start`` and ``wobble`` (views one by one). others: more scans of the same object, lying as it did, with the same panel:
-    what is wrong in ``scan`` is taken to be wrong in them. device: what ``--device`` takes, or a Runtime.
+    ``start``, ``direction``, ``lag``, ``drift``, ``motion`` and ``wobble`` (views one by one). others: more scans of the
+    same object, lying as it did, with the same panel: what is wrong in ``scan`` is taken to be wrong in them. phantom: what
+    was scanned, wherever it lies, where that is known: a TOML file of beads and wires (docs/formats.md). device: what
+    ``--device`` takes, or a Runtime.
 
-    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s) and a
-    verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line integrals
-    before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames.
+    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s, %),
+    and a verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line
+    integrals before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames.
 
     Raises InputError for names that there are not, timing of a gantry that stands still, fewer than 8 frames or 12 columns,
-    and others that do not fit the first.
+    others that do not fit the first, and a phantom that the frames do not show.
     """
     check_scan(scan)
     scan.check_timing()
-    return run_calibration(scan, runtime_of(device), what, others)
+    shape = None if phantom is None else load_beads(Path(phantom))
+    return run_calibration(scan, runtime_of(device), what, others, phantom=shape)

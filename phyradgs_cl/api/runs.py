@@ -16,7 +16,7 @@ from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers import foreign_volume, load_attenuation
+from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
 from phyradgs_cl.importers import load_volume as load_voxels
 from phyradgs_cl.io import StoredVolume, read_scan, read_state, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
@@ -121,7 +121,7 @@ def simulate(
 ) -> Scan:
     """A fly-scan (or, with ``protocol="static"``, a stop-and-shoot scan) of a phantom, with its truth as reference.
 
-    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm.
+    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
     size: voxels along the longest side of grid and reference. detector: columns, rows in proportion.
     device: what ``--device`` takes, or a Runtime.
@@ -134,7 +134,8 @@ def simulate(
         raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
     described = scanner_for(scanner, detector)
     chosen = scanner_options(described, protocol, **options)
-    of = str(phantom) if phantom in PHANTOMS else load_attenuation(phantom)
+    is_toml = str(phantom).endswith(".toml")
+    of = str(phantom) if phantom in PHANTOMS else (load_beads(Path(phantom)) if is_toml else load_attenuation(phantom))
     name = f"volume {phantom}"
     return simulated_scan(runtime_of(device), of, described, chosen, size=size, name=name)
 

@@ -1,15 +1,17 @@
 """The frames of one or two scans at one coarseness, their operator under any change, and the volume that fits them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
-from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, drift_course, moved
 from phyradgs_cl.check.coarse import binned, coarse_grid, fewer_frames, smooth
 from phyradgs_cl.check.questions.timing import exposure_arc_rad
+from phyradgs_cl.detector import noise_level
+from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.operators.rays.operator import RayOperator
@@ -29,7 +31,8 @@ _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 @dataclass(frozen=True, eq=False)
 class Level:
     """``scans`` as they are stated, with at most 60 frames each; measured (F, rows, columns): the frames of all of them in
-    blocks of ``block`` pixels, 0 where ``valid`` is not; ``grid``: the volume's."""
+    blocks of ``block`` pixels, 0 where ``valid`` is not; ``grid``: the volume's. ``before`` likewise: transmission of the
+    frame before each, of scans whose lag is looked for; ``course`` (F,): of a drift."""
 
     rt: Runtime
     scans: Sequence[Scan]
@@ -37,20 +40,44 @@ class Level:
     grid: Grid
     measured: np.ndarray
     valid: np.ndarray | None
+    course: np.ndarray
+    before: np.ndarray | None = None
 
     @classmethod
-    def of(cls, rt: Runtime, scans: Sequence[Scan], columns: int, most_frames: int = MOST_FRAMES) -> "Level":
+    def of(
+        cls,
+        rt: Runtime,
+        asks_lag: bool,
+        scans: Sequence[Scan],
+        columns: int,
+        most_frames: int = MOST_FRAMES,
+    ) -> "Level":
         """Blocks such that the longer side has at most ``columns`` of them."""
         block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
+
+        def made_small(scan: Scan) -> Scan:
+            return binned(smooth(fewer_frames(scan, most_frames), _SMOOTH * block if block > 1 else 0.0), block)
+
         fewer = [fewer_frames(scan, most_frames) for scan in scans]
-        small = [binned(smooth(scan, _SMOOTH * block if block > 1 else 0.0), block) for scan in fewer]
+        small = [made_small(scan) for scan in scans]
         grid = coarse_grid(scans[0].grid, small[0].geometry, 1.0)
         measured = np.concatenate([np.asarray(scan.projections, np.float32) for scan in small])
         valid = np.concatenate([scan.valid for scan in small])
         bare = [replace(s, projections=np.broadcast_to(np.float32(0), s.projections.shape)) for s in fewer]
-        if valid.all():
-            return cls(rt, bare, block, grid, measured, None)
-        return cls(rt, bare, block, grid, np.where(valid, measured, np.float32(0)), valid)
+        course = np.concatenate([drift_course(scan) for scan in fewer])
+        before = np.concatenate([_through_before(scan, made_small) for scan in scans]) if asks_lag else None
+        level = cls(rt, bare, block, grid, measured, None if valid.all() else valid, course, before)
+        return replace(level, measured=level.masked(measured))
+
+    def at(self, change: Change) -> "Level":
+        """The frames without the lag and the drift that they would then have."""
+        measured = self.measured
+        if self.before is not None:
+            lag = self.scans[0].lag + change.lag
+            through = (np.exp(-measured) - lag * self.before) / (1 - lag)
+            measured = -np.log(np.maximum(through, TRANSMISSION_FLOOR))
+        measured = measured + change.drift * self.course[:, None, None]
+        return replace(self, measured=self.masked(measured.astype(np.float32)), before=None)
 
     @property
     def is_intensity(self) -> bool:
@@ -87,11 +114,37 @@ class Level:
             method.step()
         return method.volume
 
-    def off_range(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
-        """What of ``frames`` no volume explains, as far as CGLS gets in ``iterations``."""
+    def compared(self, frames: np.ndarray) -> np.ndarray:
+        """What of frames is compared with the measured ones (F · pixels)."""
+        return self.masked(frames).ravel()
+
+    def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """What a volume leaves of the frames (F, rows, columns)."""
+        return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))
+
+    def noise(self, residual: np.ndarray) -> float:
+        """Standard deviation of a pixel's noise; a volume fits some of it, so that the residual would say too little."""
+        return noise_level(self.measured, self.valid)
+
+    def off_range(
+        self, operator: RayOperator, volume: np.ndarray, images: Sequence[np.ndarray], iterations: int
+    ) -> list[np.ndarray]:
+        """What of each image (F, rows, columns) no volume, be it this one or another, explains, as far as CGLS gets."""
+        return [self._off_range(operator, image, iterations) for image in images]
+
+    def _off_range(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
         method = Cgls(System(operator, self.masked(frames), self.valid))
         for _ in range(iterations):
             if method.finished:
                 break
             method.step()
         return method.residual
+
+
+def _through_before(scan: Scan, made_small: Callable[[Scan], Scan]) -> np.ndarray:
+    """Transmission (F, rows, columns) of the frame before each, none before the first: the beam was off."""
+    frames = np.asarray(scan.projections)
+    small = made_small(replace(scan, projections=np.concatenate([frames[:1], frames[:-1]])))
+    through: np.ndarray = np.exp(-np.asarray(small.projections, np.float32))
+    through[0] = 0
+    return through

@@ -7,6 +7,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.trajectory import Trajectory
 
 
@@ -15,8 +16,9 @@ class Change:
     """What is different, in the order of docs/calibrate.md; all 0 is the scan as stated.
 
     Shifts of the panel in its own columns and rows, its turns about its middle (roll in its plane, tilts about v and u),
-    source and panel further from the axis, what is longer or later in time, and a turn of all views about the axis, which
-    no frame can tell from an object that is turned.
+    source and panel further from the axis, what is longer or later in time, more of the frame before that a panel shows, how
+    much brighter (log) the beam gets from the first frame to the last, and a turn of all views about the axis, which no
+    frame can tell from an object that is turned.
     """
 
     offset_u_mm: float = 0.0
@@ -29,6 +31,8 @@ class Change:
     readout_s: float = 0.0
     exposure_s: float = 0.0
     start_s: float = 0.0
+    lag: float = 0.0
+    drift: float = 0.0
     turn_rad: float = 0.0
 
 
@@ -111,8 +115,8 @@ class Moved:
 
 
 def moved(scan: Scan, change: Change, views: Views | Sway | None = None) -> Scan:
-    """The scan after a change. Offsets and distances of a circular orbit stay numbers of its geometry; what they cannot say
-    makes the trajectory one of its own."""
+    """The scan after a change, its frames as they are (``evenly_lit`` is for those). Offsets and distances of a circular
+    orbit stay numbers of its geometry; what they cannot say makes the trajectory one of its own."""
     shutter, geometry, path = scan.shutter, scan.geometry, scan.trajectory
     shutter = replace(
         shutter, readout_s=shutter.readout_s + change.readout_s, exposure_s=shutter.exposure_s + change.exposure_s
@@ -127,11 +131,23 @@ def moved(scan: Scan, change: Change, views: Views | Sway | None = None) -> Scan
     turns = (change.roll_rad, change.tilt_v_rad, change.tilt_u_rad, change.turn_rad)
     if isinstance(path, CircularOrbit) and not any(turns) and views is None:
         path = CircularOrbit(geometry, path.kinematics)
-    elif change != _timing(change) or views is not None:
+    elif change != _not_of_poses(change) or views is not None:
         path = Moved(path, geometry.detector_shape, change, views)
     start_s = np.asarray(scan.frame_start_s, np.float64) + change.start_s
-    return replace(scan, geometry=geometry, trajectory=path, shutter=shutter, frame_start_s=start_s)
+    lag = float(np.clip(scan.lag + change.lag, 0, LARGEST_LAG))
+    return replace(scan, geometry=geometry, trajectory=path, shutter=shutter, frame_start_s=start_s, lag=lag)
 
 
-def _timing(change: Change) -> Change:
-    return Change(readout_s=change.readout_s, exposure_s=change.exposure_s, start_s=change.start_s)
+def _not_of_poses(change: Change) -> Change:
+    return Change(**{name: getattr(change, name) for name in ("readout_s", "exposure_s", "start_s", "lag", "drift")})
+
+
+def evenly_lit(scan: Scan, drift: float) -> Scan:
+    """The scan as a beam that gets no brighter had recorded it."""
+    return replace(scan, projections=(scan.projections + drift * drift_course(scan)[:, None, None]).astype(np.float32))
+
+
+def drift_course(scan: Scan) -> np.ndarray:
+    """Where in the scan its frames (F,) begin, -1/2 to 1/2."""
+    starts_s = np.asarray(scan.frame_start_s, np.float64)
+    return (starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5

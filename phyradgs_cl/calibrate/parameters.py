@@ -14,6 +14,7 @@ from phyradgs_cl.text import near_miss
 
 _STEP_PX = 0.25  # how far a derivative's differences move the image at its edge
 _TIMING_STEP, _LEAST_TIME = 0.1, 0.7  # of the time that is stated: of a difference, and what may be taken off
+_PER_ONE = 50.0  # what moves nothing is tried by half a percent, and stepped by four at most
 _MOST_TILT_RAD = math.radians(2.0)
 
 
@@ -107,6 +108,8 @@ PARAMETERS = {
             lambda s: s.shutter.exposure_s, _timing_pixels, is_timing=True,
         ),
         Parameter("start", "start_s", "s", _TURN, lambda s: 0.0, _timing_pixels, is_timing=True),
+        Parameter("lag", "lag", "%", "an object that is turned and blurred", lambda s: s.lag, lambda s: _PER_ONE, 100.0),
+        Parameter("drift", "drift", "%", "an object denser at one side", lambda s: 0.0, lambda s: _PER_ONE, 100.0),
     )
 }  # fmt: skip
 GAUGE = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, lambda s: _roll_pixels(s), _DEGREES)
@@ -117,29 +120,31 @@ GROUPS = {
     "distance": ("source-distance", "detector-distance"),
     "timing": ("readout", "exposure", "start"),
 }
-WOBBLE, MOTION = "wobble", "motion"
+WOBBLE, MOTION, DIRECTION = "wobble", "motion", "direction"
 
 
-def chosen(what: str | None, scan: Scan) -> tuple[list[Parameter], str]:
+def chosen(what: str | None, scan: Scan, knows_shape: bool = False) -> tuple[list[Parameter], str, bool]:
     """(the parameters that ``what`` names with commas; whether views are asked for one by one or the object's motion, as
-    named); None: those of the panel and, of a fly-scan, readout and exposure. InputError for a name that there is not, both
-    of the latter, or timing of a gantry at rest."""
-    words = [word.strip() for word in (_usual(scan) if what is None else what).split(",")]
+    named; whether the readout's direction is); None: those of the panel, of an object of known shape distances and, of a
+    fly-scan, readout and exposure. InputError: a name that there is not, views and motion, timing of a gantry at rest."""
+    words = [word.strip() for word in (_usual(scan) + ",distance" * knows_shape if what is None else what).split(",")]
     names: list[str] = []
     for word in words:
-        if word not in (*PARAMETERS, *GROUPS, WOBBLE, MOTION):
-            known = [*GROUPS, *PARAMETERS, WOBBLE, MOTION]
+        if word not in (known := [*GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRECTION]):
             raise InputError("--what", repr(word), ", ".join(known), near_miss(word, known, "name some of them"))
         names += GROUPS.get(word, (word,))
     names = list(dict.fromkeys(names))
     per_view = [name for name in names if name in (WOBBLE, MOTION)]
     if len(per_view) > 1:
         raise InputError("--what", f"{WOBBLE} and {MOTION}", "one of the two: each would take the other's part", "ask twice")
-    found = [PARAMETERS[name] for name in names if name not in per_view]
-    timed = [one.name for one in found if one.is_timing]
+    found = [PARAMETERS[name] for name in names if name in PARAMETERS]
+    asks_direction = DIRECTION in names
+    timed = [one.name for one in found if one.is_timing] + [DIRECTION] * asks_direction
     if timed and not _turns(scan):
         raise InputError("--what", timed[0], "a parameter of the panel: this gantry stands still in each frame")
-    return found, "".join(per_view)
+    if asks_direction and scan.shutter.readout_s == 0:
+        raise InputError(f"--what {DIRECTION}", "a readout of 0 s", "lines that are read one after the other")
+    return found, "".join(per_view), asks_direction
 
 
 def _turns(scan: Scan) -> bool:

@@ -5,13 +5,14 @@ Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in K
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
 
+from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
-from phyradgs_cl.detector import noise_level
 
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
 _MISMATCH = 2.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
@@ -79,39 +80,40 @@ class Reduced:
 
 
 def reduced(
-    level: Level,
+    level: Level | BeadLevel,
     parameters: Sequence[Parameter],
     at: Mapping[str, float],
     volume: np.ndarray,
     iterations: int,
 ) -> Reduced:
     """The signals of ``parameters`` about the values ``at`` (by name), for the object ``volume``, by central differences."""
-    operator = level.operator(change_of(at))
-    expected = operator.forward(volume)
+    # What a level's operator takes is what it reconstructed.
+    operator: Any = level.operator(change_of(at))
     signals = [_signal(level, one, at, volume) for one in parameters]
-    left = [level.off_range(operator, signal, iterations).ravel() for signal in signals]
-    sizes = np.array([max(float(np.linalg.norm(signal)), 1e-30) for signal in signals])
-    unit = np.array([signal.ravel() / size for signal, size in zip(signals, sizes, strict=True)], np.float64)
-    residual = level.line_integrals(operator, volume) - level.masked(expected)
-    beyond = level.off_range(operator, residual, iterations)
+    images = [*signals, level.at(change_of(at)).residual(operator, volume)]
+    *left, beyond = level.off_range(operator, volume, images, iterations)
+    compared = np.array([level.compared(signal) for signal in signals], np.float64)
+    sizes = np.maximum(np.linalg.norm(compared, axis=1), 1e-30)
+    unit = compared / sizes[:, None]
     return Reduced(
         names=tuple(one.name for one in parameters),
-        jacobian=np.array(left, np.float64),
+        jacobian=np.array([one.ravel() for one in left], np.float64),
         sizes=sizes,
         whole=unit @ unit.T,
         residual=beyond.ravel().astype(np.float64),
         frames=len(beyond),
-        noise=noise_level(level.measured, level.valid),
+        noise=level.noise(beyond),
     )
 
 
-def _signal(level: Level, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
-    """Change of the frames (F, rows, columns) by a unit of a parameter."""
+def _signal(level: Level | BeadLevel, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
+    """Change of what is expected over what is measured (F, rows, columns) by a unit of a parameter."""
     step = one.step(level.scans[0]) * (1 if one.is_timing else level.block)
     ends = []
     for sign in (1, -1):
-        there = {**at, one.name: at.get(one.name, 0.0) + sign * step}
-        ends.append(level.operator(change_of(there)).forward(volume))
+        there = change_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
+        operator: Any = level.operator(there)
+        ends.append(operator.forward(volume) - level.at(there).measured)
     return level.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 

@@ -2,27 +2,47 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
 from phyradgs_cl.calibrate.level import MOST_FRAMES, Level
-from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
-from phyradgs_cl.calibrate.parameters import PARAMETERS, WOBBLE, Parameter, change_of, chosen, in_words
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, evenly_lit, moved
+from phyradgs_cl.calibrate.parameters import (
+    DIRECTION,
+    PARAMETERS,
+    WOBBLE,
+    Parameter,
+    change_of,
+    chosen,
+    in_words,
+)
+from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
+from phyradgs_cl.check.statistics import residual_ratio, t_statistic
+from phyradgs_cl.check.variants import reversed_readout
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
+Maker = Callable[..., Level | BeadLevel]
 Report = Callable[[int, int, str], None]
 DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
+LEAST_OF_BEADS = 0.02  # of a parameter's signal, of a known shape: voxels explain nothing by accident
+_LEAST_EXPLAINED = 0.3  # of the frames' variance, by beads that lie best, before anything is put right
+_ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other order's residual, as ``check`` has them
+_OF_FRAMES = ("lag", "drift")  # what is no matter of poses
 _SETTLED = 0.1  # of a standard deviation
 _OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
@@ -38,13 +58,14 @@ class Stage:
     again: int
 
 
+BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 6, 0, 6, 4))
 STAGES = (Stage(24, 6, 40, 40, 15), Stage(48, 3, 20, 40, 12), Stage(96, 3, 30, 50, 15))
 
 
 @dataclass(eq=False)
 class _Search:
-    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before; ``known``: those that
-    the frames tell; the last stage's problem."""
+    """Where the search stands: ``at``, values by name, and ``former`` at the end of the stage before, if of voxels;
+    ``known``: those that the frames tell; the last stage's problem."""
 
     at: dict[str, float] = field(default_factory=dict)
     former: dict[str, float] = field(default_factory=dict)
@@ -71,35 +92,48 @@ def calibrate(
     what: str | None = None,
     others: Sequence[Scan] = (),
     report: Report = lambda done, total, text: None,
+    phantom: EllipsoidPhantom | None = None,
 ) -> Calibration:
     """The scan with its true geometry and timing as far as its frames tell them; ``what``: parameters with commas, None the
-    usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong.
+    usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong. ``phantom``: what the
+    object is, wherever it lies.
 
-    InputError for parameters that there are not, a scan too small, or others that do not fit the first."""
-    parameters, per_view = chosen(what, scan)
-    ready = [prepared(one, InputOptions()) for one in (scan, *others)]
-    _check(ready, per_view)
+    InputError for parameters that there are not, a scan too small, others that do not fit the first, a phantom that is not
+    what frames show."""
+    parameters, per_view, asks_direction = chosen(what, scan, phantom is not None)
+    asks_lag = any(one.name == "lag" for one in parameters)
+    ready = [prepared(one, InputOptions(ignore_lag=asks_lag)) for one in (scan, *others)]
+    _check(ready, [one.name for one in parameters], per_view, phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
-    levels = [stage for k, stage in enumerate(STAGES) if k == 0 or _blocks(scan, stage) < _blocks(scan, STAGES[k - 1])]
+    stages = STAGES if phantom is None else BEAD_STAGES
+    levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
+    make: Maker = partial(Level.of, rt, asks_lag)
+    if phantom is not None:
+        report(0, len(levels), "where the beads are")
+        make = partial(BeadLevel.of, phantom, _placement(rt, ready, phantom, search))
+    order = _order(make, ready, levels[min(1, len(levels) - 1)], search) if asks_direction else None
+    if order is not None and order.verdict == CORRECTED:
+        scan, ready = reversed_readout(scan), [reversed_readout(one) for one in ready]
     for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
-        level = Level.of(rt, ready, stage.columns)
+        level = make(ready, stage.columns)
         _descend(level, stage, parameters, search)
         if not search.known:
             break
     kept = _corrections(search)
     change, views = change_of(kept), None
-    table = _table(scan, parameters, search, kept)
+    table = ([] if order is None else [order]) + _table(scan, parameters, search, kept)
     if per_view:
         report(len(levels), len(levels), "views")
         find = find_wobble if per_view == WOBBLE else find_sway
         wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
         table, views = table + wobble.table, wobble.views
     report(len(levels), len(levels), "residuals")
-    level = Level.of(rt, ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
+    level = make(ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
     corrected = moved(scan, change, views) if kept or views is not None else scan
+    corrected = evenly_lit(corrected, change.drift) if change.drift else corrected
     calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
     told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
     return replace(calibration, scan=replace(corrected, provenance=told))
@@ -113,21 +147,60 @@ def _start(rt: Runtime, scan: Scan) -> dict[str, float]:
     return {"offset-u": offset.pixels * pitch_mm} if np.isfinite(offset.pixels) else {}
 
 
+def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, search: _Search) -> np.ndarray:
+    """How the phantom lies (7,), about: of the places where its beads are seen, that which explains the frames best."""
+    bead_centres_mm(phantom)
+    change = change_of(search.at)
+    first = Level.of(rt, False, scans, STAGES[-1].columns)
+    volume = first.reconstruct(first.operator(change), None, STAGES[-1].first)
+    stage, best = BEAD_STAGES[0], []
+    for place in placements(phantom, volume, first.grid):
+        level = BeadLevel.of(phantom, np.array([*place, 1.0]), scans, stage.columns)
+        operator = level.operator(change)
+        found = level.reconstruct(operator, None, stage.first)
+        best.append((level.explained(operator, found), found))
+    share, placement = max(best, key=lambda one: one[0])
+    if share < _LEAST_EXPLAINED:
+        raise InputError("--phantom", f"beads that explain {100 * share:.0f} % of the frames", "most", WRONG_PHANTOM)
+    return placement
+
+
+def _order(make: Maker, scans: Sequence[Scan], stage: Stage, search: _Search) -> Found:
+    """Are lines read from the stated end? Told by four standard errors of the frames' residuals, and a share; the deviation
+    is that by which 1 and −1 differ as they do."""
+    stated, other = (
+        np.mean(np.square(_residual(make(some, stage.columns), stage, change_of(search.at), None), dtype=np.float64), (1, 2))
+        for some in (scans, [reversed_readout(scan) for scan in scans])
+    )
+    errors, ratio = t_statistic(stated, other), residual_ratio(stated, other)
+    direction, share = float(scans[0].shutter.direction), abs(1 - min(ratio, 1 / ratio))
+    if abs(errors) < _ORDER_ERRORS or max(ratio, 1 / ratio) < _ORDER_RATIO:
+        return Found(DIRECTION, "", direction, None, None, share, CANNOT_TELL)
+    verdict, found = (AGREES, direction) if errors > 0 else (CORRECTED, -direction)
+    return Found(DIRECTION, "", direction, found, 2 / abs(errors), share, verdict)
+
+
 def _blocks(scan: Scan, stage: Stage) -> int:
     return -(-max(scan.geometry.detector_shape) // stage.columns)
 
 
-def _check(scans: Sequence[Scan], per_view: str) -> None:
+def _check(scans: Sequence[Scan], names: Sequence[str], per_view: str, phantom: EllipsoidPhantom | None) -> None:
     first = scans[0]
     for scan in scans:
         scan.check_sight()
+    unsuited = [per_view] * bool(per_view) + [name for name in _OF_FRAMES if name in names]
+    if unsuited and phantom is not None:
+        expected = "parameters of geometry and timing, of all views"
+        raise InputError(f"--what {unsuited[0]}", "with a phantom", expected, "leave one of the two out")
+    if per_view and "lag" in names:
+        raise InputError(f"--what {per_view}", "with lag", "one of the two at a time", "ask twice")
     if per_view and len(scans) > 1:
         raise InputError(f"--what {per_view}", "a second scan", "one scan: views are each scan's own", "leave --with out")
     if first.frames < _FEWEST_FRAMES or first.geometry.detector_shape[1] < _FEWEST_COLUMNS:
         found = f"{first.frames} frames of {first.geometry.detector_shape[1]} columns"
         raise InputError("scan", found, f"at least {_FEWEST_FRAMES} frames of {_FEWEST_COLUMNS} columns")
     for other in scans[1:]:
-        for name in ("geometry", "grid", "detector_model"):
+        for name in ("geometry", "grid", "detector_model", "lag"):
             if getattr(other, name) != getattr(first, name):
                 found = str(getattr(other, name))
                 raise InputError(f"--with: {name}", found, f"the first scan's, {getattr(first, name)}")
@@ -135,17 +208,22 @@ def _check(scans: Sequence[Scan], per_view: str) -> None:
             raise InputError("--with: readout axis", other.shutter.axis, f"the first scan's, {first.shutter.axis}")
 
 
-def _descend(level: Level, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:
+def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:
     """Steps on one level until they are small; which parameters the frames tell is asked at each step of the first one."""
     volume: np.ndarray | None = None
     asks = search.problem is None
-    search.former = {} if asks else dict(search.at)
+    search.former = {} if asks or isinstance(level, BeadLevel) else dict(search.at)
     for number in range(stage.steps):
         asked = parameters if asks else [PARAMETERS[name] for name in search.known]
-        volume = level.reconstruct(level.operator(change_of(search.at)), volume, stage.again if number else stage.first)
+        operator: Any = level.operator(change_of(search.at))
+        here = level.at(change_of(search.at))
+        volume = here.reconstruct(operator, volume, stage.again if number else stage.first)
         problem = reduced(level, asked, search.at, volume, stage.project)
         if asks:
-            _ask(problem, gauge_share(level, search.at, volume, stage.project), search)
+            least = LEAST_OF_BEADS
+            if isinstance(level, Level):
+                least = least_share(gauge_share(level, search.at, volume, stage.project))
+            _ask(problem, least, search)
         search.problem = problem.about(search.at).only(search.known)
         if not search.known:
             return
@@ -159,15 +237,14 @@ def _descend(level: Level, stage: Stage, parameters: Sequence[Parameter], search
             return
 
 
-def _limited(one: Parameter, level: Level, old: float, new: float) -> float:
+def _limited(one: Parameter, level: Level | BeadLevel, old: float, new: float) -> float:
     """``new`` as far as a step from ``old`` may go."""
     most = _MOST_PX * level.block / one.pixels(level.scans[0])
     return max(old + float(np.clip(new - old, -most, most)), one.lowest(level.scans[0]))
 
 
-def _ask(problem: Reduced, gauge: float, search: _Search) -> None:
-    """Which parameters the frames tell, and what they cannot tell apart."""
-    least = least_share(gauge)
+def _ask(problem: Reduced, least: float, search: _Search) -> None:
+    """Which parameters the frames tell, of whose signals ``least`` is left, and what they cannot tell apart."""
     search.known = identifiable(problem, least)
     search.alike = [in_words(weights) for weights in alike(problem, least)]
     search.shares = dict(zip(problem.names, problem.shares.tolist(), strict=True))
@@ -202,11 +279,11 @@ def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: M
     return table
 
 
-def _residual(level: Level, stage: Stage, change: Change, views: Views | Sway | None) -> np.ndarray:
+def _residual(level: Level | BeadLevel, stage: Stage, change: Change, views: Views | Sway | None) -> np.ndarray:
     """What a volume leaves of the frames (F, rows, columns) after a change."""
-    operator = level.operator(change, views)
-    volume = level.reconstruct(operator, None, stage.first)
-    return level.line_integrals(operator, volume) - level.masked(operator.forward(volume))
+    operator: Any = level.operator(change, views)
+    level = level.at(change)
+    return level.residual(operator, level.reconstruct(operator, None, stage.first))
 
 
 def _rms(values: np.ndarray) -> float:

@@ -27,7 +27,7 @@ from phyradgs_cl.runtime import Runtime
 SPLINES = 7  # of a motion: one for every seventh of the scan, about
 _STEPS = 3
 _ITERATIONS = 20
-_DEVIATIONS = 2.0  # of one value, that all of them have to be off by (root mean square)
+_DEVIATIONS = 3.0  # of one value, that all of them have to be off by (root mean square)
 _DEG = float(np.rad2deg(1.0))
 _OF_VIEWS = (("turn per view", "deg", _DEG), ("shift-v per view", "mm", 1.0), ("shift-u per view", "mm", 1.0))
 _OF_OBJECT = tuple(
@@ -74,7 +74,7 @@ def _found(
     names: Sequence[tuple[str, str, float]],
 ) -> Wobble:
     for (columns, first, again), asked in zip(stages, kinds, strict=True):
-        level, volume = Level.of(rt, [scan], columns, scan.frames), None
+        level, volume = Level.of(rt, False, [scan], columns, scan.frames), None
         for _ in range(_STEPS):
             operator = numbers.operator(level, change)
             volume = level.reconstruct(operator, volume, first if volume is None else again)

@@ -133,7 +133,7 @@ def view_step(
 ) -> Step:
     """The Gauss–Newton step of some kinds of all numbers, from where they are, for the object ``volume``."""
     operator = numbers.operator(level, change)
-    residual = level.line_integrals(operator, volume) - level.masked(operator.forward(volume))
+    residual = level.residual(operator, volume)
     signals = np.stack([_signal(level, change, numbers, volume, k) for k in kinds], 1)
     norms = np.sqrt(numbers.basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))  # of a value's own
     scale = _strength(operator) / np.maximum(norms, 0.1 * norms.max(0))
@@ -180,5 +180,5 @@ def _share(level: Level, operator: RayOperator, basis: np.ndarray, signals: np.n
     """What an object leaves of signals (F, rows, columns) whose numbers go either way, as chance has it."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
-    left = level.off_range(operator, probe, iterations)
+    (left,) = level.off_range(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
     return float(np.linalg.norm(left) / max(float(np.linalg.norm(probe)), 1e-30))

@@ -9,12 +9,13 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, Found, calibrate
-from phyradgs_cl.calibrate.parameters import GROUPS, MOTION, PARAMETERS, WOBBLE
+from phyradgs_cl.calibrate.parameters import DIRECTION, GROUPS, MOTION, PARAMETERS, WOBBLE
 from phyradgs_cl.calibrate.picture import residual_picture
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import load_beads
 from phyradgs_cl.io import check_writable, only_run, written_beside
 from phyradgs_cl.io.scan.copy import copy_with_motion
 from phyradgs_cl.progress import Ticker
@@ -24,17 +25,20 @@ from phyradgs_cl.settings import device_wish
 from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
-_NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION]
+_NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION, DIRECTION]
 _WHAT = f"What to look for, with commas: {', '.join(_NAMES)}."
+_USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
 _OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."
+_PHANTOM = "What was scanned: a TOML file of beads and wires (docs/formats.md), wherever they lie."
 _WITH = "Another scan of the same object, which lies as it did: turned the other way, it tells readout and exposure."
 
 
 def calibrate_command(
     scan: Scan,
     output: Annotated[Path | None, file_option(_OUTPUT, "--output", "-o", default="none is written")] = None,
-    what: Annotated[str | None, option(_WHAT, "offset,roll,tilt; of a fly-scan also readout,exposure")] = None,
+    what: Annotated[str | None, option(_WHAT, _USUAL)] = None,
     other: Annotated[Path | None, file_option(_WITH, "--with", default=False)] = None,
+    phantom: Annotated[Path | None, file_option(_PHANTOM, "--phantom", default=False)] = None,
     picture: Annotated[
         Path | None, file_option("PNG of residuals before and after.", "--picture", default="OUTPUT with .png")
     ] = None,
@@ -47,14 +51,16 @@ def calibrate_command(
     picture = picture or (output and output.with_suffix(".png"))
     for flag, target in (("-o", output), ("--picture", picture)):
         if target is not None:
-            refuse_overwriting(flag, target, scan, *([] if other is None else [other]))
+            refuse_overwriting(flag, target, scan, *(path for path in (other, phantom) if path is not None))
             check_writable(target)
     with Ticker("stage") as ticker:
         ticker.stage(f"reading {scan}")
+        shape = None if phantom is None else load_beads(phantom)
         loaded, others = load_scan(scan), [] if other is None else [load_scan(other)]
-        if output is not None and WOBBLE in (what or ""):
-            _check_storable(loaded)
-        found = calibrate(loaded, Runtime(wish), what, others, lambda done, total, at: ticker.show(done, total, f"  {at}"))
+        if output is not None:
+            _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
+        report = lambda done, total, at: ticker.show(done, total, f"  {at}")  # noqa: E731
+        found = calibrate(loaded, Runtime(wish), what, others, report, shape)
     if output is not None:
         with only_run(output), finish_despite_interrupt():
             copy_with_motion(scan, output, found.scan)
@@ -67,8 +73,14 @@ def calibrate_command(
         say(f"{output}: {said} corrected")
 
 
-def _check_storable(scan: Loaded) -> None:
-    """InputError where a table of poses over time has no place for views of their own."""
+def _check_storable(scan: Loaded, asked: list[str]) -> None:
+    """InputError where a file has no place: for another light of its frames, or in a table of poses over time for views of
+    their own."""
+    if "drift" in asked:
+        remedy = "leave -o out, and normalise frames by 'phyradgs prepare --steps air'"
+        raise InputError("--what drift", "with -o", "a copy whose frames stay as they are", remedy)
+    if WOBBLE not in asked:
+        return
     closest_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))
     if scan.is_fly and closest_s <= scan.shutter.span_s:
         found = f"frames of {scan.shutter.span_s:.4g} s that begin every {closest_s:.4g} s"

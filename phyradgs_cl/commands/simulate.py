@@ -16,9 +16,9 @@ from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_opti
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
 
-PhantomName = Literal[tuple(PHANTOMS)]  # type: ignore[valid-type]
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]
+_PHANTOM = f"Built-in phantom ({', '.join(PHANTOMS)}) or a TOML file of beads and wires."
 _VOLUME = "Volume file: ours, an HDF5 file with a dataset /volume (z, y, x), mha, nii, nrrd, npy or tiff."
 _PROTOCOL = (
     "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
@@ -26,9 +26,15 @@ _PROTOCOL = (
 )
 
 
+def _phantoms(incomplete: str) -> list[str]:
+    return [name for name in PHANTOMS if name.startswith(incomplete)]
+
+
 def simulate_command(
     output: Output,
-    phantom: Annotated[PhantomName | None, option("Built-in phantom.", "foot, without --volume")] = None,  # type: ignore[valid-type]
+    phantom: Annotated[
+        str | None, option(_PHANTOM, "foot, without --volume", autocompletion=_phantoms)
+    ] = None,
     volume: Annotated[Path | None, file_option(_VOLUME, "--volume")] = None,
     scanner: Annotated[str, option("Scanner by name (r2, carm) or a TOML file.")] = "r2",
     protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]

@@ -1,3 +1,4 @@
+from .beads import load_beads as load_beads
 from .options import ImportOptions as ImportOptions
 from .recognise import recognise as recognise
 from .scan import FORMATS as FORMATS

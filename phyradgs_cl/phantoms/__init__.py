@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.checks import one_of, positive
 from phyradgs_cl.fields.volume import Grid
-from phyradgs_cl.phantoms.ellipsoids import Ellipsoid, EllipsoidPhantom, rotation_about_z
+from phyradgs_cl.phantoms.ellipsoids import Cylinder, Ellipsoid, EllipsoidPhantom, rotation_about_z
 from phyradgs_cl.phantoms.procedural_foot import foot
 from phyradgs_cl.phantoms.procedural_jaw import jaw
 from phyradgs_cl.phantoms.shepp_logan import shepp_logan
@@ -19,7 +19,7 @@ from phyradgs_cl.phantoms.spheres import sphere_phantom
 from phyradgs_cl.phantoms.voxels import VoxelPhantom
 
 __all__ = [
-    "PHANTOMS", "Ellipsoid", "EllipsoidPhantom", "Phantom", "VoxelPhantom", "foot", "jaw",
+    "PHANTOMS", "Cylinder", "Ellipsoid", "EllipsoidPhantom", "Phantom", "VoxelPhantom", "foot", "jaw",
     "make_phantom", "rotation_about_z", "shepp_logan", "sphere_phantom"
 ]  # fmt: skip
 

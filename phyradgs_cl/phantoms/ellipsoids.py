@@ -1,4 +1,4 @@
-"""Phantoms made of additive ellipsoids: line integrals in closed form, no voxels in between.
+"""Phantoms made of additive ellipsoids and cylinders: line integrals in closed form, no voxels in between.
 
 An affine map takes an ellipsoid to the unit ball and a ray to a ray: the chord follows from the ray's distance to the
 centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1).
@@ -19,6 +19,7 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_PARALLEL = 1e-30  # instead of 0: a ray along a cylinder meets its side nowhere
 RAYS_PER_CHUNK = 1 << 15  # a chunk's intermediates stay in a core's cache: 2-3 MB
 
 
@@ -66,12 +67,108 @@ class Ellipsoid:
         """(3,): half the sides (x, y, z) of the smallest axis-aligned box around the ellipsoid."""
         return np.linalg.norm(np.asarray(self.rotation) * np.asarray(self.semi_axes_mm), axis=1)
 
+    @property
+    def ends_mm(self) -> tuple[Triple, Triple]:
+        """The ends of a line of which all of the body is within ``reach_mm``."""
+        return self.centre_mm, self.centre_mm
+
+    @property
+    def reach_mm(self) -> float:
+        return max(self.semi_axes_mm)
+
+    def chord_fraction(self, start: Array, step: Array) -> Array:
+        """(n,): the part of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        to_ball = self.to_unit_ball.T
+        o = (start - np.asarray(self.centre_mm)) @ to_ball
+        d = step @ to_ball
+        dd = np.einsum("ij,ij->i", d, d)
+        dd[dd == 0] = 1.0  # no length: the fraction is multiplied by a length of zero
+        nearest = -np.einsum("ij,ij->i", o, d) / dd
+        # The distance from the foot point, not the discriminant, whose terms cancel for far sources.
+        foot = o + nearest[:, None] * d
+        half = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
+        return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
+
+    def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
+        """Whether points, by coordinates in mm that broadcast, lie inside."""
+        cx, cy, cz = self.centre_mm
+        # One term per axis before they broadcast: coordinates of a grid stay one-dimensional.
+        rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
+        return rows[0] ** 2 + rows[1] ** 2 + rows[2] ** 2 <= 1.0
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A straight wire or rod between two points (x, y, z), its ends flat, whose attenuation adds to whatever else is there.
+    Raises InputError for ends that are one point, a radius that is not positive, values that are not finite."""
+
+    ends_mm: tuple[Triple, Triple]
+    radius_mm: float
+    attenuation_per_mm: float
+
+    def __post_init__(self) -> None:
+        shape("cylinder ends_mm", self.ends_mm, (2, 3))
+        finite("cylinder ends", self.ends_mm)
+        finite("cylinder attenuation", self.attenuation_per_mm)
+        positive("cylinder radius", self.radius_mm)
+        if self.length_mm == 0:
+            raise InputError("cylinder ends_mm", str(self.ends_mm), "two points")
+
+    @property
+    def length_mm(self) -> float:
+        return float(np.linalg.norm(np.subtract(*self.ends_mm)))
+
+    @property
+    def axis(self) -> Array:
+        """(3,): unit vector from the first end to the second."""
+        found: Array = np.subtract(self.ends_mm[1], self.ends_mm[0]) / self.length_mm
+        return found
+
+    @property
+    def centre_mm(self) -> Triple:
+        x, y, z = np.mean(self.ends_mm, axis=0).tolist()
+        return x, y, z
+
+    @property
+    def reach_mm(self) -> float:
+        return self.radius_mm
+
+    @property
+    def half_box_mm(self) -> Array:
+        """(3,): half the sides (x, y, z) of the smallest axis-aligned box around the cylinder."""
+        along = np.abs(self.axis)
+        return self.length_mm / 2 * along + self.radius_mm * np.sqrt(np.maximum(1 - along**2, 0))
+
+    def chord_fraction(self, start: Array, step: Array) -> Array:
+        """(n,): the part of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        o = start - np.asarray(self.ends_mm[0])
+        height, rise = o @ self.axis, step @ self.axis
+        o, d = o - height[:, None] * self.axis, step - rise[:, None] * self.axis
+        dd = np.maximum(np.einsum("ij,ij->i", d, d), _PARALLEL)
+        nearest = -np.einsum("ij,ij->i", o, d) / dd
+        foot = o + nearest[:, None] * d
+        half = np.sqrt(np.maximum(self.radius_mm**2 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
+        rise = np.where(np.abs(rise) < _PARALLEL, _PARALLEL, rise)
+        ends = np.sort([-height / rise, (self.length_mm - height) / rise], axis=0)
+        first, last = np.maximum(nearest - half, ends[0]), np.minimum(nearest + half, ends[1])
+        return np.maximum(np.clip(last, 0.0, 1.0) - np.clip(first, 0.0, 1.0), 0.0)
+
+    def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
+        """Whether points, by coordinates in mm that broadcast, lie inside."""
+        points = [c - c0 for c, c0 in zip((x, y, z), self.ends_mm[0], strict=True)]
+        height = sum(a * p for a, p in zip(self.axis, points, strict=True))
+        across = sum((p - a * height) ** 2 for a, p in zip(self.axis, points, strict=True))
+        inside: NDArray[np.bool_] = (across <= self.radius_mm**2) & (height >= 0) & (height <= self.length_mm)
+        return inside
+
+
+Body = Ellipsoid | Cylinder
 
 @dataclass(frozen=True)
 class EllipsoidPhantom:
-    """A sum of ellipsoids with exact line integrals."""
+    """A sum of ellipsoids, and of cylinders, with exact line integrals."""
 
-    ellipsoids: tuple[Ellipsoid, ...]
+    ellipsoids: tuple[Body, ...]
     name: str
     kind: ClassVar[str] = "analytic"
 
@@ -98,7 +195,7 @@ class EllipsoidPhantom:
     def _segments(self, start: Array, step: Array) -> Array:
         total = np.zeros(len(start))
         for ellipsoid in self.ellipsoids:
-            total += ellipsoid.attenuation_per_mm * _chord_fraction(ellipsoid, start, step)
+            total += ellipsoid.attenuation_per_mm * ellipsoid.chord_fraction(start, step)
         return total * np.sqrt(np.einsum("ij,ij->i", step, step))
 
     def density(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Array:
@@ -106,7 +203,7 @@ class EllipsoidPhantom:
         px, py, pz = (np.asarray(c, dtype=np.float64) for c in (x, y, z))
         total = np.zeros(np.broadcast_shapes(px.shape, py.shape, pz.shape))
         for ellipsoid in self.ellipsoids:
-            total += ellipsoid.attenuation_per_mm * _inside(ellipsoid, px, py, pz)
+            total += ellipsoid.attenuation_per_mm * ellipsoid.contains(px, py, pz)
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
@@ -131,28 +228,7 @@ def _broadcast_points(source: ArrayLike, target: ArrayLike) -> tuple[Array, Arra
     return np.broadcast_to(start, common), np.broadcast_to(end, common)
 
 
-def _chord_fraction(ellipsoid: Ellipsoid, start: Array, step: Array) -> Array:
-    """(n,): the part of each segment start + t·step, 0 <= t <= 1, that lies inside."""
-    to_ball = ellipsoid.to_unit_ball.T
-    o = (start - np.asarray(ellipsoid.centre_mm)) @ to_ball
-    d = step @ to_ball
-    dd = np.einsum("ij,ij->i", d, d)
-    dd[dd == 0] = 1.0  # no length: the fraction is multiplied by a length of zero
-    nearest = -np.einsum("ij,ij->i", o, d) / dd
-    # The distance from the foot point, not the discriminant, whose terms cancel for far sources.
-    foot = o + nearest[:, None] * d
-    half = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
-    return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
-
-
-def _inside(ellipsoid: Ellipsoid, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-    cx, cy, cz = ellipsoid.centre_mm
-    # One term per axis before they broadcast: coordinates of a grid stay one-dimensional.
-    rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in ellipsoid.to_unit_ball]
-    return rows[0] ** 2 + rows[1] ** 2 + rows[2] ** 2 <= 1.0
-
-
-def _add_ellipsoid(volume: Array, ellipsoid: Ellipsoid, grid: Grid, samples: int) -> None:
+def _add_ellipsoid(volume: Array, ellipsoid: Body, grid: Grid, samples: int) -> None:
     """Add to `volume` (nz, ny, nx) in place, visiting only the ellipsoid's box, a slice at a time."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     centre, half = ellipsoid.centre_mm[::-1], ellipsoid.half_box_mm[::-1]
@@ -167,6 +243,6 @@ def _add_ellipsoid(volume: Array, ellipsoid: Ellipsoid, grid: Grid, samples: int
     ny, nx = ys.size // samples, xs.size // samples
     for i, iz in enumerate(range(ranges[0].start, ranges[0].stop)):
         z = zs[i * samples : (i + 1) * samples, None, None]
-        covered = _inside(ellipsoid, xs[None, None, :], ys[None, :, None], z)
+        covered = ellipsoid.contains(xs[None, None, :], ys[None, :, None], z)
         mean = covered.reshape(samples, ny, samples, nx, samples).mean(axis=(0, 2, 4))
         volume[iz, ranges[1], ranges[2]] += ellipsoid.attenuation_per_mm * mean

@@ -6,19 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import load_attenuation
+from phyradgs_cl.importers import load_attenuation, load_beads
 from phyradgs_cl.io import LoadedVolume, Scanner, check_writable, only_run, write_scan
+from phyradgs_cl.phantoms import PHANTOMS, EllipsoidPhantom
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
+from phyradgs_cl.text import near_miss
 from phyradgs_cl.workflow.files import expecting, refuse_overwriting
+
+_TOML = ".toml"
 
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """What to simulate: a phantom by name or a volume file, on which scanner, with how many voxels and rays per pixel."""
+    """What to simulate, a phantom by name or TOML file or a volume file, on which scanner; voxels and rays per pixel."""
 
     output: Path
     phantom: str | None = None
@@ -42,6 +47,16 @@ def refuse_noise_options(noise: str, given: Mapping[str, float | None]) -> None:
         raise InputError(stated[0], "--noise none", "a model of noise with it", "add --noise tigre or beer")
 
 
+def phantom_of(name: str) -> str | EllipsoidPhantom:
+    """A phantom from a TOML file; a name of one of ours as it is. InputError for neither."""
+    if name.endswith(_TOML):
+        return load_beads(Path(name))
+    if name not in PHANTOMS:
+        remedy = near_miss(name, PHANTOMS, "or give the path of a .toml file")
+        raise InputError("--phantom", checks.shown(name), f"one of {', '.join(PHANTOMS)}", remedy)
+    return name
+
+
 @np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line
 def run_simulation(
     job: SimulationJob,
@@ -55,11 +70,12 @@ def run_simulation(
         if job.phantom is not None:
             raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
         refuse_overwriting("-o", job.output, job.volume)
-    if job.scanner.endswith(".toml"):
-        refuse_overwriting("-o", job.output, Path(job.scanner))
+    for described in (job.scanner, job.phantom or ""):
+        if described.endswith(_TOML):
+            refuse_overwriting("-o", job.output, Path(described))
     check_writable(job.output)
     with only_run(job.output):
-        of: str | LoadedVolume = job.phantom or "foot"
+        of: str | LoadedVolume | EllipsoidPhantom = phantom_of(job.phantom or "foot")
         if job.volume is not None:
             with expecting(job.volume, "plain-volume", "volume"):
                 of = load_attenuation(job.volume)

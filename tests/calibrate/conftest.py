@@ -21,11 +21,11 @@ class Backwards(Protocol):
 def turned(rt) -> Callable[..., Scan]:
     """The scan with the gantry turning on or back, and this detector model."""
 
-    def make(back: bool = False, model: str = "log") -> Scan:
+    def make(back: bool = False, model: str = "log", axis: str = "rows") -> Scan:
         geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
-        scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
+        scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, axis, 0)
         plan = (Backwards if back else Protocol)(views=15, exposure_deg=12.0, readout_ratio=0.5)
-        options = SimulationOptions(plan, "rows", noise="tigre", dose=1e6, time_samples=8, detector_model=model)
+        options = SimulationOptions(plan, axis, noise="tigre", dose=1e6, time_samples=8, detector_model=model)
         return simulate(scene.source, geometry, scene.grid, options)
 
     return make

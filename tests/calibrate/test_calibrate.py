@@ -8,10 +8,11 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
-from phyradgs_cl.calibrate.moved import Change, Views, moved
+from phyradgs_cl.calibrate.moved import Change, Views, evenly_lit, moved
 from phyradgs_cl.calibrate.parameters import in_words
 from phyradgs_cl.calibrate.views import SPLINES, find_sway, find_wobble
 from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges, without_sway_gauges
+from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.workflow import load_scan
@@ -172,6 +173,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
     path = tmp_path / "scan.h5"
     write_scan(path, replace(right, shutter=replace(right.shutter, readout_s=1.5)))
     refused(["calibrate", path, "--what", "wobble", "-o", tmp_path / "out.h5"], "do not overlap in time")
+    refused(["calibrate", path, "--what", "offset, drift", "-o", tmp_path / "out.h5"], "prepare --steps air")
     refused(["calibrate", path, "-o", path], "the input file")
     assert not (tmp_path / "out.h5").exists()
 
@@ -179,3 +181,38 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
 def test_views_in_a_result_are_its_trajectory(right) -> None:
     views = Views.none(15)
     assert not isinstance(moved(right, Change(), views).trajectory, CircularOrbit)
+
+
+def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turned, tmp_path, capsys) -> None:
+    """Columns bend it; rows twist it, which two turns tell and one does not."""
+    words = ["--what", "direction", "--json"]
+    for name, scan in (("on", turned()), ("back", turned(back=True)), ("columns", turned(axis="columns"))):
+        write_scan(tmp_path / name, replace(scan, shutter=replace(scan.shutter, direction=-1)))
+    on, out = tmp_path / "on", tmp_path / "out.h5"
+    back, columns = ["--with", tmp_path / "back"], [tmp_path / "columns"]
+    for asked, verdict in (([on], CANNOT_TELL), ([on, *back], CORRECTED), (columns, CORRECTED)):
+        assert cli.run([*map(str, ["calibrate", *asked, "-o", out]), *words]) == 0
+        (one,) = json.loads(capsys.readouterr().out)["parameters"]
+        assert one["verdict"] == verdict, (asked, one)
+        assert load_scan(out).shutter.direction == (1 if verdict == CORRECTED else -1)
+        assert one["found"] is None if verdict == CANNOT_TELL else 0 < one["deviation"] <= 0.5
+
+
+def test_lag_and_drift_are_numbers_of_the_frames(cli, rt, right, tmp_path, capsys) -> None:
+    """A panel with 5 % of lag of which 1 % is stated; a beam that gets 4 % (log) brighter; both; neither."""
+    path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
+    brighter = (right.projections - 0.04 * np.linspace(-0.5, 0.5, right.frames)[:, None, None]).astype(np.float32)
+    write_scan(path, replace(right, projections=lagged(right.projections, 0.05).astype(np.float32), lag=0.01))
+    assert cli.run(["calibrate", str(path), "--what", "lag,offset-u", "-o", str(out), "--json"]) == 0
+    lines = {one["name"]: one for one in json.loads(capsys.readouterr().out)["parameters"]}
+    assert lines["lag"]["stated"] == pytest.approx(1) and lines["offset-u"]["verdict"] == AGREES
+    assert load_scan(out).lag == pytest.approx(lines["lag"]["found"] / 100)
+    drifting = replace(right, projections=brighter)
+    found = calibrate(drifting, rt, "drift")
+    assert np.abs(found.scan.projections - evenly_lit(drifting, 0.04).projections).max() < 0.01
+    both = calibrate(replace(right, projections=lagged(brighter, 0.05).astype(np.float32)), rt, "lag,drift")
+    for one, truth in zip([*found.parameters, *both.parameters], (4, 5, 4), strict=True):
+        assert one.verdict == CORRECTED and abs(one.found - truth) < 3 * one.deviation < 3, one
+    assert lines["lag"]["verdict"] == CORRECTED and abs(lines["lag"]["found"] - 5) < 3 * lines["lag"]["deviation"] < 3
+    for one in calibrate(right, rt, "lag,drift").parameters:
+        assert one.verdict == AGREES and abs(one.found) < 3 * one.deviation, one

@@ -8,7 +8,7 @@ from refusals import assert_refused
 
 from phyradgs_cl.fields.volume import Grid
 from phyradgs_cl.phantoms import ellipsoids as module
-from phyradgs_cl.phantoms.ellipsoids import Ellipsoid, EllipsoidPhantom, rotation_about_z
+from phyradgs_cl.phantoms.ellipsoids import Cylinder, Ellipsoid, EllipsoidPhantom, rotation_about_z
 
 
 def _random_rotation(rng: np.random.Generator) -> tuple:
@@ -43,6 +43,23 @@ def test_line_integrals_equal_brute_force_sampling_also_from_inside() -> None:
     expected = [_marched(phantom, s, t) for s, t in zip(source, target, strict=True)]
     # 40,000 samples of a step function along 200 mm: each surface is off by at most half a sample.
     assert np.allclose(phantom.line_integrals(source, target), expected, atol=5e-4, rtol=0)
+
+
+def test_wires_are_sampled_alike_from_any_side_and_cut_off_flat() -> None:
+    rng = np.random.default_rng(3)
+    wire = EllipsoidPhantom((Cylinder(((-3, 1, -8), (5, -2, 9)), 2.5, 0.3),), "wire")
+    source, target = rng.uniform(-12, 12, (2, 40, 3))
+    share = (np.arange(20000) + 0.5) / 20000
+    for s, t in zip(source, target, strict=True):
+        points = s + share[:, None] * (t - s)
+        expected = wire.density(*points.T).mean() * np.linalg.norm(t - s)
+        assert abs(wire.line_integrals(s, t) - expected) < 2e-3, (s, t)
+    upright = EllipsoidPhantom((Cylinder(((0, 0, -2), (0, 0, 3)), 1.0, 1.0),), "upright")
+    along, across = upright.line_integrals([0.5, 0, -9], [0.5, 0, 9]), upright.line_integrals([-9, 0, 2.9], [9, 0, 2.9])
+    assert np.allclose([along, across], [5, 2]) and upright.line_integrals([1.5, 0, -9], [1.5, 0, 9]) == 0
+    grid = Grid.cube(40, 8.0)
+    assert upright.voxelise(grid, 4).sum() * 0.2**3 == pytest.approx(5 * np.pi, rel=0.01)
+    assert np.allclose(wire.ellipsoids[0].centre_mm, (1, -0.5, 0.5))
 
 
 def test_sphere_chords_in_closed_form_and_segments_that_stop() -> None:

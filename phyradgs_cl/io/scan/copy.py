@@ -36,8 +36,8 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
 
 
 def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None:
-    """Copy a scan file with geometry, timing, trajectory and provenance of ``scan``, which has its frames; what is the same
-    is not touched. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    """Copy a scan file with geometry, timing, lag, trajectory and provenance of ``scan``, which has its frames; what is the
+    same is not touched. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         start = f"{header.entry}/{schema.DETECTOR}/frame_start_time"
@@ -53,6 +53,9 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
             detector = entry[schema.DETECTOR]
             _replace(detector, "count_time", scan.shutter.exposure_s, "s")
             _replace(detector, "detector_readout_time", scan.shutter.readout_s, "s")
+            if scan.shutter.direction != stated.shutter.direction:
+                _remove(entry[schema.EXTRA], "readout_direction")
+                write_number(entry[schema.EXTRA], "readout_direction", scan.shutter.direction)
             if starts_s is not None:
                 starts_s[header.image_key == schema.PROJECTION] += later_s
                 _replace(detector, "frame_start_time", starts_s, "s")
@@ -67,6 +70,9 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
                 _replace(detector, "detector_readout_time", 0.0, "s")
                 _replace(detector, "frame_start_time", np.asarray(scan.frame_start_s)[frame_of], "s")
             write_poses(entry, scan)
+        if scan.lag != stated.lag:
+            _remove(entry[schema.EXTRA], "lag")
+            write_number(entry[schema.EXTRA], "lag", scan.lag)
         _remove(entry, f"{schema.EXTRA}/provenance")
         entry[schema.EXTRA]["provenance"] = json.dumps(scan.provenance, default=str)
 

@@ -49,7 +49,7 @@ class FistaOptions(IterativeOptions):
     a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the total variation
     from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
-    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 for grids of at most 90³ where the device has room, else 1.
+    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """

@@ -1,0 +1,108 @@
+"""Where a phantom of known shape lies: bright spots of a first volume, and the rigid motion that takes known beads there."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.spatial.transform import Rotation
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
+
+FEWEST_BEADS = 4
+WRONG_PHANTOM = "is it this one, is all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
+_LEAST_SHARE = 0.75  # of the beads that have to be found
+_SMOOTH = 0.5  # of a bead's radius: one of many voxels has one middle then
+_OVER = 2.0  # peaks that are looked for, per bead
+_TOLERANCE_VOXELS = 1.5
+_TRIANGLES = 40  # of known beads that are tried
+_APART = 0.05  # rad between placements that are not the same
+_MOST = 6  # placements that fit alike: a phantom that turned looks as it did
+
+
+def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
+    """Centres (n, 3) of a phantom's beads; InputError for fewer than four, or such as lie on a line."""
+    centres_mm = np.array([body.centre_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)]).reshape(-1, 3)
+    spread_mm = np.linalg.svd(centres_mm - centres_mm.mean(0), compute_uv=False) if len(centres_mm) else np.zeros(3)
+    if len(centres_mm) < FEWEST_BEADS or spread_mm[1] < 0.01 * spread_mm[0]:
+        found = f"{len(centres_mm)} beads" + " on a line" * (len(centres_mm) >= FEWEST_BEADS)
+        raise InputError("--phantom", found, f"at least {FEWEST_BEADS} beads that do not lie on a line")
+    return centres_mm
+
+
+def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> list[np.ndarray]:
+    """Turns (rotation vectors, rad) and shifts (mm), (6,) each, that take the most of the known beads to bright spots of a
+    volume (z, y, x), the best first. InputError where none does."""
+    known = bead_centres_mm(phantom)
+    radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
+    smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
+    seen = _peaks_mm(smooth, grid, int(_OVER * len(known)) + FEWEST_BEADS)
+    within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
+    found: list[tuple[int, float, np.ndarray]] = []
+    for three, corners in _alike(known, seen, within_mm):
+        place = _rigid(known[list(three)], seen[corners])
+        for _ in range(2):  # of three, then of all that are near
+            apart_mm = np.linalg.norm(_moved(place, known)[:, None] - seen, axis=-1)
+            near = apart_mm.min(1) < within_mm
+            if near.sum() < 3:
+                break
+            place = _rigid(known[near], seen[apart_mm[near].argmin(1)])
+        found.append((-int(near.sum()), float(np.mean(np.minimum(apart_mm.min(1), within_mm))), place))
+    found.sort(key=lambda one: one[:2])
+    most = -found[0][0] if found else 0
+    if most < max(_LEAST_SHARE * len(known), FEWEST_BEADS - 1):
+        raise InputError("--phantom", f"{most} of {len(known)} beads where they should be", "most of them", WRONG_PHANTOM)
+    best: list[np.ndarray] = []
+    for count, _, place in found:
+        if -count < most - 1 or len(best) == _MOST:
+            break
+        if all(_turn_between(place, other) > _APART for other in best):
+            best.append(place)
+    return best
+
+
+def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
+    """Bright spots (m, 3) of a volume (z, y, x), as x, y, z: the middles of the largest local maxima's surroundings."""
+    inner = np.zeros(volume.shape, bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    peaks = np.argwhere((volume == maximum_filter(volume, 3)) & inner & (volume > 0))
+    peaks = peaks[np.argsort(-volume[tuple(peaks.T)])[:most]]
+    axes_mm, places = grid.axes_mm(), []
+    for peak in peaks:
+        around = tuple(slice(at - 1, at + 2) for at in peak)
+        weight = volume[around] - volume[around].min()
+        weight = weight / weight.sum() if weight.sum() > 0 else np.full(weight.shape, 1 / weight.size)
+        shares = (weight.sum((1, 2)), weight.sum((0, 2)), weight.sum((0, 1)))
+        places.append([float(share @ axis[s]) for share, axis, s in zip(shares, axes_mm, around, strict=True)][::-1])
+    return np.array(places).reshape(-1, 3)
+
+
+def _alike(known: np.ndarray, seen: np.ndarray, within_mm: float) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
+    """Triangles of known points (n, 3) with those of seen ones (m, 3) whose sides are as long."""
+    rng = np.random.default_rng(0)
+    apart = np.linalg.norm(seen[:, None] - seen, axis=-1)
+    for _ in range(_TRIANGLES):
+        a, b, c = map(int, rng.permutation(len(known))[:3])
+        ab, bc, ca = (float(np.linalg.norm(known[i] - known[j])) for i, j in ((a, b), (b, c), (c, a)))
+        if min(ab, bc, ca) < 3 * within_mm:
+            continue
+        for i, j in np.argwhere(np.abs(apart - ab) < within_mm):
+            for k in np.flatnonzero((np.abs(apart[j] - bc) < within_mm) & (np.abs(apart[i] - ca) < within_mm)):
+                yield (a, b, c), [int(i), int(j), int(k)]
+
+
+def _rigid(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """The turn and shift (6,) that take points (n, 3) as near to targets (n, 3) as they can."""
+    middle, there = points.mean(0), targets.mean(0)
+    turn, _ = Rotation.align_vectors(targets - there, points - middle)
+    return np.concatenate([turn.as_rotvec(), there - turn.apply(middle)])
+
+
+def _moved(place: np.ndarray, points: np.ndarray) -> np.ndarray:
+    moved: np.ndarray = Rotation.from_rotvec(place[:3]).apply(points) + place[3:]
+    return moved
+
+
+def _turn_between(one: np.ndarray, other: np.ndarray) -> float:
+    return float((Rotation.from_rotvec(one[:3]).inv() * Rotation.from_rotvec(other[:3])).magnitude())
