@@ -1,13 +1,14 @@
 /* Soft threshold of all 4³ block DCTs of a volume, averaged (translation-invariant shrinkage, Coifman and Donoho 1995).
 
    What is shrunk away, clamp(B v, ±threshold) without the mean of the block, is gathered in ``excess``: the result is
-   v − excess / blocks that cover a voxel. Volumes are (z, y, pitch) with a guard. A work-item has one block in registers, and
+   v − 4 excess / blocks that cover a voxel, as a map takes a quarter of them. Volumes are (z, y, pitch) with a guard. A work-item has one block in registers, and
    along x a vector of blocks one voxel apart; blocks of one launch do not meet in y and z, so that nothing adds at one time.
    Where work-items are the lanes they do not meet in x either. Twin: objective/dct_prox.py. */
 #include "common/lanes.h"
 
 #define EDGE 4
 #define BLOCK 64
+#define TURNS 4 /* maps that have all blocks together */
 #define COS_1 0.65328148f /* cos(π/8)/√2 */
 #define COS_3 0.27059805f /* cos(3π/8)/√2 */
 
@@ -116,6 +117,7 @@ __kernel void dct_end(
         return;
     const size_t row = (size_t)z * shape.y + y;
     const int blocks = covering(x, shape.x) * covering(y, shape.y) * covering(z, shape.z);
-    const float value = volume[row * shape.x + x] - excess[IMAGE_GUARD + row * pitch + x] / (float)max(blocks, 1);
+    const float mean = TURNS * excess[IMAGE_GUARD + row * pitch + x] / (float)max(blocks, 1);
+    const float value = volume[row * shape.x + x] - mean;
     result[row * shape.x + x] = nonnegative ? fmax(value, 0.0f) : value;
 }

@@ -242,7 +242,7 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     yield TvDescent(rt, GRID.shape)(volume, 0.1, 2), tv_descent(volume, 0.1, 2), VALUE
     found = TvProx(rt, GRID.shape)(volume, 0.2, 4, nonnegative=True)
     yield found, tv_prox(volume, 0.2, 4, nonnegative=True), VALUE
-    yield DctProx(rt, GRID.shape)(volume, 0.2, nonnegative=True), dct_prox(volume, 0.2, nonnegative=True), VALUE
+    yield DctProx(rt, GRID.shape)(volume, 0.2, 1, nonnegative=True), dct_prox(volume, 0.2, 1, nonnegative=True), VALUE
 
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:

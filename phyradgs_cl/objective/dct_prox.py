@@ -3,9 +3,13 @@
 argmin of a sparsity term by soft threshold of an overcomplete transform: B_sᵀ T(B_s v), averaged over the shifts s of the
 blocks (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16
 (2007) 3020). A block's mean is not shrunk. Near faces the average is over the blocks that lie in the volume.
+
+A map takes a quarter of the shifts, the next one the next quarter: within iterations the average is the same (cycle
+spinning; Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326).
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -15,6 +19,8 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 EDGE = 4
+# the shift along y of every shift along z: a turn has each of both once, and four have all pairs
+TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
@@ -31,19 +37,22 @@ class DctProx:
         self._excess = padded_zeros(rt, nz * ny, nx)
 
     def __call__(
-        self, volume: SameArray, threshold: float, *, nonnegative: bool, out: DeviceArray | None = None
+        self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
         """The map of a volume (z, y, x), float32; ``threshold`` in its unit, of coefficients of the orthonormal transform.
 
-        A device array gives a device array, ``out`` if there is one, and nothing crosses the bus.
+        ``turn``, 0 to 3: which quarter of the shifts. A device array gives a device array, ``out`` if there is one, and
+        nothing crosses the bus.
         """
         is_there = isinstance(volume, DeviceArray)
         observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
         result = self.rt.empty(self.shape) if out is None else out
-        self._map(observed, threshold, nonnegative, result)
+        self._map(observed, threshold, TURNS[turn], nonnegative, result)
         return cast(SameArray, result if is_there else self.rt.download(result))
 
-    def _map(self, volume: DeviceArray, threshold: float, nonnegative: bool, result: DeviceArray) -> None:
+    def _map(
+        self, volume: DeviceArray, threshold: float, turn: Sequence[int], nonnegative: bool, result: DeviceArray
+    ) -> None:
         rt, (nz, ny, nx) = self.rt, self.shape
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
@@ -51,7 +60,7 @@ class DctProx:
         # blocks of one launch are apart: in x too where they are work-items, else a vector of them is one
         along_x = EDGE if rt.pixel_items else 1
         blocks = -(-nx // EDGE) if rt.pixel_items else 1, -(-ny // EDGE), -(-nz // EDGE)
-        for z, y, x in itertools.product(range(EDGE), range(EDGE), range(along_x)):
+        for (z, y), x in itertools.product(enumerate(turn), range(along_x)):
             shift = np.array([x, y, z, 0], np.int32)
             arguments = self._padded, *layout, shift, np.float32(threshold), self._excess
             rt.launch(self._excess_of, blocks, *arguments, group=rt.group())
@@ -59,7 +68,7 @@ class DctProx:
         rt.launch(self._end, voxels, volume, self._excess, *layout, clip, result, group=by_voxel)
 
 
-def dct_prox(volume: np.ndarray, threshold: float, *, nonnegative: bool) -> np.ndarray:
+def dct_prox(volume: np.ndarray, threshold: float, turn: int, *, nonnegative: bool) -> np.ndarray:
     """Float64 twin of ``DctProx``."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
@@ -69,10 +78,12 @@ def dct_prox(volume: np.ndarray, threshold: float, *, nonnegative: bool) -> np.n
     kept = np.clip(scipy.fft.dctn(blocks, axes=(3, 4, 5), norm="ortho"), -threshold, threshold)
     kept[..., 0, 0, 0] = 0
     back = scipy.fft.idctn(kept, axes=(3, 4, 5), norm="ortho")
+    z, y = (np.arange(count) % EDGE for count in blocks.shape[:2])
+    taken = np.array(TURNS[turn])[z][:, None] == y
     excess, count = np.zeros_like(volume), np.zeros_like(volume)
     for k, j, i in itertools.product(range(EDGE), repeat=3):
         at = tuple(slice(o, o + n) for o, n in zip((k, j, i), blocks.shape[:3], strict=True))
-        excess[at] += back[..., k, j, i]
+        excess[at] += taken[:, :, None] * back[..., k, j, i]
         count[at] += 1
-    shrunk: np.ndarray = volume - excess / count
+    shrunk: np.ndarray = volume - len(TURNS) * excess / count
     return np.maximum(shrunk, 0) if nonnegative else shrunk

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.fft
 from tolerances import FLOAT32, FLOAT64
 
 from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
@@ -13,28 +14,45 @@ SHAPES = [(5, 6, 7), (4, 4, 33), (17, 4, 20), (9, 11, 16), (3, 8, 8), (1, 1, 1)]
 def test_the_kernel_is_its_twin(any_rt, shape) -> None:
     volume = np.random.default_rng(1).normal(size=shape).astype(np.float32)
     prox, on_device = DctProx(any_rt, shape), any_rt.upload(volume)
-    for nonnegative in (False, True):
-        found = any_rt.empty(shape)
-        assert prox(on_device, 0.4, nonnegative=nonnegative, out=found) is found
+    for turn in range(4):
+        found, nonnegative = any_rt.empty(shape), turn % 2 == 0
+        assert prox(on_device, 0.4, turn, nonnegative=nonnegative, out=found) is found
         np.testing.assert_allclose(
-            any_rt.download(found), dct_prox(volume, 0.4, nonnegative=nonnegative), rtol=0, atol=FLOAT32
+            any_rt.download(found), dct_prox(volume, 0.4, turn, nonnegative=nonnegative), rtol=0, atol=FLOAT32
         )
-    np.testing.assert_array_equal(prox(volume, 0.4, nonnegative=True), any_rt.download(found))
-    prox(on_device, 0.4, nonnegative=True, out=on_device)  # in place, the same bits
+    np.testing.assert_array_equal(prox(volume, 0.4, 0, nonnegative=True), any_rt.download(found))
+    prox(on_device, 0.4, 0, nonnegative=True, out=on_device)  # in place, the same bits
     np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(found))
+
+
+def mean_of_turns(volume: np.ndarray, threshold: float) -> np.ndarray:
+    return np.mean([dct_prox(volume, threshold, turn, nonnegative=False) for turn in range(4)], 0)
+
+
+def test_four_turns_are_the_mean_over_all_blocks() -> None:
+    volume = np.random.default_rng(2).normal(size=(6, 5, 7))
+    shrunk, count = np.zeros_like(volume), np.zeros_like(volume)
+    for z, y, x in np.ndindex(3, 2, 4):
+        at = np.s_[z : z + 4, y : y + 4, x : x + 4]
+        values = scipy.fft.dctn(volume[at], norm="ortho")
+        less = np.sign(values) * np.maximum(np.abs(values) - 0.7, 0)
+        less[0, 0, 0] = values[0, 0, 0]
+        shrunk[at] += scipy.fft.idctn(less, norm="ortho")
+        count[at] += 1
+    np.testing.assert_allclose(mean_of_turns(volume, 0.7), shrunk / count, atol=FLOAT64)
 
 
 def test_what_is_kept_and_what_goes() -> None:
     """A constant stays; noise below the threshold leaves its block means; a strong wave loses the threshold alone."""
     rng = np.random.default_rng(0)
     flat = np.full((8, 8, 8), 3.0)
-    np.testing.assert_allclose(dct_prox(flat, 1.0, nonnegative=True), flat, atol=FLOAT64)
+    np.testing.assert_allclose(dct_prox(flat, 1.0, 0, nonnegative=True), flat, atol=FLOAT64)
     noise = 1e-3 * rng.normal(size=(12, 12, 12))
-    smoothed = dct_prox(flat[0, 0, 0] + noise, 1.0, nonnegative=True) - 3
+    smoothed = mean_of_turns(flat[0, 0, 0] + noise, 1.0) - 3
     assert smoothed[4:8, 4:8, 4:8].std() < noise.std() / 8  # the mean over 64 voxels and their 64 shifts
     block = np.zeros((4, 4, 4))
     block[...] = 10 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)  # one coefficient of the only block
     norm = np.linalg.norm(block)
     np.testing.assert_allclose(
-        dct_prox(block, 2.0, nonnegative=False), block * (norm - 2) / norm, atol=FLOAT64
+        mean_of_turns(block, 2.0), block * (norm - 2) / norm, atol=FLOAT64
     )

@@ -10,6 +10,8 @@ import numpy as np
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import DctProx, TvProx
+from phyradgs_cl.objective.dct_prox import TURNS
+from phyradgs_cl.reconstructors.checkpoint import count_of
 from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
@@ -78,12 +80,20 @@ class TvAndDct(TvPrior):
 
     def __init__(self, tv: TvPrior, shrink: DctProx) -> None:
         super().__init__(tv.prox, tv.iterations)
-        self.shrink = shrink
+        self.shrink, self.turn = shrink, 0
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = super().__call__(space, volume, _TV_SHARE * weight, nonnegative=nonnegative)
-        shrink = partial(self.shrink, threshold=_DCT_SHARE * weight, nonnegative=nonnegative)
+        shrink = partial(self.shrink, threshold=_DCT_SHARE * weight, turn=self.turn, nonnegative=nonnegative)
+        self.turn = (self.turn + 1) % len(TURNS)
         return space.apply(shrink, smooth, self.prox.shape)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {**super().state(), "turn": np.array(self.turn)}
+
+    def restore(self, state: State) -> None:
+        super().restore(state)
+        self.turn = count_of(state, "turn", len(TURNS) - 1)
 
 
 class Piccs:
