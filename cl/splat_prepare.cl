@@ -235,9 +235,9 @@ __kernel void splat_prepare(
             V_STORE(l11 * cosine, fields + 2 * LANES);
             V_STORE(l12 * cosine + l22 * sine, fields + 3 * LANES);
             V_STORE(l22 * cosine - l12 * sine, fields + 4 * LANES);
-            V_STORE(l11 * -sine, fields + 9 * LANES);
-            V_STORE(speed, fields + 10 * LANES);
-            V_STORE(reach2, fields + 11 * LANES);
+            V_STORE(speed, fields + 9 * LANES);
+            V_STORE(reach2, fields + 10 * LANES);
+            V_STORE(l11 * -sine, fields + 11 * LANES);
 #else
             V_STORE(l11, fields + 2 * LANES);
             V_STORE(l12, fields + 3 * LANES);

@@ -37,9 +37,9 @@
 #define REC_ALONG_U 2
 #define REC_ALONG_V 3
 #define REC_ACROSS_V 4
-#define REC_ACROSS_U 15
-#define REC_SPEED 16      /* path over the segment, in widths of the splat */
-#define REC_REACH2 17     /* cutoff for |(along, across)|^2, enlarged by the largest Q */
+#define REC_SPEED 15      /* path over the segment, in widths of the splat */
+#define REC_REACH2 16     /* cutoff for |(along, across)|^2, enlarged by the largest Q */
+#define REC_ACROSS_U 17
 #endif
 
 /* floats from the first image to that of a cell; all of a frame's cells share one unless each line's own are wanted */
