@@ -33,6 +33,23 @@ def misses(grid: Grid, geometry: ConeGeometry) -> bool:
     return bool(np.any((low_mm >= half_mm) | (high_mm <= -half_mm)))
 
 
+def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str:
+    """Where all of ``grid`` lies that no ray of a pose (12,) meets: behind the panel, or beside the rays; else nothing."""
+    source, first, step_u, step_v = pose.reshape(4, 3)
+    rows, columns = detector_shape
+    edges = [(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)]
+    rays = np.array([first + u * step_u + v * step_v - source for u, v in edges])
+    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3) - source
+    away = np.cross(step_u, step_v)
+    away = away * np.sign(away @ rays[0])
+    sides = np.cross(rays, np.roll(rays, -1, axis=0))
+    inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
+    if (corners @ away > rays[0] @ away).all():
+        return "behind the panel"
+    planes = np.concatenate([inward, away[None]])  # of the pyramid of rays, and the source's own
+    return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
+
+
 def cuts(grid: Grid, whole: Grid, geometry: ConeGeometry) -> bool:
     """Whether ``grid`` ends, by more than a voxel, inside of what is seen of the box of ``whole``."""
     half_mm = np.array(field_of_view_mm(geometry))

@@ -40,7 +40,8 @@ class ConeGeometry:
             raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
         object.__setattr__(self, "detector_shape", (int(counts[0]), int(counts[1])))
         _positive_mm("pixel_size_mm", self.pixel_size_mm, (2,))
-        checks.numbers("detector_offset_mm", self.detector_offset_mm, (2,))
+        for name in ("pixel_size_mm", "detector_offset_mm"):  # tuples whatever was given: geometries are compared
+            object.__setattr__(self, name, tuple(checks.numbers(name, getattr(self, name), (2,)).tolist()))
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
         """Poses (..., 12) float64 at gantry angles (...) (design: source at (DSO cos θ, DSO sin θ, 0))."""

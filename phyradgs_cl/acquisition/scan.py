@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.field_of_view import default_grid, field_of_view_mm, misses
+from phyradgs_cl.acquisition.field_of_view import default_grid, field_of_view_mm, hidden, misses
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
@@ -80,6 +80,8 @@ class Scan:
         if frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
         object.__setattr__(self, "frame_start_s", checks.numbers("frame_start_s", self.frame_start_s, (frames,)))
+        if not isinstance(self.title, str):
+            raise InputError("title", checks.shown(self.title), "text")
         if self.detector_model not in DETECTOR_MODELS:
             raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
         checks.within("lag", self.lag, 0, LARGEST_LAG)
@@ -105,7 +107,7 @@ class Scan:
         column, step to the next row, x y z each. grid: the cube that a full turn sees when None. others: fields of ``Scan``:
         detector_model, pixel_mask, reference, title, lag, provenance.
 
-        Raises InputError for shapes that do not fit, and a panel that the source does not face.
+        Raises InputError for shapes that do not fit, and poses from which no ray meets the grid.
         """
         values = _uncounted(frames, others.get("pixel_mask"))
         checks.shape("frames", values, (None, None, None))
@@ -117,7 +119,9 @@ class Scan:
         shutter, start_s = Shutter(0.0), np.arange(len(values), dtype=np.float64)
         trajectory = resting_trajectory(geometry, table, start_s)
         check_others(others)
-        return cls(values, geometry, trajectory, shutter, start_s, grid or default_grid(geometry), False, **others)
+        scan = cls(values, geometry, trajectory, shutter, start_s, grid or default_grid(geometry), False, **others)
+        scan.check_sight()
+        return scan
 
     @classmethod
     def from_astra(cls, frames: "ArrayLike", vectors: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
@@ -145,6 +149,7 @@ class Scan:
 
         Raises InputError for parallel beams, a turned panel, and attributes that are missing or do not fit.
         """
+        check_others(others)
         poses, panel, grid = poses_of_tigre(geo, angles)
         checks.shape("frames", frames, (len(poses), *panel))
         return cls.from_poses(frames, poses, grid, **others)
@@ -220,6 +225,23 @@ class Scan:
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
         for frame, start_s in enumerate(self.frame_start_s):
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
+
+    def check_sight(self) -> None:
+        """InputError for a grid that no ray meets in any frame, as each opens: its volume would be 0."""
+        places = set()
+        for frame, start_s in enumerate(self.frame_start_s):
+            (pose,) = checked_poses(self.trajectory, frame, np.array([start_s]))
+            place = hidden(self.grid, pose, self.geometry.detector_shape)
+            if not place:
+                return
+            places.add(place)
+        culprit = getattr(self.trajectory, "culprit", "trajectory")
+        if places == {"behind the panel"}:
+            remedy = "are the source's distances to axis and panel exchanged?"
+            raise InputError(culprit, "the grid behind the panel in every frame", "it between source and panel", remedy)
+        box_mm = np.round(self.grid.box_mm, 3).tolist()
+        found = f"a box in {box_mm} mm (z, y, x) that no ray meets in any frame"
+        raise InputError("grid", found, "one that the panel sees", "correct its offset or unit, or the poses")
 
 
 def check_others(others: Iterable[str]) -> None:

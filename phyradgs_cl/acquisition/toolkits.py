@@ -5,6 +5,7 @@ TIGRE's cone is ours: source at (DSO cos α, DSO sin α, 0), columns along the t
 its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
 """
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
+
+log = logging.getLogger(__name__)
+_MOST_RAD = 20 * np.pi  # ten turns
 
 
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
@@ -53,6 +57,8 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     if angles.ndim == 2:
         _refuse("angles", angles[:, 1:], "turns about z only: (F,), or (F, 3) with zeros behind the first")
         angles = angles[:, 0]
+    if (span := float(np.ptp(angles)) if angles.size else 0.0) > _MOST_RAD:
+        log.warning("angles: %d frames over %.4g rad: are they degrees? np.deg2rad(angles)", len(angles), span)
     frames = len(angles)
     _refuse("geo.rotDetector", _each(geo, "rotDetector", frames, 3, 0.0), "zeros: a panel that is not turned")
     offset_mm = _each(geo, "offOrigin", frames, 3, 0.0)

@@ -17,7 +17,7 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
     float32 on the operator's device; tensors of float32 on the host are read and made where they are, by DLPack. Linear
     operators can be differentiated any number of times, others once, and ``backward`` renders nothing again.
 
-    Raises InputError where PyTorch is not installed, for what is no operator, and as the operator does.
+    Raises InputError where PyTorch is not installed, for what is no operator or tensor, and as the operator does.
     """
     torch: Any = checks.package("torch", "for as_torch", "torch")
     if not isinstance(operator, Operator):
@@ -52,6 +52,8 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
             return tensor(ctx.back(array(by_y)), by_y), None
 
     def function(x: Any, frames: Sequence[int] | None = None) -> Any:
+        if not isinstance(x, torch.Tensor):
+            raise InputError("x", checks.shown(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
         of = operator if frames is None else operator.frames(frames)
         return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
 

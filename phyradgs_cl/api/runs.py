@@ -1,9 +1,10 @@
 """Scans and volumes: read, written, simulated, reconstructed."""
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,14 @@ from phyradgs_cl.reconstructors import (
     method_options,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
+from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
+
+_IDENTITY = "run"
+"""Where a state has what its run was of."""
 
 
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
@@ -174,7 +179,7 @@ def reconstruct(
     report: a function that is called with every ``Progress``, of voxels each iteration, of splats every 50 and where ten
     seconds went by; True: a line with rate and time left, on a terminal or in a
     notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
-    resume: the partial result of an interrupted run of the same scan and options, to go on from.
+    resume: the partial result of an interrupted run of the same scan, options, seed and first volume, to go on from.
     initial: a volume from which an iterative or splatting method starts: a result, resampled where its grid is another, or
     an array (nz, ny, nx) in 1/mm on the scan's grid.
     on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" a
@@ -192,15 +197,24 @@ def reconstruct(
     given = {name: options.pop(name) for name in input_names(method, preset) if name in options}
     chosen = method_options(method, preset, options)
     before = input_options(given)
-    more: dict[str, Any] = {} if resume is None else {"resume": _state_of(resume, method, chosen)}
+    on_its_grid = scan.with_grid(before)
+    more: dict[str, Any] = {}
     if initial is not None:
-        more["initial"] = _first_volume(initial, scan.with_grid(before).grid)
+        more["initial"] = _first_volume(initial, on_its_grid.grid)
+
+    def identity() -> dict[str, object]:  # made where it is needed: it reads all frames
+        return _identity(on_its_grid, asdict(before), seed, *more.get("initial", ())[:1])
+
+    if resume is not None:
+        more["resume"] = _state_of(resume, method, chosen, on_its_grid.grid, identity)
     result: Reconstruction | None = None
     try:
         with _reporting(report) as (tell, end), keep_finished_work():
             result = run_method(
                 scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more
             )
+            if result.state is not None:
+                result = replace(result, state={**result.state, _IDENTITY: np.array(json.dumps(identity(), default=repr))})
             if result.early_stop:
                 end(f"{method_name(method)}{result.early_stop}")
     except KeyboardInterrupt as error:
@@ -256,8 +270,24 @@ def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, 
             yield ticker.progress, ticker.end
 
 
-def _state_of(partial: object, method: object, options: Any) -> State:
-    """How to go on from a result that was interrupted, of the same method and options."""
+def _identity(scan: Scan, before: object, seed: int, initial: np.ndarray | None = None) -> dict[str, object]:
+    """What a run that goes on has in common with the one that was interrupted, besides its method: of arrays SHA-256."""
+    frames = _sha256(scan.projections, np.packbits(scan.valid))
+    start = None if initial is None else _sha256(initial.astype(np.float32))  # as files have it
+    return {"scan": frames, "seed": seed, "steps or other input options": before, "initial": start}
+
+
+def _sha256(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def _state_of(
+    partial: object, method: object, options: Any, grid: Grid, identity: Callable[[], dict[str, object]]
+) -> State:
+    """How to go on from a result that was interrupted, of the same scan, method and options."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
         found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.shown(partial)
         raise InputError("resume", found, "the partial result of an interrupted run")
@@ -272,4 +302,12 @@ def _state_of(partial: object, method: object, options: Any) -> State:
         raise InputError(
             "resume", "another method, or other options", "those of the run that was interrupted"
         )
-    return partial.state
+    if not partial.grid.is_close(grid):
+        raise InputError("resume", f"a volume on {partial.grid}", f"one on {grid}")
+    state = dict(partial.state)
+    was = parsed(state, _IDENTITY, dict)
+    del state[_IDENTITY]
+    for name, value in json.loads(json.dumps(identity(), default=repr)).items():
+        if was.get(name) != value:
+            raise InputError("resume", f"another {name}", "that of the run that was interrupted")
+    return state

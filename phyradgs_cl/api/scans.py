@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 _TURN_RAD = 2 * np.pi
 _SLACK = 1e-3  # relative: angles come rounded
 _MANY = 16  # frames: fewer may well be of a few degrees
+_AIR_SLACK = 0.2  # of a transmission, with noise
 _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the gantry turns
 
 
@@ -77,7 +78,7 @@ def fly_scan(
         raise InputError("exposure_deg", found, "the sign of the angles' steps", remedy)
     shutter = Shutter(exposure_s, readout_ratio * exposure_s, readout, readout_direction)
     in_turn = np.all(steps > 0)
-    _warn_of_angles(turned_deg, steps.min(initial=np.inf) if in_turn else np.inf)
+    _warn_of_angles(turned_deg, steps.min(initial=np.inf) if in_turn else np.inf, readout_ratio)
     exposures = (
         (turned_deg - turned_deg[:1]) / exposure_deg
         if in_turn
@@ -116,14 +117,26 @@ def static_scan(
     return _scan(pixels, orbit, Shutter(0.0), start_s, grid, False, others)
 
 
-def _warn_of_angles(angle_deg: np.ndarray, least_step: float = np.inf) -> None:
-    """Says what angles (F,) look like that are radians; ``least_step``: of the shortest step, how many exposures it has."""
+def _warn_of_angles(angle_deg: np.ndarray, least_step: float = np.inf, readout_ratio: float = 0.0) -> None:
+    """Says what angles (F,) look like that are radians, and what no panel does; ``least_step``: of the shortest step, how
+    many exposures it has.
+    """
     span_deg = float(np.ptp(angle_deg))
     if len(angle_deg) >= _MANY and 0 < span_deg <= _TURN_RAD * (1 + _SLACK):
         log.warning("angles_deg: %d frames within %.4g°: are they radians? np.rad2deg(angles)", len(angle_deg), span_deg)
     elif least_step < 1 - _SLACK:
         found = "angles_deg: frames follow each other within %.3g of an exposure: a line would open again while it is open"
         log.warning(found + "; expected steps of exposure_deg or more, but where turns are sorted by angle", least_step)
+    elif readout_ratio > least_step * (1 + _SLACK):
+        found = "readout_ratio: readout takes %.4g of the time between frames: a frame would be read while the last one is"
+        log.warning(found + "; is it in percent?", readout_ratio / least_step)
+
+
+def _warn_of_transmission(frames: np.ndarray) -> None:
+    """Says what frames (F, rows, columns) look like that are 1 in air, at their left and right borders, and less within."""
+    border, brighter = np.median(frames[..., [0, -1]]), np.count_nonzero(frames > 1 + _AIR_SLACK)
+    if abs(border - 1) < _AIR_SLACK and brighter < 0.01 * frames.size and np.min(frames) < 1 - _AIR_SLACK:
+        log.warning('frames: 1 at their borders, and less within: are they transmissions? quantity="transmission"')
 
 
 def _pixels(
@@ -153,6 +166,7 @@ def _pixels(
         )
     if quantity is None and flat is None:
         check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
+        _warn_of_transmission(values)
     found = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, custom=held)
     if mask is None:
         return found

@@ -119,6 +119,8 @@ def _blocks(scan: Scan, stage: Stage) -> int:
 
 def _check(scans: Sequence[Scan], per_view: str) -> None:
     first = scans[0]
+    for scan in scans:
+        scan.check_sight()
     if per_view and len(scans) > 1:
         raise InputError(f"--what {per_view}", "a second scan", "one scan: views are each scan's own", "leave --with out")
     if first.frames < _FEWEST_FRAMES or first.geometry.detector_shape[1] < _FEWEST_COLUMNS:

@@ -148,6 +148,7 @@ def reconstruct(
         _check_ranks(method_name(method), rt)
     asked = InputOptions() if before is None else before
     ready = prepared(scan, asked, rt)
+    ready.check_sight()
     check_own_motion(getattr(chosen, "motion", None), ready)
     if initial is not None:
         extra["initial"] = _initial(method, *initial, ready.grid)

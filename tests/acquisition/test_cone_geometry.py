@@ -57,6 +57,13 @@ def test_scaled_and_transposed_poses() -> None:
     np.testing.assert_array_equal(transpose_pose(transpose_pose(pose)), pose)
 
 
+def test_lists_and_arrays_make_the_same_geometry() -> None:
+    shape, pixels, offsets = ([*pair] for pair in ((7, 10), (0.6, 0.5), (1.25, -2.5)))
+    for kind in (list, np.array):
+        same = ConeGeometry(785.0, 1200.0, kind(shape), kind(pixels), kind(offsets))
+        assert same == GEOMETRY and hash(same) == hash(GEOMETRY)
+
+
 def test_nonsense_is_refused_by_name() -> None:
     small = ConeGeometry(0.25, 0.5, (4, 4), (0.01, 0.01))  # machines may be smaller than a millimetre
     assert (small.source_to_axis_mm, small.magnification) == (0.25, 2.0)

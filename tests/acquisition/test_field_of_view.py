@@ -1,10 +1,12 @@
 """What a scan sees, and its grid replaced."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
-from phyradgs_cl.acquisition.field_of_view import cuts, field_of_view_mm, misses
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter, transpose_pose
+from phyradgs_cl.acquisition.field_of_view import cuts, field_of_view_mm, hidden, misses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 
@@ -39,6 +41,24 @@ def test_a_grid_that_ends_inside_of_what_is_seen() -> None:
         assert cuts(grid, GRID, GEOMETRY) is is_cut and not misses(grid, GEOMETRY), roi_mm
     for x_mm, is_missed in ((248, True), (-248, True), (240, False)):  # two touch what is seen, ±240
         assert misses(Grid((2, 2, 2), (8.0, 8.0, 8.0), (0.0, 0.0, x_mm)), GEOMETRY) is is_missed
+
+
+def test_where_a_grid_lies_that_no_ray_of_a_pose_meets(scan) -> None:
+    """A cube of 8 mm, from the panel's and the rays' edges as seen from the source at x = 400 mm."""
+    at = GEOMETRY.pose(0.0)  # the panel at x = -400 mm is 40 mm high and 1200 mm wide
+    for z_mm, y_mm, x_mm, place in [
+        (0, 0, 0, ""), (0, 0, -395, ""), (0, 0, -405, "behind the panel"), (0, 0, 405, "beside the rays"),
+        (0, 0, 400, ""), (13, 0, 0, ""), (15, 0, 0, "beside the rays"), (-15, 0, 0, "beside the rays"),
+        (0, 303, 0, ""), (0, 308, 0, "beside the rays"), (0, -308, 0, "beside the rays"),
+    ]:  # fmt: skip
+        grid = Grid((2, 2, 2), (4.0, 4.0, 4.0), (z_mm, y_mm, x_mm))
+        for pose, panel in ((at, (20, 30)), (transpose_pose(at), (30, 20))):  # either handedness
+            assert hidden(grid, pose, panel) == place, (z_mm, y_mm, x_mm)
+    scan.check_sight()
+    one_side = replace(scan, grid=Grid((2, 2, 2), (4.0, 4.0, 4.0), (0.0, 0.0, -405.0)), reference=None)
+    one_side.check_sight()  # a radian later it is before the panel
+    with pytest.raises(InputError, match="grid: found a box in .* that no ray meets in any frame"):
+        replace(one_side, grid=replace(GRID, offset_mm=(500.0, 0.0, 0.0))).check_sight()
 
 
 def test_a_reference_goes_with_a_part_of_its_grid_that_is_seen(scan) -> None:

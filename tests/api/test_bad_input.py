@@ -46,6 +46,8 @@ FRAMES = np.zeros((4, 6, 8), np.float32)
 ANGLES = [0.0, 10.0, 20.0, 30.0]
 NAN = np.full((4, 6, 8), np.nan)
 POSES = CONE.pose(np.deg2rad(ANGLES))
+EXCHANGED = POSES[[0, 3]] + np.pad(2 * POSES[[0, 3], :3] / 5, ((0, 0), (0, 9)))  # source at 7 mm, panel at -2 mm
+EXCHANGED[:, 3:6] += 4 * POSES[[0, 3], :3] / 5  # and at 2
 ONE = np.ones(1)
 
 
@@ -86,6 +88,7 @@ def fly(
 
 
 GOOD = fly()
+BACKWARDS = replace(GOOD, trajectory=PoseTable([0.0, 9.0], EXCHANGED))
 FLAT = np.zeros((11, 2))
 
 
@@ -162,6 +165,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: replace(GOOD, shutter=1.0), "shutter: found 1.0; expected a Shutter"),
         (lambda: replace(GOOD, frame_start_s=[0.0]), r"frame_start_s: found shape \(1,\)"),
         (lambda: replace(GOOD, pixel_mask=np.ones(6)), r"pixel_mask: found shape \(6,\)"),
+        (lambda: replace(GOOD, title=3), "title: found 3; expected text"),
         (lambda: replace(GOOD, reference=np.ones((2, 2, 2))), r"reference: found shape \(2, 2, 2\)"),
         (lambda: Scan.from_poses(FRAMES, POSES, is_fly=True), "is_fly: found no such option"),
         (lambda: Scan.from_poses(FRAMES.astype(np.uint16), POSES), "frames: found whole numbers .*−ln"),
@@ -212,6 +216,10 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "PoseTable": [
         (lambda: PoseTable([0.0, 1.0], POSES), "pose table: found shapes"),
         (lambda: PoseTable([0.0, 1.0], np.zeros((2, 12))), "pose table: found parallel pixel steps"),
+        (
+            lambda: reconstruct(BACKWARDS, "fdk"),
+            "pose table: found the grid behind the panel in every frame; .*axis and panel exchanged",
+        ),
     ],
     "TimeCells": [
         (lambda: reconstruct(GOOD, "sirt", motion=OnePose()), r"motion OnePose: pose: found shape \(1, 12\)"),
@@ -255,6 +263,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "calibrate": [
         (lambda: api.calibrate("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
         (lambda: api.calibrate(GOOD, "rol"), "rol"),
+        (lambda: api.calibrate(BACKWARDS), "pose table: found the grid behind the panel"),
         (lambda: api.calibrate(GOOD), "4 frames|12 columns|8 frames|columns"),
     ],
     "prepare": [
@@ -277,6 +286,8 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: reconstruct(GOOD, lambda scan, options, rt: 3), "found a int as its result"),
         (lambda: reconstruct(GOOD, "nowhere:f"), "No module named 'nowhere'"),
         (lambda: reconstruct(GOOD, "sirt", iteration=3), "did you mean 'iterations'"),
+        (lambda: reconstruct(GOOD, "sirt", grid=ELSEWHERE.grid), "grid: found a box in .* that no ray meets"),
+        (lambda: reconstruct(GOOD, prior="dtc"), "prior: found 'dtc'; expected one of .*'package.module:function'"),
         (lambda: reconstruct(GOOD, "sirt", grid=(8, 8, 8)), r"grid: found \(8, 8, 8\)"),
         (lambda: reconstruct(GOOD, "sirt", report=3), "report: found 3"),
         (lambda: reconstruct(GOOD, "sirt", on_interrupt="stop"), "on_interrupt: found 'stop'"),

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -100,6 +101,26 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path,
     assert api.load_volume(tmp_path / "partial.h5").state is None  # the volume is good without
     with pytest.raises(api.InputError, match="resume: found another method, or other options"):
         reconstruct(scan, method, iterations=9, device=rt, resume=partial)
+
+
+def test_another_run_is_not_gone_on_with(rt, scan) -> None:
+    options = {"method": "sirt", "iterations": 4, "device": rt}
+    partial = reconstruct(scan, **options, report=pressing_at(2), on_interrupt="return")
+    wider = replace(scan.grid, voxel_size_mm=(0.5, 0.5, 0.5))
+    mask = np.zeros(scan.projections.shape[1:], bool)
+    mask[3] = True
+    for given, changes, words in [
+        (replace(scan, projections=scan.projections[::-1]), {}, "another scan"),
+        (replace(scan, pixel_mask=mask), {}, "another scan"),
+        (scan, {"seed": 1}, "another seed"),
+        (scan, {"median_filter": 3}, "another steps or other input options"),
+        (scan, {"initial": partial}, "another initial"),
+        (scan, {"grid": wider}, "a volume on Grid"),
+    ]:
+        with pytest.raises(api.InputError, match=f"resume: found {words}"):
+            reconstruct(given, **options, **changes, resume=partial)
+    again = reconstruct(scan, **options, resume=partial, report=pressing_at(3), on_interrupt="return")
+    assert again.facts["interrupted_at"] == 3 and again.state["run"] == partial.state["run"]
 
 
 def test_who_asks_for_the_result_gets_it(rt, scan) -> None:

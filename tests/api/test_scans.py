@@ -54,9 +54,11 @@ def test_a_gantry_that_turns_clockwise_has_a_negative_exposure() -> None:
     assert np.all(np.diff(shuffled.frame_start_s) > 0)
 
 
-def test_angles_that_look_like_radians_and_lines_that_open_while_they_are_open_are_said(caplog) -> None:
+def test_what_looks_like_radians_transmissions_percent_or_lines_that_open_while_they_are_open_is_said(caplog) -> None:
     cone = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
     frames, turn_deg = np.zeros((20, 6, 8), np.float32), 18.0 * np.arange(20)
+    transmission = np.ones_like(frames)
+    transmission[..., 2:6] = 0.3
     cases = [
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=18.0), ""),
         (lambda: fly_scan(frames, cone, np.deg2rad(turn_deg), exposure_deg=18.0), "20 frames within 5.969°: .* radians"),
@@ -64,6 +66,12 @@ def test_angles_that_look_like_radians_and_lines_that_open_while_they_are_open_a
         (lambda: static_scan(frames, cone, np.deg2rad(turn_deg)), "radians"),
         (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=36.0), "within 0.5 of an exposure: a line would open"),
+        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=2.0), ""),
+        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=86), "readout takes 43 of .* in percent"),
+        (lambda: static_scan(transmission, cone, turn_deg), "frames: 1 at their borders.* quantity="),
+        (lambda: static_scan(transmission, cone, turn_deg, quantity="transmission"), ""),
+        (lambda: static_scan(1 - transmission, cone, turn_deg), ""),
+        (lambda: static_scan(2 - transmission, cone, turn_deg), ""),  # an object wider than the panel
     ]
     for number, (make, words) in enumerate(cases):
         caplog.clear()

@@ -9,6 +9,7 @@ from phyradgs_cl.acquisition import CircularOrbit, PoseTable
 from phyradgs_cl.api import (
     ConeGeometry,
     Gaussians,
+    Grid,
     Scan,
     load_scan,
     reconstruct,
@@ -114,6 +115,21 @@ def astra_vectors() -> np.ndarray:
     return vectors
 
 
+def exchanged() -> np.ndarray:
+    """Vectors of who gave 700 mm as the distance of the axis, 400 mm as the panel's."""
+    vectors = astra_vectors()
+    out = np.stack([np.cos(ANGLES), np.sin(ANGLES), 0 * ANGLES], -1)
+    vectors[:, :3], vectors[:, 3:6] = 700 * out, 300 * out
+    return vectors
+
+
+def test_tigre_angles_that_look_like_degrees_are_said(caplog) -> None:
+    for angles, is_said in ((ANGLES, False), (np.rad2deg(ANGLES), True)):
+        caplog.clear()
+        Scan.from_tigre(tigre(), angles, FRAMES)
+        assert is_said == ("4 frames over 234.9 rad: are they degrees?" in caplog.text)
+
+
 def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_path) -> None:
     vectors = astra_vectors()
     scan = Scan.from_astra(FRAMES, vectors)
@@ -159,6 +175,8 @@ def test_rows_may_run_down(rt, scan) -> None:
         (lambda: Scan.from_astra(FRAMES.swapaxes(0, 1), astra_vectors()), r"frames.swapaxes\(0, 1\)"),
         (lambda: Scan.from_astra(FRAMES, astra_vectors()[:, :9]), r"vectors: found shape \(4, 9\)"),
         (lambda: Scan.from_poses(FRAMES, np.zeros((4, 12))), "poses: found parallel pixel steps"),
+        (lambda: Scan.from_tigre(tigre(), ANGLES, FRAMES, grid=Grid.cube(4, 2.0)), "grid: found no such option"),
+        (lambda: Scan.from_astra(FRAMES, exchanged()), "poses: found the grid behind the panel .*exchanged"),
     ],
 )
 def test_what_does_not_fit_is_named(make, words) -> None:

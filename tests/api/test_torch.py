@@ -70,6 +70,11 @@ def test_tensors_on_the_host_are_not_copied(rt, scan, monkeypatch) -> None:
     assert np.shares_memory(seen[0], numbers(volume)) and np.shares_memory(seen[1], numbers(frames))
 
 
+def test_what_is_no_tensor_is_refused_in_a_line(rt, scan, cloud) -> None:
+    with pytest.raises(InputError, match="x: found Gaussians.*expected a tensor; of a cloud"):
+        as_torch(splat_operator(scan, device=rt))(cloud)
+
+
 def test_gaussians_are_fitted_by_a_torch_optimiser(rt, scan, cloud) -> None:
     project = as_torch(splat_operator(scan, device=rt))
     wanted = project(torch.tensor(cloud.rows().tolist()))

@@ -129,10 +129,13 @@ def test_more_gaussians_than_voxels_are_said_and_kept(scan, reconstructed, caplo
     assert f"starting with {facts['gaussians_first']}" in caplog.text
 
 
-def test_beams_that_miss_and_scans_without_an_object_are_said(cli, reconstructed, tmp_path, caplog):
+def test_beams_that_miss_and_scans_without_an_object_are_said(cli, scan, reconstructed, tmp_path, caplog, capfd):
     path = tmp_path / "scan.h5"
     assert cli.run([*SIMULATE, "--detector-offset", "500,500", "-o", str(path)]) == 0
     assert caplog.messages == ["no ray meets anything that attenuates: all 6 frames are empty"]
+    assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "volume.h5")]) == 2
+    assert "that no ray meets in any frame" in capfd.readouterr().err
+    shutil.copy(scan, path)
     for value in (0.0, -1.0):
         with h5py.File(path, "r+") as file:
             file["entry/instrument/detector/data"][...] = value

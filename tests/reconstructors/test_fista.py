@@ -166,8 +166,11 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at) -> None
 
 
 def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
-    (tmp_path / "own_priors.py").write_text("def nothing(volume, noise):\n    return 0 * volume\n")
+    own = "nothing = lambda volume, noise: 0 * volume\nless = lambda volume, noise: volume[1:]\n"
+    (tmp_path / "own_priors.py").write_text(own)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert not run(rt, scan, "fista", prior="own_priors:nothing", iterations=2).volume.any()
     with pytest.raises(InputError, match="prior: found own_priors:nobody"):
         run(rt, scan, "fista", prior="own_priors:nobody", iterations=2)
+    with pytest.raises(InputError, match="prior: found shape"):
+        run(rt, scan, "fista", prior="own_priors:less", iterations=2)

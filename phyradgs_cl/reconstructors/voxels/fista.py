@@ -65,7 +65,7 @@ class FistaOptions(IterativeOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if ":" not in self.prior:
-            checks.one_of("prior", self.prior, PRIORS)
+            checks.one_of("prior", self.prior, (*PRIORS, "package.module:function"))
         checks.within("subvoxels", self.subvoxels, 0, 8)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)
         checks.within("prior_share", self.prior_share, 0, 1)

@@ -7,6 +7,7 @@ from typing import Protocol as Interface
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import DctProx, TvProx
@@ -143,7 +144,9 @@ class OwnPrior:
         self.denoiser = denoiser
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        cleaned = np.asarray(self.denoiser(space.numpy(volume), weight), np.float32)
+        before = space.numpy(volume)
+        cleaned = np.asarray(self.denoiser(before, weight), np.float32)
+        checks.shape("prior", cleaned, before.shape)
         return space.array(np.maximum(cleaned, 0) if nonnegative else cleaned)
 
     def state(self) -> dict[str, np.ndarray]:
