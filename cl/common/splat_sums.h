@@ -6,7 +6,7 @@
 #define SUM_BU 8
 #define SUM_BV 9
 #if MOVING
-#define SUMS 5           /* between ALONG_U, ALONG_V, ACROSS_V and ACROSS_U, which the chain rule needs */
+#define SUMS 3           /* between ACROSS_V and ACROSS_U: the chain rule needs what the record keeps of S */
 #define SUM_COUNT 12     /* in the coordinates of common/splat_moving.h, where nothing cancels */
 #define SUM_ZZ 2         /* by the squares and the product of z and across */
 #define SUM_ZC 3
