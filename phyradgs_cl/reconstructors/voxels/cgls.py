@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
-from phyradgs_cl.detector import noise_level
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, voxel_method
@@ -17,44 +15,31 @@ from phyradgs_cl.reconstructors.voxels.system import System
 class CglsOptions(IterativeOptions):
     """CGLS does not clip: there is no ``nonnegative``.
 
-    noise_stop: the run ends when the residual falls to this many times the noise of the measurement, which is estimated
-    from it (discrepancy principle, Morozov 1966); below it CGLS fits the noise. 0 runs all iterations.
+    noise_stop: as of ``sart``.
     """
 
     iterations: int = 60
     nonnegative: bool = False
-    noise_stop: float = 1.1
+    noise_stop: float = 1.1  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.within("noise_stop", self.noise_stop, 0, 1e6)
         if self.nonnegative:
             raise InputError("nonnegative", "true", "false for --method cgls", "use sirt or fista-tv")
 
 
-def _noise(system: System) -> float:
-    """The norm of the measurement's noise."""
-    measured = system.space.numpy(system.measured)
-    valid = None if system.valid is None else np.broadcast_to(system.space.numpy(system.valid) != 0, measured.shape)
-    pixels = measured.size if valid is None else np.count_nonzero(valid)
-    return float(noise_level(measured, valid) * np.sqrt(pixels))
-
-
-METHOD = voxel_method(
-    "cgls", CglsOptions(), lambda system, options, _: Cgls(system, options.noise_stop * _noise(system)),
-    volumes=7, frames=3, stops_itself=lambda options: options.noise_stop > 0,
-)  # fmt: skip
+METHOD = voxel_method("cgls", CglsOptions(), lambda system, options, _: Cgls(system), volumes=7, frames=3)
 
 
 class Cgls:
-    """min ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0, until the residual's norm is ``enough`` or less.
+    """min ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0.
 
     The residual that is reported is the new one. In the intensity model it is p − I(x), J takes A's place, and
     directions combine as in nonlinear conjugate gradients (Polak and Ribière 1969), which is the same where I is linear.
     """
 
-    def __init__(self, system: System, enough: float = 0.0) -> None:
-        self.system, self.enough = system, enough
+    def __init__(self, system: System) -> None:
+        self.system = system
         self.volume = system.space.full(system.volume_shape, 0.0)
         self.finished: str | None = None
         self.residual = system.measured
@@ -86,10 +71,7 @@ class Cgls:
         beta = max(gamma - turned, 0.0) / self.gamma
         self.direction = space.add(gradient, self.direction, beta)
         self.gradient, self.gamma = gradient, gamma
-        length = space.norm(self.residual)
-        if length <= self.enough:
-            self.finished = "residual as small as the noise"
-        return length
+        return space.norm(self.residual)
 
     def state(self) -> dict[str, np.ndarray]:
         arrays = {

@@ -37,8 +37,10 @@ from phyradgs_cl.runtime import Runtime
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time
-# of the passes, the result and the prior's weight: what is the smaller voxels' (docs/results/settings.md)
-_FINE_PASSES, _FINE_SHARE, _FINE_WEIGHT = 3 / 7, np.float32(2 / 3), 2 / 3
+_FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
+# of the weight at half the side, as neighbours differ less: of 64³ and 128³ from 128² pixels, and of 128³ from 256²
+_HALF_SIDE, _SIDE = 2 / 3, 64
+_MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time for: of 64³ they are, of 128³ not
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class FistaOptions(IterativeOptions):
     a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the total variation
     from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
-    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 where the device has room for them, else 1.
+    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 for grids of at most 90³ where the device has room, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
@@ -97,7 +99,8 @@ def fista_stages(
     scan: Scan, options: FistaOptions, rt: Runtime, image: np.ndarray | None = None
 ) -> list[Stage]:
     """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels; ``image``: of piccs."""
-    parts = options.subvoxels or (2 if _has_room(scan.grid, 2, rt) else 1)
+    is_small = math.prod(scan.grid.shape) <= _MOST_PARTED
+    parts = options.subvoxels or (2 if is_small and _has_room(scan.grid, 2, rt) else 1)
     first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
@@ -106,8 +109,7 @@ def fista_stages(
     def parted(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
         assert before is not None
         grid = finer(scan.grid, parts)
-        weight = _FINE_WEIGHT * options.prior_weight
-        small = replace(options, iterations=options.iterations - first, prior_weight=weight)
+        small = replace(options, iterations=options.iterations - first)
         fine = replace(scan, grid=grid, reference=None)
         return _run(fine, small, rt, report, resume, repeated(before, parts), repeated(image, parts))
 
@@ -175,7 +177,7 @@ class Fista:
     """The residual that is reported is the pass's own: of every subset just before its step.
 
     The weight of the prior is ``prior_weight`` · σ √(h max Aᵀ1): the noise σ of a pixel, back in a voxel of side h as the
-    gradient has it, times 1/mm.
+    gradient has it, times 1/mm; on a grid of 64³, and 2/3 of it for every halving of the side.
     """
 
     def __init__(
@@ -191,7 +193,9 @@ class Fista:
         # AᵀA has no negative entry: its largest row sum bounds its norm
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         largest = space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
-        self.weight = options.prior_weight * max(noise * (voxel_mm * columns) ** 0.5, _FEWEST * largest)
+        halvings = math.log2(math.prod(system.volume_shape) ** (1 / 3) / _SIDE)
+        strength = options.prior_weight * _HALF_SIDE**halvings
+        self.weight = strength * max(noise * (voxel_mm * columns) ** 0.5, _FEWEST * largest)
         size = options.frames_per_subset or system.frames
         self.subsets = self._subsets(max(1, round(system.frames / size)))
 

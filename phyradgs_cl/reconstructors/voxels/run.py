@@ -47,6 +47,9 @@ class IterativeOptions:
     transmission_weights: ClassVar[bool] = False
     """Weigh pixels by their transmission; methods that can have an option of this name."""
 
+    noise_stop: ClassVar[float] = 0.0
+    """Times the noise, the residual at which the run ends; likewise."""
+
     MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
 
     motion: Motion = Static()
@@ -58,6 +61,7 @@ class IterativeOptions:
     def __post_init__(self) -> None:
         checks.within("iterations", self.iterations, 0, MOST_ITERATIONS)
         checks.within("tolerance", self.tolerance, 0, 1)
+        checks.within("noise_stop", self.noise_stop, 0, 1e6)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         check_motion(self.motion, self.MOTIONS)
 
@@ -113,7 +117,9 @@ def run_iterations(
     algorithm = make(system)
     if initial is not None and resume is None:
         algorithm.start_from(system.space.array(np.ascontiguousarray(initial, np.float32)))
-    run = _Iterations(algorithm, options, scan.grid, system.space.norm(system.measured) or 1.0)
+    norm = system.space.norm(system.measured) or 1.0
+    enough = options.noise_stop * system.noise_norm() / norm if options.noise_stop else 0.0
+    run = _Iterations(algorithm, options, scan.grid, norm, enough)
     loop = Loop(run, rt.ranks, report, started)
     loop.run(resume)
     facts: dict[str, object] = {
@@ -145,7 +151,6 @@ def voxel_method(
     *,
     volumes: int | Callable[[Scan, Any], int],
     frames: int,
-    stops_itself: Callable[[Any], bool] = lambda options: False,
 ) -> Method:
     """An algorithm as a method; ``volumes``, of scan and options where it depends on them, and ``frames`` as of
     ``run_iterations``."""
@@ -166,7 +171,8 @@ def voxel_method(
             volumes=held, frames=frames,
         )  # fmt: skip
 
-    return Method(run, {"default": default}, is_shared=True, takes_initial=True, stops_itself=stops_itself)
+    presets, stops = {"default": default}, lambda options: options.noise_stop > 0
+    return Method(run, presets, is_shared=True, takes_initial=True, stops_itself=stops)
 
 
 class _Iterations:
@@ -175,14 +181,17 @@ class _Iterations:
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 
     def __init__(
-        self, algorithm: Algorithm, options: IterativeOptions, grid: Grid, measured_norm: float
+        self, algorithm: Algorithm, options: IterativeOptions, grid: Grid, measured_norm: float, enough: float
     ) -> None:
-        self.algorithm, self.options, self.grid, self.measured_norm = algorithm, options, grid, measured_norm
+        self.algorithm, self.options, self.grid = algorithm, options, grid
+        self.measured_norm, self.enough = measured_norm, enough
         self.iteration, self.iterations = 0, options.iterations
         self.residual, self.change = 0.0, 0.0
 
     @property
     def finished(self) -> str | None:
+        if self.enough and self.residual <= self.enough:
+            return "residual as small as the noise"
         return self.algorithm.finished or ("tolerance" if self.change < self.options.tolerance else None)
 
     def step(self) -> None:

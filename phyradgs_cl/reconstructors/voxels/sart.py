@@ -28,6 +28,8 @@ class SartOptions(IterativeOptions):
     frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
     (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
     transmission_weights: transmission-weighted (PWLS), W = t/(A 1) and V = 1/(Aᵀ t).
+    noise_stop: the run ends when the residual falls to this many times the noise of the measurement, which is estimated
+    from it (discrepancy principle, Morozov 1966); below it the noise is fitted. 0 runs all iterations.
     """
 
     relaxation: float = 1.0
@@ -35,6 +37,7 @@ class SartOptions(IterativeOptions):
     frames_per_subset: int = 1
     order: str = "spread"
     transmission_weights: bool = False  # type: ignore[misc]
+    noise_stop: float = 1.1  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()

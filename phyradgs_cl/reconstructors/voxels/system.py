@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.detector import transmission_weights
+from phyradgs_cl.detector import noise_level, transmission_weights
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
 from phyradgs_cl.reconstructors.voxels.ranks import Intensity, SharedIntensity, SharedOperator
@@ -130,6 +130,13 @@ class System:
         """Puts J where an interrupted run had it; A is the same everywhere."""
         if self.intensity is not None:
             self.expected(volume)
+
+    def noise_norm(self) -> float:
+        """The norm of the measurement's noise, estimated from it."""
+        measured = self.space.numpy(self.measured)
+        valid = None if self.valid is None else np.broadcast_to(self.space.numpy(self.valid) != 0, measured.shape)
+        pixels = measured.size if valid is None else np.count_nonzero(valid)
+        return float(noise_level(measured, valid) * np.sqrt(pixels))
 
     def row_sums(self) -> Any:
         """A 1 in mm: the length of every ray in the volume."""
