@@ -130,9 +130,8 @@ def drawn(
     rt._tile = TILE
     cells, gaussians = DeviceCells.upload(rt, table_of(motion, pixels)), DeviceGaussians.upload(rt, rows)
     projector = SplatProjector(rt, pixels, pixels)
-    projector.prepare(gaussians, cells)
-    projector.lists.build(projector._extents, gaussians.count, gaussians.stride)
     work = projector.work(gaussians, cells)
+    projector.lists.build(projector._extents, gaussians.count, gaussians.stride)
     counts = {
         "gaussians": gaussians.count, "cells": cells.count, "gaussian_cells": gaussians.stride * cells.count,
         "footprints": work.footprints, "pairs": work.pairs, "pixels": pixels**2, "tiles": projector.lists.total,
@@ -213,7 +212,7 @@ SPLAT_BYTES: dict[str, Callable[[Counts, str], float]] = {
     "splat_backward_group": lambda n, motion: (
         n["footprints"] * (record_bytes(motion) + 64) + n["gaussian_cells"] + 4 * n["pixels"]
     ),
-    "splat_chain": lambda n, motion: n["footprints"] * (64 + 16) + n["gaussian_cells"] + 96 * n["gaussians"],
+    "splat_chain": lambda n, motion: n["footprints"] * record_bytes(motion) + n["gaussian_cells"] + 96 * n["gaussians"],
     "bin_count_group": lambda n, motion: 24 * n["gaussians"] + 4 * n["counts"],
     "bin_within_group": lambda n, motion: 8 * n["counts"],
     "bin_starts_group": lambda n, motion: 8 * n["tiles"],

@@ -97,14 +97,13 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
 #endif
 
 #define ARGUMENTS                                                                                                    \
-    __global const float *records,    /* (stride, C, RECORD) */                                                      \
+    __global float *records,          /* (stride, C, RECORD); the sums come in their place */                        \
     __global const uchar *seen,       /* (stride, C) */                                                              \
     __global const float *cells,      /* (C, CELL) */                                                                \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                       \
     const int time_pitch, const float4 path_limits,                                                                  \
     __global const float *images,     /* dL/dp: guard, then (lines, pitch), padding zero; LAYERED: one per layer */    \
-    const int count, const int cell_count, const int lines, const int pitch, const float cutoff2,                    \
-    __global float *sums              /* (stride, C, SUMS) */
+    const int count, const int cell_count, const int lines, const int pitch, const float cutoff2
 
 #if GROUP == 1
 __kernel void splat_backward_rows(ARGUMENTS)
@@ -116,13 +115,14 @@ __kernel void splat_backward_rows(ARGUMENTS)
         const size_t at = (size_t)g * cell_count + c;
         if (!seen[at])
             continue;
-        __global const float *rec = records + at * RECORD, *cell = cells + c * CELL;
+        __global float *rec = records + at * RECORD;
+        __global const float *cell = cells + c * CELL;
         __global const int *whole = (__global const int *)rec;
         gatherer own = {no_sums(), images + LAYER_AT(cell, lines, pitch), pitch, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT};
         walk_footprint(rec, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, path_limits, cutoff2,
                        whole[REC_V_LO], whole[REC_V_HI], &own);
         for (int f = 0; f < SUM_COUNT; ++f)
-            sums[at * SUMS + f] = v_sum(own.sums.of[f]);
+            rec[SUMS + f] = v_sum(own.sums.of[f]);
     }
 }
 #else
@@ -140,7 +140,7 @@ __kernel void splat_backward_group(ARGUMENTS)
             rec[f] = records[at * RECORD + f];
         for (int f = item; f < CELL; f += GROUP)
             cell[f] = cells[c * CELL + f];
-        barrier(CLK_LOCAL_MEM_FENCE);
+        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* all have read where sums will be */
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
         __global const float *image = images + LAYER_AT(cell, lines, pitch) + IMAGE_GUARD;
         splat_sums mine = no_sums();
@@ -149,7 +149,7 @@ __kernel void splat_backward_group(ARGUMENTS)
             for (int u = line.u_lo + (int)get_local_id(0); u <= line.u_hi; u += ACROSS)
                 gather(&mine, line, u, limit, image[(size_t)v * pitch + u]);
         }
-        group_sums(mine.of, SUM_COUNT, tree, sums + at * SUMS);
+        group_sums(mine.of, SUM_COUNT, tree, records + at * RECORD + SUMS);
         barrier(CLK_LOCAL_MEM_FENCE); /* all have read what the next cell writes */
     }
 }

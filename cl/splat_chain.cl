@@ -43,9 +43,8 @@ __kernel void splat_chain(
     __global const float *gaussians,      /* (11, stride) */
     __global const float *cells,          /* (C, CELL) */
     __global const coefficient *matrices, /* (C, POSES, 12) */
-    __global const float *records,        /* (stride, C, RECORD) */
+    __global const float *records,        /* (stride, C, RECORD), with sums in them */
     __global const uchar *is_drawn,       /* (stride, C) */
-    __global const float *sums,           /* (stride, C, SUMS) */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
     __global float *gradients)            /* (13, stride) */
@@ -69,12 +68,12 @@ __kernel void splat_chain(
         for (int lane = 0; lane < LANES; ++lane) {
             const size_t at = (size_t)(first + lane) * cell_count + c;
             const int here = first + lane < count && is_drawn[at];
+            __global const float *rec = records + at * RECORD;
             drawn |= here;
             seen[lane] = here;
             for (int f = 0; f < SUM_COUNT; ++f)
-                fields[f * LANES + lane] = here ? sums[at * SUMS + f] : 0.0f;
+                fields[f * LANES + lane] = here ? rec[SUMS + f] : 0.0f;
 #if MOVING
-            __global const float *rec = records + at * RECORD;
             fields[SUM_COUNT * LANES + lane] = here ? rec[REC_ALONG_U] : 1.0f;
             fields[(SUM_COUNT + 1) * LANES + lane] = here ? rec[REC_ALONG_V] : 0.0f;
             fields[(SUM_COUNT + 2) * LANES + lane] = here ? rec[REC_ACROSS_U] : 0.0f;

@@ -229,20 +229,20 @@ __kernel void splat_prepare(
         VI_STORE(v_lo, bounds + 4 * LANES);
         VI_STORE(v_hi, bounds + 5 * LANES);
         if (V_ANY(drawn)) {
-            V_STORE(u_rest, fields);
-            V_STORE(v_rest, fields + LANES);
 #if MOVING
-            V_STORE(l11 * cosine, fields + 2 * LANES);
-            V_STORE(l12 * cosine + l22 * sine, fields + 3 * LANES);
-            V_STORE(l22 * cosine - l12 * sine, fields + 4 * LANES);
+            V_STORE(l11 * cosine, fields);
+            V_STORE(l12 * cosine + l22 * sine, fields + LANES);
+            V_STORE(l22 * cosine - l12 * sine, fields + 2 * LANES);
             V_STORE(l11 * -sine, fields + 9 * LANES);
             V_STORE(speed, fields + 10 * LANES);
             V_STORE(reach2, fields + 11 * LANES);
 #else
-            V_STORE(l11, fields + 2 * LANES);
-            V_STORE(l12, fields + 3 * LANES);
-            V_STORE(l22, fields + 4 * LANES);
+            V_STORE(l11, fields);
+            V_STORE(l12, fields + LANES);
+            V_STORE(l22, fields + 2 * LANES);
 #endif
+            V_STORE(u_rest, fields + 3 * LANES);
+            V_STORE(v_rest, fields + 4 * LANES);
             V_STORE(b1, fields + 5 * LANES);
             V_STORE(b2, fields + 6 * LANES);
             V_STORE(ik, fields + 7 * LANES);

@@ -18,11 +18,11 @@
 #else
 #define RECORD 16
 #endif
-#define REC_U_REST 0      /* u0 - REC_U_WHOLE */
-#define REC_V_REST 1
-#define REC_L11 2
-#define REC_L12 3
-#define REC_L22 4
+#define REC_L11 0
+#define REC_L12 1
+#define REC_L22 2
+#define REC_U_REST 3      /* u0 - REC_U_WHOLE */
+#define REC_V_REST 4
 #define REC_B1 5
 #define REC_B2 6
 #define REC_INV_KAPPA 7
@@ -34,9 +34,9 @@
 #define REC_V_LO 13
 #define REC_V_HI 14
 #if MOVING                /* another factor of S, turned into the motion: common/splat_moving.h */
-#define REC_ALONG_U 2
-#define REC_ALONG_V 3
-#define REC_ACROSS_V 4
+#define REC_ALONG_U 0
+#define REC_ALONG_V 1
+#define REC_ACROSS_V 2
 #define REC_ACROSS_U 15
 #define REC_SPEED 16      /* path over the segment, in widths of the splat */
 #define REC_REACH2 17     /* cutoff for |(along, across)|^2, enlarged by the largest Q */

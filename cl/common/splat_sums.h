@@ -1,11 +1,12 @@
-/* What the adjoint keeps of the pixels under a splat in one cell, (stride, C, SUMS): from here the chain rule goes on. */
-#define SUMS 16
+/* What the adjoint keeps of the pixels under a splat in one cell: from here the chain rule goes on. It lies in the record,
+   from SUMS on, over what only the projector and the adjoint's first pass need of it. */
 #define SUM_W 0          /* sum of gradient x value: the derivative by log amplitude */
 #define SUM_IK 1         /* by 1/kappa */
 #define SUM_B 7          /* by B = 1 + b.D, and its moments */
 #define SUM_BU 8
 #define SUM_BV 9
 #if MOVING
+#define SUMS 3           /* between ACROSS_V and ACROSS_U: the chain rule needs what the record keeps of S */
 #define SUM_COUNT 12     /* in the coordinates of common/splat_moving.h, where nothing cancels */
 #define SUM_ZZ 2         /* by the squares and the product of z and across */
 #define SUM_ZC 3
@@ -15,6 +16,7 @@
 #define SUM_TZ 10        /* for the path through num */
 #define SUM_TC 11
 #else
+#define SUMS 0
 #define SUM_COUNT 10
 #define SUM_UU 2         /* by S11, S12 (once), S22 without their factors */
 #define SUM_UV 3

@@ -20,8 +20,8 @@ def test_the_kernel_is_its_twin(any_rt, shape) -> None:
         np.testing.assert_allclose(
             any_rt.download(found), dct_prox(volume, 0.4, turn, nonnegative=nonnegative), rtol=0, atol=FLOAT32
         )
-    np.testing.assert_array_equal(prox(volume, 0.4, 0, nonnegative=True), any_rt.download(found))
-    prox(on_device, 0.4, 0, nonnegative=True, out=on_device)  # in place, the same bits
+    np.testing.assert_array_equal(prox(volume, 0.4, turn, nonnegative=nonnegative), any_rt.download(found))
+    prox(on_device, 0.4, turn, nonnegative=nonnegative, out=on_device)  # in place, the same bits
     np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(found))
 
 

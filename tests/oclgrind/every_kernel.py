@@ -41,11 +41,12 @@ SHAPE, GRID = (5, 7), Grid((5, 6, 7), (0.3, 0.28, 0.25), (0.1, 0.0, -0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
-FREEZES = ("a GPU's",)  # builds, and cases, in which unwritten memory cannot be looked for
+FREEZES = ("a GPU's", "a GPU's without float64")  # builds, and cases, in which unwritten memory cannot be looked for
 VECTORS_OR_FREEZES = ("asd-pocs", "fista", "fused", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
+    "a GPU's without float64": {"lanes": 1, "pixel_items": True, "fp64": False},
 }
 
 

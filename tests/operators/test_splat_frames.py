@@ -13,7 +13,13 @@ from tolerances import (
 )
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import (
+    TimeCells,
+    exact_cells,
+    micro_view_cells,
+    per_line_cells,
+    static_cells,
+)
 from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_frame, splat_image
 from phyradgs_cl.runtime import Runtime
@@ -144,3 +150,19 @@ def test_launches_do_not_grow_with_the_micro_views(rt, make_cloud, orbit, monkey
     assert counts[0] == counts[1]
     for kernel in ("splat_prepare", "splat_forward_rows", "splat_backward_rows", "splat_chain"):
         assert counts[1].count(kernel) == 1
+
+
+def test_a_gaussian_in_a_cell_takes_one_record(make_cloud, orbit) -> None:
+    """64 bytes, 80 where it moves, and a mark: the adjoint's sums come in its place."""
+    where, rows = (orbit, Shutter(0.5, 0.4), 0, START_S, SHAPE[0]), make_cloud(512, 37)
+    for record_bytes, tables in (
+        (65, [micro_view_cells(*where, 1, cells) for cells in (1, 41)]),
+        (81, [exact_cells(*where, cells) for cells in (1, 41)]),
+    ):
+        held = []
+        for table in tables:
+            rt = Runtime()
+            projector, cells = SplatProjector(rt, *SHAPE), DeviceCells.upload(rt, table)
+            projector.project_adjoint(rows, cells, np.ones(SHAPE))
+            held.append(rt.peak_bytes)
+        assert record_bytes <= (held[1] - held[0]) / (40 * 512) < record_bytes + 2  # and a cell's constants

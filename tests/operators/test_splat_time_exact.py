@@ -215,7 +215,6 @@ def test_counted_work_is_that_of_the_spans(rt) -> None:
     projector, cells = SplatProjector(rt, *WIDE), DeviceCells.upload(rt, table)
     gaussians = DeviceGaussians.upload(rt, row)
     drawn = np.count_nonzero(projector.project(row, cells))
-    projector.forward(gaussians, cells)
     work = projector.work(gaussians, cells)
     assert drawn <= work.pairs <= 1.1 * drawn + 2 * WIDE[0]
     assert work.evaluated >= work.pairs and work.footprints == 1

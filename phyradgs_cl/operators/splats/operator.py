@@ -1,7 +1,7 @@
 """Splats as whole operators in mm and 1/mm: of a scan's frames, and of a grid, each with its derivative's transpose.
 
 A cloud is entered once (``rows.enter``), then rendered and differentiated as often as needed. ``back`` renders nothing: it
-sees the Gaussians again from the poses (``prepare``), and leaves that out where the last call has just done so. Everything
+sees the Gaussians again from the poses (``prepare``), and leaves that out where ``forward`` has just done so. Everything
 lies on the device, without padding.
 """
 
@@ -71,14 +71,14 @@ class SplatOperator:
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         for number, cells in enumerate(self._cells):
-            if not self._ready.holds(point, cells):
-                self._ready.forget()
+            is_ready = self._ready.holds(point, cells)
+            self._ready.forget()
+            if not is_ready:
                 see = self._projector.forward if self.is_layered else self._projector.prepare
                 see(gaussians, cells)  # intensities are merged anew: their derivative depends on every layer
             by_image = self._images.enter(by_frames, number)
             self._projector.backward(gaussians, cells, by_image, gradients)
             self.rows.leave(gradients, point, by_rows, add=number > 0)
-        self._ready.note(point, self._cells[-1])
         return by_rows
 
     def subset(self, frames: Sequence[int]) -> "SplatOperator":

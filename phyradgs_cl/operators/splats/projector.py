@@ -19,7 +19,6 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
-SUM_FLOATS = 16
 DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
 DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
 PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
@@ -103,7 +102,6 @@ class SplatProjector:
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
         self._seen = rt.empty(1, np.uint8)
-        self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
         options = {"AFFINE": affine, "FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
         self._kernels = {moving: _Kernels.declare(rt, MOVING=moving, **options) for moving in (False, True)}
@@ -161,7 +159,7 @@ class SplatProjector:
     ) -> None:
         """Writes dL/dparameters into ``gradients`` (13, stride), rows as cl/common/gradient.h says.
 
-        Uses what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells.
+        Uses up what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells: its sums take the place.
         """
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
@@ -182,7 +180,6 @@ class SplatProjector:
             np.int32(self.lines),
             np.int32(self.pitch),
             self.cutoff2,
-            self._sums,
             group=group,
         )
         rt.launch(
@@ -193,7 +190,6 @@ class SplatProjector:
             cells.matrices,
             self._records,
             self._seen,
-            self._sums,
             np.int32(cells.count),
             np.int32(gaussians.count),
             np.int32(gaussians.stride),
@@ -204,14 +200,15 @@ class SplatProjector:
         )
 
     def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
-        """Of the last ``forward``: Gaussian–pixel pairs in the spans that are walked, pairs that were evaluated (whole
-        vectors), and Gaussian–cell footprints.
+        """Of a ``forward``: Gaussian–pixel pairs in the spans that are walked, pairs that are evaluated (whole vectors),
+        and Gaussian–cell footprints.
         """
         work = self.work(gaussians, cells)
         return work.pairs, work.evaluated, work.footprints
 
     def work(self, gaussians: DeviceGaussians, cells: DeviceCells) -> Work:
-        """What the last ``forward`` of these Gaussians and cells had to do."""
+        """What a ``forward`` of these Gaussians and cells has to do."""
+        self.prepare(gaussians, cells)
         shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
         size = int(np.prod(shape))
         records = self.rt.download(DeviceArray(self._records.buffer, (size,), np.dtype(np.float32)))
@@ -232,9 +229,6 @@ class SplatProjector:
         if self._seen.size < footprints:
             self._seen = rt.empty(1, np.uint8)
             self._seen = rt.empty(footprints, np.uint8)
-        if self._sums.size < footprints * SUM_FLOATS:
-            self._sums = rt.empty(1)
-            self._sums = rt.empty(footprints * SUM_FLOATS)
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
         rt.launch(

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-_U_REST, _V_REST, _U_WHOLE, _V_WHOLE, _U_LO, _U_HI, _V_LO, _V_HI = 0, 1, 9, 10, 11, 12, 13, 14
-_ALONG_U, _ALONG_V, _ACROSS_V, _ACROSS_U, _SPEED, _REACH2 = 2, 3, 4, 15, 16, 17
+_U_REST, _V_REST, _U_WHOLE, _V_WHOLE, _U_LO, _U_HI, _V_LO, _V_HI = 3, 4, 9, 10, 11, 12, 13, 14
+_ALONG_U, _ALONG_V, _ACROSS_V, _ACROSS_U, _SPEED, _REACH2 = 0, 1, 2, 15, 16, 17
 UNSEEN = np.zeros(20, np.float32)  # a record without lines, for splats that a cell does not see
 UNSEEN.view(np.int32)[[_V_LO, _V_HI]] = 1, 0
 RULES = ("1 time", "2 times", "3 times", "closed form")

@@ -111,5 +111,4 @@ def evaluated_pairs(run: SplatRun) -> dict[str, int]:
 def _first_frame_work(run: SplatRun) -> Work:
     gaussians, cells, projector = run.cloud.gaussians, run.frames.cells(0), run.frame_step.projector
     run.cloud.activate(run.adam)
-    projector.prepare(gaussians, cells)
     return projector.work(gaussians, cells)
