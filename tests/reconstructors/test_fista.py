@@ -48,7 +48,7 @@ def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
     options = FistaOptions(frames_per_subset=1)
     prior = prior_of("tv", rt, scan.grid, 5)
-    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, 0.01, 0.1)
+    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, 0.01)
     assert len(algorithm.subsets) == scan.frames
     residuals = [algorithm.step() for _ in range(30)]
     assert 1 <= len(algorithm.subsets) <= scan.frames // 2

@@ -38,8 +38,6 @@ _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart 
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
-# of the weight at half the side, as neighbours differ less: of 64³ and 128³ from 128² pixels, and of 128³ from 256²
-_HALF_SIDE, _SIDE = 2 / 3, 64
 _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time for: of 64³ they are, of 128³ not
 
 
@@ -57,7 +55,7 @@ class FistaOptions(IterativeOptions):
     motion: Motion = PerRow()
     iterations: int = 35
     prior: str = "dct"
-    prior_weight: float = 0.45
+    prior_weight: float = 0.8
     subvoxels: int = 0
     prior_share: float = 0.5
     frames_per_subset: int = 5
@@ -167,7 +165,7 @@ def _run(
 
     def make(system: System) -> "Fista":
         prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations, image, options.prior_share)
-        return Fista(system, options, prior, noise, min(scan.grid.voxel_size_mm))
+        return Fista(system, options, prior, noise)
 
     sizes = {"volumes": _VOLUMES, "frames": _FRAMES}
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
@@ -176,26 +174,21 @@ def _run(
 class Fista:
     """The residual that is reported is the pass's own: of every subset just before its step.
 
-    The weight of the prior is ``prior_weight`` · σ √(h max Aᵀ1): the noise σ of a pixel, back in a voxel of side h as the
-    gradient has it, times 1/mm; on a grid of 64³, and 2/3 of it for every halving of the side.
+    The weight of the prior is ``prior_weight`` times the noise of the gradient: that of the frames, back through Aᵀ, which
+    averages it along a blur.
     """
 
-    def __init__(
-        self, system: System, options: FistaOptions, prior: Prior, noise: float, voxel_mm: float
-    ) -> None:
+    def __init__(self, system: System, options: FistaOptions, prior: Prior, noise: float) -> None:
         self.system, self.options, self.prior = system, options, prior
         space = system.space
         self.volume = space.full(system.volume_shape, 0.0)
         self.previous = self.volume
         self.momentum, self.least = 1.0, float("inf")
         self.finished: str | None = None
-        columns = space.largest(system.column_sums())
         # AᵀA has no negative entry: its largest row sum bounds its norm
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         largest = space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
-        halvings = math.log2(math.prod(system.volume_shape) ** (1 / 3) / _SIDE)
-        strength = options.prior_weight * _HALF_SIDE**halvings
-        self.weight = strength * max(noise * (voxel_mm * columns) ** 0.5, _FEWEST * largest)
+        self.weight = options.prior_weight * max(noise * _gain(system), _FEWEST * largest)
         size = options.frames_per_subset or system.frames
         self.subsets = self._subsets(max(1, round(system.frames / size)))
 
@@ -244,3 +237,11 @@ class Fista:
         self.momentum, self.least = float(progress[0]), float(progress[1])
         self.subsets = self._subsets(int(progress[2]))
         self.prior.restore(state)
+
+
+def _gain(system: System) -> float:
+    """The deviation of Aᵀε in mm in the middle half of the volume, ε one draw of white noise of deviation 1."""
+    drawn = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
+    back = system.adjoint(system.masked(system.weighed(system.space.array(drawn))))
+    middle = tuple(slice(n // 4, n - n // 4) for n in system.volume_shape)
+    return float(system.space.numpy(back)[middle].std(dtype=np.float64))
