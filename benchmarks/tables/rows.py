@@ -51,9 +51,7 @@ class Row:
                 f"one of {', '.join(METHODS)}",
                 "choose other rows with --rows",
             )
-        # every pass of SART, as in the paper's comparison
-        passes = {"noise_stop": 0.0} if self.method in ("sart", "os-sart") else {}
-        changes: dict[str, Any] = {"motion": self.motion, **passes, **self.changes}
+        changes: dict[str, Any] = {"motion": self.motion, **self.changes}
         if self.motion == "micro-views":
             changes |= {"strips": self.strips, "sub_intervals": self.sub_intervals}
         if self.is_splatting:

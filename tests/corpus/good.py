@@ -60,7 +60,7 @@ RESUMED = {
     "sirt": ["--iterations", "6"],
     "cgls": ["--iterations", "6", "--set", "noise_stop=0"],
     "fista-tv": ["--iterations", "6"],
-    "os-sart": ["--iterations", "6", "--set", "noise_stop=0"],
+    "os-sart": ["--iterations", "6"],
     "phyradgs": ["--method", "phyradgs", "--iterations", "100", "--gaussians", "30", "--motion", "static"],
 }
 

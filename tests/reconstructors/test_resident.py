@@ -39,7 +39,7 @@ def options_of(method: str, model: str, iterations: int = 4):
     changes = {"motion": "per-row", "sub_intervals": 2, "iterations": iterations, "detector_model": model}
     if method in ("sart", "fista", "fista-tv"):
         changes["transmission_weights"] = True
-    if method in ("cgls", "sart", "os-sart"):
+    if method == "cgls":
         changes["noise_stop"] = 0
     if method == "fista":  # one grid: between two the volume comes to the host, once
         changes["subvoxels"] = 1

@@ -22,13 +22,11 @@ class AsdPocsOptions(SartOptions):
     """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the first SART pass's change.
 
     tv_reduction: factor of that length when TV moves more than ``tv_ratio`` (r_max) of what the data moved while the
-    residual is above ε. residual_share: ε over the residual of FDK's volume. noise_stop: none, as TV goes on where SART
-    would fit noise.
+    residual is above ε. residual_share: ε over the residual of FDK's volume.
     """
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999
-    noise_stop: float = 0.0  # type: ignore[misc]
     tv_steps: int = 20
     tv_share: float = 0.002
     tv_reduction: float = 0.95

@@ -37,7 +37,7 @@ class SartOptions(IterativeOptions):
     frames_per_subset: int = 1
     order: str = "spread"
     transmission_weights: bool = False  # type: ignore[misc]
-    noise_stop: float = 1.1  # type: ignore[misc]
+    noise_stop: float = 0.0  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
