@@ -127,6 +127,8 @@ def _warn_of_angles(angle_deg: np.ndarray, least_step: float = np.inf, readout_r
     elif least_step < 1 - _SLACK:
         found = "angles_deg: frames follow each other within %.3g of an exposure: a line would open again while it is open"
         log.warning(found + "; expected steps of exposure_deg or more, but where turns are sorted by angle", least_step)
+    elif np.rad2deg(1 - _SLACK) < least_step < np.inf:
+        log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
     elif readout_ratio > least_step * (1 + _SLACK):
         found = "readout_ratio: readout takes %.4g of the time between frames: a frame would be read while the last one is"
         log.warning(found + "; is it in percent?", readout_ratio / least_step)

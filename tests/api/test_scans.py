@@ -64,6 +64,7 @@ def test_what_looks_like_radians_transmissions_percent_or_lines_that_open_while_
         (lambda: fly_scan(frames, cone, np.deg2rad(turn_deg), exposure_deg=18.0), "20 frames within 5.969°: .* radians"),
         (lambda: fly_scan(frames, cone, -np.deg2rad(turn_deg), exposure_deg=-0.3), "radians"),
         (lambda: static_scan(frames, cone, np.deg2rad(turn_deg)), "radians"),
+        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=np.deg2rad(18.0)), "exposure_deg: 1/57.3 .* radians"),
         (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=36.0), "within 0.5 of an exposure: a line would open"),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=2.0), ""),
