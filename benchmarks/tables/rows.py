@@ -110,7 +110,7 @@ _FUSED = (
     Row("FISTA with DCT", "fista"),
     Row("FISTA with DCT per-row", "fista", "per-row", still="FISTA with DCT"),
     Row(
-        "FISTA with DCT, one grid per-row", "fista", "per-row", still="FISTA with DCT, one grid", variant="one grid",
+        "FISTA with DCT on one grid per-row", "fista", "per-row", still="FISTA with DCT on one grid", variant="one grid",
         changes={"subvoxels": 1, "iterations": 30},
     ),
     Row("Fused", "fused"),

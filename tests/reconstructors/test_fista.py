@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, Motion, PerRow, Scan, Static, make_protocol
 from phyradgs_cl.api import simulate as simulated
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -53,6 +53,17 @@ def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     residuals = [algorithm.step() for _ in range(30)]
     assert 1 <= len(algorithm.subsets) <= scan.frames // 2
     assert residuals[-1] < residuals[0]
+
+
+def test_the_prior_follows_the_noise_as_it_comes_back(rt, scan) -> None:
+    """Twice the noise has twice the weight; a blur, which spreads a ray over voxels, averages it."""
+    prior = prior_of("tv", rt, scan.grid, 5)
+
+    def weight(motion: Motion, noise: float) -> float:
+        return Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, noise).weight
+
+    assert weight(PerRow(), 0.2) == pytest.approx(2 * weight(PerRow(), 0.1))
+    assert weight(PerRow(), 0.1) < 0.9 * weight(Static(), 0.1)
 
 
 def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wrong(rt, scan) -> None:
