@@ -55,17 +55,6 @@ def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     assert residuals[-1] < residuals[0]
 
 
-def test_the_prior_follows_the_noise_as_it_comes_back(rt, scan) -> None:
-    """Twice the noise has twice the weight; a blur, which spreads a ray over voxels, averages it."""
-    prior = prior_of("tv", rt, scan.grid, 5)
-
-    def weight(motion: Motion, noise: float) -> float:
-        return Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, noise).weight
-
-    assert weight(PerRow(), 0.2) == pytest.approx(2 * weight(PerRow(), 0.1))
-    assert weight(PerRow(), 0.1) < 0.9 * weight(Static(), 0.1)
-
-
 def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wrong(rt, scan) -> None:
     """The truth but for a part that has changed since, from a third of the views; then an object that is another."""
     few = Scan(
@@ -96,14 +85,15 @@ def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
     assert residuals[-1] < 1.1 * min(residuals) and quality(scan, result.volume) > 30
 
 
-def test_the_weight_follows_the_noise(rt, scan) -> None:
-    weights = []
-    for noise in (0.01, 0.03):
-        options = FistaOptions()
-        system = System.of_scan(rt, scan, options.motion)
-        prior = prior_of("tv", rt, scan.grid, 5)
-        weights.append(Fista(system, options, prior, noise, 0.1).weight)
-    assert weights[1] == pytest.approx(3 * weights[0], rel=1e-6)
+def test_the_weight_follows_the_noise_as_it_comes_back(rt, scan) -> None:
+    """A blur, which spreads a ray over voxels, averages it."""
+    prior = prior_of("tv", rt, scan.grid, 5)
+
+    def weight(motion: Motion, noise: float) -> float:
+        return Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, noise).weight
+
+    assert weight(PerRow(), 0.03) == pytest.approx(3 * weight(PerRow(), 0.01), rel=1e-6)
+    assert weight(PerRow(), 0.01) < 0.95 * weight(Static(), 0.01)
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
@@ -114,9 +104,9 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
         return volume / 2
 
     options = FistaOptions(frames_per_subset=0)
-    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), 0.01, 0.1)
+    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), 0.01)
     algorithm.step()
-    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5), 0.01, 0.1)
+    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5), 0.01)
     plain.step()
     np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
     assert seen == [algorithm.weight / algorithm.curvature]
