@@ -67,7 +67,8 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record, facts and, of an interrupted run, its state.
+    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record, facts, a disagreement (nz, ny, nx) in 1/mm
+    where there is one and, of an interrupted run, its state.
 
     path: the HDF5 file, or one of ``phyradgs export`` (docs/export.md) with a grid, which has no more than that. Raises
     InputError, which names what is wrong by its HDF5 path.
@@ -81,7 +82,8 @@ def load_volume(path: str | Path) -> Reconstruction:
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, read_state(file))
+    state = read_state(file)
+    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, state, stored.disagreement)
 
 
 def save_volume(
@@ -106,7 +108,9 @@ def save_volume(
         export_stored(stored, format_of(file, "path"), file, "result")
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    write_volume(file, result.volume, result.grid, facts, result.gaussians, metrics, result.state)
+    write_volume(
+        file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, result.disagreement
+    )
 
 
 def simulate(

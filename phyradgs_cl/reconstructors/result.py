@@ -30,7 +30,8 @@ class Reconstruction:
 
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
-    was interrupted. Raises InputError for a volume that is not the grid's.
+    was interrupted; disagreement: how far two estimates are from each other near every voxel, (nz, ny, nx) float32 in 1/mm,
+    of ``fused``. Raises InputError for arrays that are not the grid's.
     """
 
     volume: np.ndarray
@@ -39,11 +40,14 @@ class Reconstruction:
     record: list[dict[str, float]] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
+    disagreement: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
             raise InputError("grid", checks.shown(self.grid), "a Grid")
         checks.shape("volume", self.volume, self.grid.shape)
+        if self.disagreement is not None:
+            checks.shape("disagreement", self.disagreement, self.grid.shape)
 
     def __repr__(self) -> str:
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
