@@ -24,7 +24,7 @@ _MOST_ROWS = 400  # of provenance
 _DISAGREEMENT = (
     "Half the RMS of their difference over 3³ voxels, in the middle slices: where the volume leans on its method. It is no "
     "confidence interval: both are estimates from the same frames, errors that they share are not in it, and the volume's "
-    "error may well be two or three times as large."
+    "error is larger, where we measured it 1.5 to 3.5 times."
 )
 
 
