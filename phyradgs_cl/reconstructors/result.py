@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,10 +119,18 @@ def ignore_progress(progress: Progress) -> None:
     """The default report: none."""
 
 
+def function_name(function: object) -> str:
+    """``module:name`` of a function, of any other callable its class's."""
+    of = function if hasattr(function, "__qualname__") else type(function)
+    return f"{of.__module__}:{of.__qualname__}"
+
+
 def option_facts(options: Any) -> dict[str, object]:
-    """A method's options for the facts of its result; those of one's own methods need no motion."""
+    """A method's options for the facts of its result, functions by name; those of one's own methods need no motion."""
     own = {"motion": motion_facts(options.motion)} if hasattr(options, "motion") else {}
-    return {**asdict(options), **own}
+    given = {name: getattr(options, name) for name in getattr(options, "FUNCTIONS", ())}
+    named = {name: function_name(value) for name, value in given.items() if callable(value)}
+    return {**asdict(replace(options, **named) if named else options), **own}
 
 
 def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
