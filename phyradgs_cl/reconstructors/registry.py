@@ -19,7 +19,13 @@ from phyradgs_cl.prepare.masked import with_masked
 from phyradgs_cl.reconstructors.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
-from phyradgs_cl.reconstructors.result import HELD_OUT, ProgressReport, Reconstruction, function_name, ignore_progress
+from phyradgs_cl.reconstructors.result import (
+    HELD_OUT,
+    ProgressReport,
+    Reconstruction,
+    function_name,
+    ignore_progress,
+)
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 

@@ -234,7 +234,9 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "PerRow": [(lambda: PerRow(0), "sub_intervals: found 0")],
     "LineMiddles": [(lambda: reconstruct(GOOD, "sirt", motion=api.LineMiddles()), "motion: found LineMiddles")],
     "Static": [(lambda: reconstruct(GOOD, "sirt", motion=api.Static), "motion: found the class Static")],
-    "StaticStart": [(lambda: reconstruct(GOOD, "fdk", motion="static-start", strips=3), "strips: found motion .*leave strips out")],
+    "StaticStart": [
+        (lambda: reconstruct(GOOD, "fdk", motion="static-start", strips=3), "strips: found motion .*leave strips out")
+    ],
     "Motion": [
         (lambda: reconstruct(GOOD, "sirt", motion=Half()), "motion Half: found line weights that sum to 0.5"),
         (lambda: reconstruct(GOOD, "sirt", motion=Frames()), "motion Frames: found a ndarray"),

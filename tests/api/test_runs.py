@@ -1,5 +1,9 @@
 """Scans and reconstructions from Python."""
 
+import json
+import threading
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -56,6 +60,47 @@ def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
     assert not np.array_equal(result.volume, plain.volume)
     nested = api.reconstruct(scan, "phyradgs", iterations=1, control={"every": 7}, device=rt)
     assert nested.facts["options"]["control"]["every"] == 7
+
+
+def softened(volume: np.ndarray, noise: float, share: float = 0.9) -> np.ndarray:
+    return share * volume
+
+
+class Softened:
+    """A denoiser with what no file could keep."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()  # that cannot be copied
+
+    def __call__(self, volume: np.ndarray, noise: float) -> np.ndarray:
+        return softened(volume, noise)
+
+
+def test_a_prior_may_be_a_function(rt, scan, tmp_path) -> None:
+    """The facts have its name, by which a run goes on to the same bits, and with no other."""
+    usual = {"iterations": 4, "subvoxels": 1, "device": rt}
+    named = {
+        softened: f"{__name__}:softened",
+        Softened(): f"{__name__}:Softened",
+        partial(softened, share=0.9): "functools:partial",
+        lambda volume, noise: 0.9 * volume: f"{__name__}:test_a_prior_may_be_a_function.<locals>.<lambda>",
+    }
+    whole = [api.reconstruct(scan, "fista", prior=prior, **usual) for prior in named]
+    for result, name in zip(whole, named.values(), strict=True):
+        assert json.loads(json.dumps(result.facts))["options"]["prior"] == name
+        assert np.array_equal(result.volume, whole[0].volume), name
+
+    def stop(progress: api.Progress) -> None:
+        if progress.iteration == 2:
+            raise KeyboardInterrupt
+
+    part = api.reconstruct(scan, "fista", prior=softened, report=stop, on_interrupt="return", **usual)
+    api.save_volume(tmp_path / "part.h5", part)
+    part = api.load_volume(tmp_path / "part.h5")
+    rest = api.reconstruct(scan, "fista", prior=softened, resume=part, **usual)
+    assert np.array_equal(rest.volume, whole[0].volume)
+    with pytest.raises(InputError, match="^resume: found another method, or other options"):
+        api.reconstruct(scan, "fista", prior=Softened(), resume=part, **usual)
 
 
 def test_a_grid_is_given_or_described(rt, scan) -> None:

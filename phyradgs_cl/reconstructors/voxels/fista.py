@@ -44,8 +44,8 @@ _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or a function of one's own or its ``package.module:function``: (volume (nz, ny, nx) in 1/mm,
-    noise in 1/mm) to a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the total variation
-    from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
+    noise in 1/mm) to a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the
+    total variation from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual

@@ -79,7 +79,7 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
 
 
 def _picture(plane: Plane, of: str, *, is_walked: bool = False) -> Markup:
-    """The slice with the names of the directions at its edges and a bar of a round length; under cross lines if one walks."""
+    """The slice, the names of the directions at its edges, a bar of a round length; cross lines where one walks."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img",
