@@ -13,8 +13,7 @@ import numpy as np
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
-from phyradgs_cl.api.wording import naming_arguments
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
@@ -47,7 +46,7 @@ _IDENTITY = "run"
 """Where a state has what its run was of."""
 
 
-@naming_arguments
+@naming_arguments()
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
     """A scan file (docs/formats.md) as a ``Scan``: line integrals (F, rows, columns), lengths in mm, times in s.
 
@@ -88,7 +87,7 @@ def load_volume(path: str | Path) -> Reconstruction:
     return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, state, stored.disagreement)
 
 
-@naming_arguments
+@naming_arguments()
 def save_volume(
     path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None
 ) -> None:
@@ -116,7 +115,7 @@ def save_volume(
     )
 
 
-@naming_arguments
+@naming_arguments()
 def simulate(
     phantom: str | Path = "foot",
     *,
@@ -148,7 +147,7 @@ def simulate(
     return simulated_scan(runtime_of(device), of, described, chosen, size=size, name=name)
 
 
-@naming_arguments
+@naming_arguments()
 def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **options: Any) -> Scan:
     """The scan without what the panel and the beam did to it, by the steps of docs/prepare.md, names with commas between.
 
@@ -163,7 +162,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     return prepared(scan, before, runtime_of(device))
 
 
-@naming_arguments
+@naming_arguments()
 def reconstruct(
     scan: Scan,
     method: "str | Callable[..., Reconstruction | np.ndarray]" = DEFAULT_METHOD,

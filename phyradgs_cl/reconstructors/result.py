@@ -9,7 +9,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ class Reconstruction:
             return ""
         return f", stopped after {done} of {asked} iterations ({reason})"
 
+    @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
         """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.
 

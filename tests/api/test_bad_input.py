@@ -263,6 +263,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: Reconstruction(np.zeros((2, 2, 2)), 2.0), "grid: found 2.0"),
         (lambda: VOLUME.plot("scan.h5"), "scan: found 'scan.h5'"),
         (lambda: VOLUME.plot(GOOD, frame=9), "frame: found 9"),
+        (lambda: VOLUME.plot(GOOD, device="no such device"), "^device: found 'no such device'"),
     ],
     "calibrate": [
         (lambda: api.calibrate("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
@@ -309,7 +310,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: reconstruct(GOOD, "sirt", on_interrupt="stop"), "on_interrupt: found 'stop'"),
         (lambda: reconstruct(GOOD, "sirt", resume=VOLUME), "resume: found a result that is complete"),
         (lambda: reconstruct(GOOD, "sirt", seed=-1), "seed: found -1"),
-        (lambda: reconstruct(GOOD, "sirt", device="no such device"), "no such device"),
+        (lambda: reconstruct(GOOD, "sirt", device="no such device"), "^device: found 'no such device'"),
     ],
     "simulate": [
         (lambda: api.simulate("elbow"), "elbow"),
