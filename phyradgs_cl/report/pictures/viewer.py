@@ -68,11 +68,10 @@ def _figure(plane: Plane) -> Markup:
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
     """Pictures that stay as they are, black 0 and white ``high`` in 1/mm or more, and a bar of these values."""
-    places = (f"{plane.name.capitalize()} slice ({_place(plane, plane.middle)})" for plane in planes)
-    figures = (
-        element("figure", _picture(plane, of), element("figcaption", place))
-        for plane, place in zip(planes, places, strict=True)
-    )
+    figures = []
+    for plane in planes:
+        words = f"{plane.name.capitalize()} slice ({_place(plane, plane.middle)})"
+        figures.append(element("figure", _picture(plane, of), element("figcaption", words)))
     ramp = data_uri(png_bytes(np.arange(256, dtype=np.uint8)[None]))
     bar = "0", element("img", src=ramp, alt="from black to white"), f"{number(high)} 1/mm and above"
     return joined(element("div", *figures, class_="slices"), element("p", *bar, class_="values"))
