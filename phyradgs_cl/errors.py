@@ -3,10 +3,14 @@
 Exit statuses are told apart by scripts (docs/trouble.md); 1 is Python's own, for a defect of this program.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from phyradgs_cl.text import plain_text
+
+_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # what is quoted, a command or a value, stays
+_ELSEWHERE = {"with": "others"}  # options whose argument has another name
 
 
 class PhyradgsError(Exception):
@@ -61,6 +65,25 @@ class OutOfMemoryError(DeviceError):
     """The memory of the device or of the machine is exhausted."""
 
     exit_code = 6
+
+
+@contextmanager
+def naming_arguments() -> Iterator[None]:
+    """Errors of the body name arguments of Python for options of the command line: ``time_error`` for ``--time-error``."""
+    try:
+        yield
+    except PhyradgsError as error:
+        told = error.culprit, error.found, error.expected, error.remedy
+        error.args = tuple(_OPTION.sub(_argument, text) for text in told)
+        error.culprit, error.found, error.expected, error.remedy = error.args
+        raise
+
+
+def _argument(match: re.Match[str]) -> str:
+    option = match[1]
+    if option is None:
+        return "" if match[0] == "--set " else match[0]
+    return _ELSEWHERE.get(option, option.replace("-", "_"))
 
 
 @contextmanager

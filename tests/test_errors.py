@@ -34,6 +34,22 @@ def test_errors_survive_pickling_as_worker_processes_need() -> None:
     assert (type(copy), str(copy), copy.remedy) == (NumericalError, str(error), error.remedy)
 
 
+def test_in_python_errors_name_arguments_for_options() -> None:
+    """But in commands and values, which are in quotes."""
+    for text, told in (
+        ("--time-error", "time_error"),
+        ("--set prior=piccs", "prior=piccs"),
+        ("--with: readout axis", "others: readout axis"),
+        ("the scan's --size or one's --roi-mm", "the scan's size or one's roi_mm"),
+        ("'--no-option', see 'phyradgs check --fix-offset'", "'--no-option', see 'phyradgs check --fix-offset'"),
+        ("1--2", "1--2"),
+    ):
+        with pytest.raises(NumericalError) as raised, errors.naming_arguments():
+            raise NumericalError(text, text, text, text)
+        assert str(raised.value) == f"{told}: found {told}; expected {told}; {told}"
+        assert pickle.loads(pickle.dumps(raised.value)).remedy == told
+
+
 def test_positive_at_least_and_one_of() -> None:
     for value in (0, -1, 0.0, float("nan"), float("inf"), "3", None, True, np.float32(-2)):
         with pytest.raises(InputError, match=r"^size: found .*above 0$"):

@@ -67,7 +67,7 @@ class MicroViews:
 
     def __post_init__(self) -> None:
         checks.whole("strips", self.strips, 1, 10_000)
-        checks.whole("sub-intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """The ``TimeCells`` of one frame of a scan: strips × sub-intervals of them."""
@@ -84,7 +84,7 @@ class PerRow:
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
-        checks.whole("sub-intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """The ``TimeCells`` of one frame of a scan: sub-intervals for every line."""
@@ -117,8 +117,8 @@ class Exact:
     time_error: float = 0.005
 
     def __post_init__(self) -> None:
-        checks.whole("--segments (0 chooses from the time error)", self.segments, 0, 1000)
-        checks.within("--time-error", self.time_error, 1e-6, 1)
+        checks.whole("segments (0 chooses from the time error)", self.segments, 0, 1000)
+        checks.within("time_error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
         """The ``TimeCells`` of one frame of a scan: its segments. intensity_peak: as for ``segments_for``."""

@@ -275,4 +275,4 @@ def _check_covered(culprit: str, frame: int, t: np.ndarray, table_s: np.ndarray)
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"
         expected = f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)"
-        raise InputError(culprit, found, expected, "extend the table or drop the frame")
+        raise InputError(culprit, found, expected, "extend the table or drop the frame; are both in s?")

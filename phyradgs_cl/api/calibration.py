@@ -8,9 +8,11 @@ from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
+from phyradgs_cl.errors import naming_arguments
 from phyradgs_cl.importers import load_beads
 
 
+@naming_arguments()
 def calibrate(
     scan: Scan,
     what: str | None = None,

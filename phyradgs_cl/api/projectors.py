@@ -14,7 +14,7 @@ from phyradgs_cl.api.arrays import Values, computed, placed
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
 from phyradgs_cl.api.runs import check_scan
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import QUATERNION, ROWS, SCALE
 from phyradgs_cl.operators import (
@@ -35,6 +35,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 
+@naming_arguments()
 def ray_operator(
     scan: Scan, motion: str | Motion = "per-row", *, grid: Grid | None = None, device: Device = None
 ) -> LinearOperator:
@@ -82,6 +83,7 @@ def _own(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
+@naming_arguments()
 def splat_operator(
     scan: Scan,
     motion: str | Motion = "exact",
@@ -184,6 +186,7 @@ def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: S
     )
 
 
+@naming_arguments()
 def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
     """Gaussians, or parameter rows (11, G) as ``splat_operator`` takes them, to a volume (nz, ny, nx) in 1/mm on ``grid``.
 
@@ -196,6 +199,7 @@ def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, de
     return GaussianOperator(engine, (_VOLUME, grid.shape))
 
 
+@naming_arguments()
 def voxelise(
     gaussians: Gaussians, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None
 ) -> np.ndarray:
@@ -214,6 +218,7 @@ def voxelise(
     return voxelise_rows(runtime_of(device), rows, grid.scaled(1 / length_mm), cutoff_sigma=cutoff_sigma)
 
 
+@naming_arguments()
 def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Device = None) -> Gaussians:
     """The cloud in mm and 1/mm with which ``phyradgs`` begins: ``count`` Gaussians drawn from an FDK volume.
 

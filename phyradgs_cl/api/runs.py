@@ -13,7 +13,7 @@ import numpy as np
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
@@ -46,6 +46,7 @@ _IDENTITY = "run"
 """Where a state has what its run was of."""
 
 
+@naming_arguments()
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
     """A scan file (docs/formats.md) as a ``Scan``: line integrals (F, rows, columns), lengths in mm, times in s.
 
@@ -67,7 +68,8 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record, facts and, of an interrupted run, its state.
+    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record, facts, a disagreement (nz, ny, nx) in 1/mm
+    where there is one and, of an interrupted run, its state.
 
     path: the HDF5 file, or one of ``phyradgs export`` (docs/export.md) with a grid, which has no more than that. Raises
     InputError, which names what is wrong by its HDF5 path.
@@ -81,9 +83,11 @@ def load_volume(path: str | Path) -> Reconstruction:
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, read_state(file))
+    state = read_state(file)
+    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, state, stored.disagreement)
 
 
+@naming_arguments()
 def save_volume(
     path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None
 ) -> None:
@@ -106,9 +110,12 @@ def save_volume(
         export_stored(stored, format_of(file, "path"), file, "result")
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    write_volume(file, result.volume, result.grid, facts, result.gaussians, metrics, result.state)
+    write_volume(
+        file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, result.disagreement
+    )
 
 
+@naming_arguments()
 def simulate(
     phantom: str | Path = "foot",
     *,
@@ -140,6 +147,7 @@ def simulate(
     return simulated_scan(runtime_of(device), of, described, chosen, size=size, name=name)
 
 
+@naming_arguments()
 def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **options: Any) -> Scan:
     """The scan without what the panel and the beam did to it, by the steps of docs/prepare.md, names with commas between.
 
@@ -154,6 +162,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     return prepared(scan, before, runtime_of(device))
 
 
+@naming_arguments()
 def reconstruct(
     scan: Scan,
     method: "str | Callable[..., Reconstruction | np.ndarray]" = DEFAULT_METHOD,

@@ -26,6 +26,11 @@ from phyradgs_cl.text import plain_text
 
 _DATA = "/entry/reconstruction"
 _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
+_DISAGREEMENT = f"{_DATA}/disagreement"
+_DISAGREEMENT_MEANS = (
+    "half the RMS of the difference of two estimates, over 3 x 3 x 3 voxels: where the result leans on its method; errors "
+    "that both share are not in it, and it is no confidence interval"
+)
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE = "/entry/gaussians", "/entry/state"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
@@ -36,13 +41,15 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class StoredVolume:
     """Volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what its file has beside it: ``provenance`` of the kinds that
-    ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name; None where there are none."""
+    ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name, ``disagreement`` of two estimates
+    (nz, ny, nx) float32 in 1/mm; None where there are none."""
 
     volume: np.ndarray
     grid: Grid
     provenance: dict[str, object]
     gaussians: Gaussians | None = None
     metrics: dict[str, object] | None = None
+    disagreement: np.ndarray | None = None
 
 
 class LoadedVolume(NamedTuple):
@@ -60,18 +67,21 @@ def write_volume(
     gaussians: Gaussians | None = None,
     metrics: Mapping[str, object] | None = None,
     state: Mapping[str, np.ndarray] | None = None,
+    disagreement: np.ndarray | None = None,
 ) -> None:
     """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all: ``provenance`` and
     ``metrics`` as JSON, plain values also as attributes; ``gaussians`` as float32; ``state``: how an interrupted run goes
-    on, arrays and texts. InputError: a volume that is not finite
-    or does not fit its grid. OutputError: the file cannot be written."""
-    checks.shape("volume", volume, grid.shape)
-    checks.finite("volume", volume)
+    on, arrays and texts; ``disagreement`` (nz, ny, nx) in 1/mm. InputError: a volume or a disagreement that is not finite
+    or does not fit the grid. OutputError: the file cannot be written."""
+    for name, values in (("volume", volume), ("disagreement", disagreement)):
+        if values is not None:
+            checks.shape(name, values, grid.shape)
+            checks.finite(name, values)
     with written_beside(path) as temporary, new_hdf5(temporary) as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         entry = new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
-        _write_data(entry, np.asarray(volume, np.float32), grid)
+        _write_data(entry, np.asarray(volume, np.float32), grid, disagreement)
         write_grid(entry, grid)
         _write_facts(entry, "provenance", provenance)
         if metrics is not None:
@@ -91,7 +101,8 @@ def read_volume(path: str | Path) -> StoredVolume:
     and a run that was interrupted is one too."""
     with open_hdf5(path) as source:
         volume, grid = _read_voxels(source)
-        return StoredVolume(volume, grid, read_provenance(source), _read_gaussians(source), _read_metrics(source))
+        parts = read_provenance(source), _read_gaussians(source), _read_metrics(source)
+        return StoredVolume(volume, grid, *parts, _read_disagreement(source, grid.shape))
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
@@ -152,6 +163,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
             "provenance": read_provenance(source),
             "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
+            "disagreement": None if source.optional(_DISAGREEMENT) is None else _DISAGREEMENT,
             "sha256": sha256_of(path),
         }
 
@@ -193,12 +205,16 @@ def _say_once(path: Path, text: str) -> None:
     log.warning("%s: %s", path, text)
 
 
-def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:
+def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid, disagreement: np.ndarray | None) -> None:
     group = new_group(entry, "reconstruction", "NXdata")
     group.attrs["signal"], group.attrs["axes"] = "volume", list(_AXES)
     group["title"] = "attenuation (1/mm)"
     dataset = group.create_dataset("volume", data=volume)
     dataset.attrs.update(units="1/mm", long_name="attenuation (1/mm)", interpretation="image")
+    if disagreement is not None:
+        group.attrs["auxiliary_signals"] = ["disagreement"]
+        beside = group.create_dataset("disagreement", data=np.asarray(disagreement, np.float32))
+        beside.attrs.update(units="1/mm", long_name="disagreement (1/mm)", description=_DISAGREEMENT_MEANS)
     for name, centres_mm in zip(_AXES, grid.axes_mm(), strict=True):
         write_number(group, name, centres_mm, "mm", long_name=f"{name} (mm)")
 
@@ -247,9 +263,22 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
 
 def _read_voxels(source: Hdf5Source) -> tuple[np.ndarray, Grid]:
     dataset, grid = _checked(source)
-    values = read_values(source, _VOLUME, dataset)
-    checks.finite(source.name(_VOLUME), values)
-    return in_unit(source, _VOLUME, values, ATTENUATION).astype(np.float32), grid
+    return _read_attenuation(source, _VOLUME, dataset), grid
+
+
+def _read_disagreement(source: Hdf5Source, shape: tuple[int, ...]) -> np.ndarray | None:
+    dataset = source.optional(_DISAGREEMENT)
+    if dataset is None:
+        return None
+    checks.shape(source.name(_DISAGREEMENT), dataset, shape)
+    return _read_attenuation(source, _DISAGREEMENT, dataset)
+
+
+def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:
+    """Finite float32 in 1/mm."""
+    values = read_values(source, address, dataset)
+    checks.finite(source.name(address), values)
+    return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 
 def _read_bare(source: Hdf5Source) -> np.ndarray:

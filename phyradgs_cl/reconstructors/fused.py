@@ -5,10 +5,11 @@ Two estimates of about the same error whose errors correlate by ρ have a mean t
 sure.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, Motion, PerRow, Scan, Static
@@ -27,6 +28,8 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.runtime import Runtime
+
+_NEAR = 3  # voxels along each side: at a single one two estimates may agree by chance
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ def fused(
 ) -> Reconstruction:
     """The mean of both volumes in 1/mm, with the Gaussians of one; the seed is the splats'.
 
-    The fact ``stages`` has those of the parts; ``disagreement_per_mm`` is half the RMS of their difference.
+    ``disagreement`` is the map of where they differ, None before there are splats. The fact ``stages`` has those of the
+    parts; ``disagreement_per_mm`` is half the RMS of their difference.
     """
     voxels = fista_stages(scan, options.voxels(), rt)
     halves: dict[str, np.ndarray] = {}
@@ -100,9 +104,17 @@ def fused(
     stages = [*voxels, Stage("splats", options.iterations, splats, both)]
     result = run_stages(stages, scan.grid, report, resume, initial)
     result.facts.update(method="fused", options=option_facts(options))
-    if "difference" in halves:
-        result.facts["disagreement_per_mm"] = float(np.std(halves["difference"], dtype=np.float64) / 2)
-    return result
+    if "difference" not in halves:
+        return result
+    squares = np.square(halves["difference"], dtype=np.float64)
+    result.facts["disagreement_per_mm"] = float(np.sqrt(squares.mean()) / 2)
+    return replace(result, disagreement=_half_of_nearby(squares))
+
+
+def _half_of_nearby(squares: np.ndarray) -> np.ndarray:
+    """Half the root of the means of squares (nz, ny, nx) over nearby voxels, float32."""
+    means = np.maximum(uniform_filter(squares, _NEAR, mode="nearest"), 0)  # its running sums round
+    return (np.sqrt(means) / 2).astype(np.float32)
 
 
 METHOD = Method(fused, {"default": FusedOptions()}, takes_initial=True)

@@ -19,7 +19,13 @@ from phyradgs_cl.prepare.masked import with_masked
 from phyradgs_cl.reconstructors.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
-from phyradgs_cl.reconstructors.result import HELD_OUT, ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors.result import (
+    HELD_OUT,
+    ProgressReport,
+    Reconstruction,
+    function_name,
+    ignore_progress,
+)
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 
@@ -81,7 +87,7 @@ def method_name(method: object) -> str:
     if isinstance(method, str) and method.lower() in METHODS:
         return method.lower()
     if callable(method):
-        return f"{getattr(method, '__module__', '')}:{getattr(method, '__qualname__', type(method).__name__)}"
+        return function_name(method)
     if not isinstance(method, str) or ":" not in method:
         expected = f"one of {', '.join(METHODS)}, or package.module:function of your own"
         raise InputError("--method", checks.shown(method), expected, near_miss(method, METHODS, ""))
@@ -265,7 +271,8 @@ def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
             names = [*known, *_motion_options(options)]
             remedy = near_miss(key, names, _having(key) or "leave it out")
             raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
-        values[key] = _converted(known[key], value, f"{culprit}: option {key}")
+        is_function = callable(value) and key in getattr(options, "FUNCTIONS", ())
+        values[key] = value if is_function else _converted(known[key], value, f"{culprit}: option {key}")
     try:
         return replace(options, **values)
     except (TypeError, ValueError) as error:  # of options of one's own, which check in their own way

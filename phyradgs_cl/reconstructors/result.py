@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid
 
 if TYPE_CHECKING:
@@ -30,7 +30,8 @@ class Reconstruction:
 
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
-    was interrupted. Raises InputError for a volume that is not the grid's.
+    was interrupted; disagreement: how far two estimates are from each other near every voxel, (nz, ny, nx) float32 in 1/mm,
+    of ``fused``. Raises InputError for arrays that are not the grid's.
     """
 
     volume: np.ndarray
@@ -39,11 +40,14 @@ class Reconstruction:
     record: list[dict[str, float]] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
+    disagreement: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
             raise InputError("grid", checks.shown(self.grid), "a Grid")
         checks.shape("volume", self.volume, self.grid.shape)
+        if self.disagreement is not None:
+            checks.shape("disagreement", self.disagreement, self.grid.shape)
 
     def __repr__(self) -> str:
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
@@ -62,6 +66,7 @@ class Reconstruction:
             return ""
         return f", stopped after {done} of {asked} iterations ({reason})"
 
+    @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
         """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.
 
@@ -115,10 +120,18 @@ def ignore_progress(progress: Progress) -> None:
     """The default report: none."""
 
 
+def function_name(function: object) -> str:
+    """``module:name`` of a function, of any other callable its class's."""
+    of = function if hasattr(function, "__qualname__") else type(function)
+    return f"{of.__module__}:{of.__qualname__}"
+
+
 def option_facts(options: Any) -> dict[str, object]:
-    """A method's options for the facts of its result; those of one's own methods need no motion."""
+    """A method's options for the facts of its result, functions by name; those of one's own methods need no motion."""
     own = {"motion": motion_facts(options.motion)} if hasattr(options, "motion") else {}
-    return {**asdict(options), **own}
+    given = {name: getattr(options, name) for name in getattr(options, "FUNCTIONS", ())}
+    named = {name: function_name(value) for name, value in given.items() if callable(value)}
+    return {**asdict(replace(options, **named) if named else options), **own}
 
 
 def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:

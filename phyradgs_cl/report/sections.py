@@ -14,12 +14,18 @@ from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, s
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
 from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
-from phyradgs_cl.report.pictures.slices import planes_of, windows_of
+from phyradgs_cl.report.pictures.preview import grey_range
+from phyradgs_cl.report.pictures.slices import Plane, planes_of, stills_of, windows_of
 from phyradgs_cl.report.pictures.steps import Change
-from phyradgs_cl.report.pictures.viewer import viewer
+from phyradgs_cl.report.pictures.viewer import stills, viewer
 from phyradgs_cl.report.run import Run
 
 _MOST_ROWS = 400  # of provenance
+_DISAGREEMENT = (
+    "Half the RMS of their difference over 3³ voxels, in the middle slices: where the volume leans on its method. It is no "
+    "confidence interval: both are estimates from the same frames, errors that they share are not in it, and the volume's "
+    "error is larger, where we measured it 1.5 to 3.5 times."
+)
 
 
 def slices_section(run: Run) -> Markup:
@@ -31,7 +37,19 @@ def slices_section(run: Run) -> Markup:
     told = f"{' × '.join(map(str, stored.grid.shape))} voxels (z, y, x), {size} mm"
     left_out = any(len(plane.indices) < plane.count for plane in planes)
     told += "; the page has evenly chosen slices of them" if left_out else ""
-    return _section("slices", "Slices", element("p", told + ".", class_="note"), viewer(planes, windows))
+    note = element("p", told + ".", class_="note")
+    return _section("slices", "Slices", note, viewer(planes, windows), _disagreement(run, planes))
+
+
+def _disagreement(run: Run, planes: Sequence[Plane]) -> Markup | None:
+    """Where two estimates differ, in the middle slices."""
+    values = run.stored.disagreement
+    if values is None:
+        return None
+    high = grey_range(values)[1]
+    heading = element("h3", "Disagreement of voxels and splats", id="disagreement")
+    shown = stills(stills_of(planes, values, (0.0, high)), "disagreement", high)
+    return joined(heading, element("p", _DISAGREEMENT, class_="note"), shown)
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:

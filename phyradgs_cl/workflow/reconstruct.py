@@ -166,7 +166,8 @@ def _reconstructed(
                 metrics = _metrics(scan, result)
                 path = job.output if result.state is None else partial_path(job.output)
                 told = _provenance(result, scan_hash, job, rt)
-                write_volume(path, result.volume, result.grid, told, result.gaussians, metrics or None)
+                parts = result.volume, result.grid, told, result.gaussians, metrics or None
+                write_volume(path, *parts, disagreement=result.disagreement)
                 _keep_checkpoint(job, result, fingerprint)
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result

@@ -121,9 +121,9 @@ def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_i
 
 def test_counts_below_one_are_refused() -> None:
     for strips, sub_intervals in ((0, 1), (1, 0), (-1, 5)):
-        with pytest.raises(InputError, match="strips|sub-intervals"):
+        with pytest.raises(InputError, match="strips|sub.intervals"):
             micro_view_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, strips, sub_intervals)
-        with pytest.raises(InputError, match="strips|sub-intervals"):
+        with pytest.raises(InputError, match="strips|sub.intervals"):
             MicroViews(strips, sub_intervals)
     with pytest.raises(InputError, match="time samples"):
         per_line_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, Saturation
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Saturation
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.questions.angles import check_angles
 from phyradgs_cl.check.questions.coverage import check_coverage
@@ -56,6 +56,30 @@ def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean
     assert check_timing(scan).verdict == OK
     assert np.rad2deg(exposure_arc_rad(clean)) == pytest.approx(24.0)
     assert exposure_arc_rad(replace(clean, is_fly=False)) == 0
+
+
+def test_a_table_in_another_unit_of_time_than_the_frames(clean) -> None:
+    """Long tables are as good where the frames see their turn, and so are short turns of tables as long as the frames."""
+    last_s = float(clean.frame_start_s[-1]) + clean.shutter.span_s
+    time_s = np.linspace(0, 1.1 * last_s, 40)
+    angle_rad = np.deg2rad(24 * time_s)
+    log_s, log_rad = np.append(time_s, 500 * last_s), np.append(angle_rad, angle_rad[-1])
+    for of, table, asks in (
+        ("angles", EncoderTable(1000 * time_s, angle_rad), "in ms"),
+        ("poses", PoseTable(1000 * time_s, clean.geometry.pose(angle_rad)), "in ms"),
+        ("angles", EncoderTable(1e6 * time_s, angle_rad), "units"),
+        ("angles", EncoderTable(time_s, angle_rad), None),
+        ("poses", PoseTable(time_s, clean.geometry.pose(angle_rad)), None),
+        ("angles", EncoderTable(log_s, log_rad), None),
+        ("angles", EncoderTable(time_s, angle_rad / 100), None),
+    ):
+        path = table if of == "poses" else CircularOrbit(clean.geometry, table)
+        finding = check_timing(replace(clean, trajectory=path))
+        if asks is None:
+            assert finding.verdict == OK, finding
+        else:
+            assert finding.verdict == SUSPICIOUS and finding.value > 900 and asks in finding.advice, finding
+            assert f"the table of {of} runs" in finding.text
 
 
 def test_missing_views_and_too_short_a_turn(clean) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from phyradgs_cl.acquisition import ConeGeometry, Motion, PerRow, Scan, Static, make_protocol
 from phyradgs_cl.api import simulate as simulated
@@ -141,12 +142,20 @@ def test_fused_goes_on_with_the_same_bits_from_either_half(rt, scan, at) -> None
     rest = reconstruct(scan, "fused", rt, options, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert rest.gaussians is not None and whole.facts["disagreement_per_mm"] > 0
+    assert (part.disagreement is None) == (at < 4)  # before there are splats
+    np.testing.assert_array_equal(rest.disagreement, whole.disagreement)
 
 
 def test_fused_is_the_mean_of_both(rt, scan) -> None:
     changes = {"iterations": 60, "voxel_iterations": 6}
-    voxels, mean, splats = (run(rt, scan, "fused", splat_weight=w, **changes).volume for w in (0.0, 0.5, 1.0))
+    whole = [run(rt, scan, "fused", splat_weight=w, **changes) for w in (0.0, 0.5, 1.0)]
+    voxels, mean, splats = (result.volume for result in whole)
     np.testing.assert_allclose(mean, (voxels + splats) / 2, atol=1e-6)
+    near = sliding_window_view(np.pad(splats - voxels, 1, mode="edge"), (3, 3, 3))
+    for result in whole:
+        np.testing.assert_allclose(result.disagreement, np.sqrt(np.mean(near**2, (3, 4, 5))) / 2, atol=1e-6)
+    assert whole[0].facts["disagreement_per_mm"] == pytest.approx(np.sqrt(np.mean((splats - voxels) ** 2)) / 2, rel=1e-4)
+    assert run(rt, scan, "fista", iterations=1).disagreement is None
 
 
 @pytest.mark.parametrize("at", [2, 5])

@@ -143,7 +143,7 @@ def of(options):
 def test_what_is_no_method_is_named(rt, scan, method, options, error, words) -> None:
     with pytest.raises(error, match=words) as raised:
         reconstruct(scan, method, device=rt, **options)
-    assert "--method" in str(raised.value)
+    assert str(raised.value).startswith("method")
 
 
 def test_the_command_line_takes_it_wherever_it_takes_a_method(cli, simulated, module, capsys) -> None:

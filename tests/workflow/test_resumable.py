@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import checkpoint_path
+from phyradgs_cl.io import checkpoint_path, partial_path, read_volume
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import ReconstructionJob
@@ -47,6 +47,17 @@ def test_a_stopped_run_goes_on_to_the_same_bits(job, rt, tmp_path) -> None:
     alone, _ = go_on(replace(job, output=tmp_path / "alone.h5"), lambda: rt, Report())
     np.testing.assert_array_equal(result.volume, alone.volume)
     assert not checkpoint_path(job.output).exists()
+
+
+def test_a_partial_volume_of_two_halves_has_their_disagreement(job, rt) -> None:
+    """Once the second has begun; the whole one has it whatever came in between."""
+    job = replace(job, method="fused", changes={"voxel_iterations": 2, "iterations": 60})
+    alone, _ = go_on(job, lambda: rt, Report())
+    for stop_at, is_there in ((1, False), (52, True)):
+        assert not is_whole(go_on(job, lambda: rt, Report(stop_at))[0])
+        assert (read_volume(partial_path(job.output)).disagreement is not None) == is_there, stop_at
+        assert is_whole(go_on(job, lambda: rt, Report())[0])
+        np.testing.assert_array_equal(read_volume(job.output).disagreement, alone.disagreement)
 
 
 @pytest.mark.parametrize("what", ["damaged", "of another seed"])

@@ -4,18 +4,22 @@ import math
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Scan
 from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
 _SLACK = 1e-3  # relative: times and angles are stored rounded
 _APART = 0.02  # relative: beyond what a gantry's speed varies without an encoder's word
+_TABLE = 100.0  # times the frames' time: so much longer is no table of one scan, where the frames also see
+_FEW_RAD = math.radians(5)  # less than this of its path
+_MILLI = (900.0, 3000.0)  # times as long: a table in ms beside frames in s, with some of it before and after them
 _QUESTION = "timing"
 
 
 def check_timing(scan: Scan) -> Finding:
     """A line cannot open while it is open, nor a frame be read while the last one is, nor a gantry be at two angles.
-    The number is the worst of: exposure and readout over the shortest time between frames (at most 1), and one more
-    than how far the angles between frames are from those that the speed within the frames gives."""
+    The number is the worst of: exposure and readout over the shortest time between frames (at most 1), one more
+    than how far the angles between frames are from those that the speed within the frames gives, and how many times as long
+    as the frames a table of angles or poses is of which they see next to nothing."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_QUESTION, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -32,6 +36,7 @@ def check_timing(scan: Scan) -> Finding:
     ]
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
         found.append(_speed(scan, starts_s))  # tables say the same within frames and between them
+    found += _table(scan)
     wrong = [f for f in found if f.verdict == SUSPICIOUS]
     return wrong[0] if wrong else max(found, key=lambda f: f.value / f.threshold)
 
@@ -64,6 +69,22 @@ def _share(name: str, meaning: str, share: float) -> Finding:
     advice = f"correct the {name} time (is it stated {share:.3g} times too long?) or frame_start_time"
     text = f"{name} takes {100 * share:.4g} % of the time between frames: {meaning}"
     return Finding(_QUESTION, SUSPICIOUS, share, 1.0, "share", text, advice)
+
+
+def _table(scan: Scan) -> list[Finding]:
+    """What is wrong with the unit of a table's times, or of the frames': nothing where the frames see some of its path."""
+    path = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
+    if not isinstance(path, EncoderTable | PoseTable):
+        return []
+    longer = float(np.ptp(path.time_s)) / (float(np.ptp(scan.frame_start_s)) + scan.shutter.span_s)
+    seen_rad = float(np.ptp(np.unwrap(start_azimuths_rad(scan))))
+    if longer <= _TABLE or seen_rad >= _FEW_RAD:
+        return []
+    kind, seen_deg = "poses" if isinstance(path, PoseTable) else "angles", math.degrees(seen_rad)
+    text = f"the table of {kind} runs {longer:.4g} times as long as the frames, which see {seen_deg:.3g}° of it"
+    is_milli = _MILLI[0] <= longer <= _MILLI[1]
+    advice = "are its times in ms, beside frames in s?" if is_milli else "correct its times or the frames', and their units"
+    return [Finding(_QUESTION, SUSPICIOUS, longer, _TABLE, "share", text, advice)]
 
 
 def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:

@@ -9,7 +9,7 @@ subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 3
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors.result import (
     option_facts,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Prior, prior_of
+from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Denoiser, Prior, prior_of
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
@@ -43,18 +43,21 @@ _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time 
 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
-    """prior: one of ``PRIORS``, or ``package.module:function`` of one's own: (volume (nz, ny, nx) in 1/mm, noise in 1/mm) to
-    a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the total variation
-    from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
+    """prior: one of ``PRIORS``, or a function of one's own or its ``package.module:function``: (volume (nz, ny, nx) in 1/mm,
+    noise in 1/mm) to a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the
+    total variation from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
     iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
+    FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
+    """Options that may be a function."""
+
     motion: Motion = PerRow()
     iterations: int = 35
-    prior: str = "dct"
+    prior: str | Denoiser = "dct"
     prior_weight: float = 0.8
     subvoxels: int = 0
     prior_share: float = 0.5
@@ -64,7 +67,7 @@ class FistaOptions(IterativeOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if ":" not in self.prior:
+        if not (callable(self.prior) or ":" in self.prior):
             checks.one_of("prior", self.prior, (*PRIORS, "package.module:function"))
         checks.within("subvoxels", self.subvoxels, 0, 8)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)

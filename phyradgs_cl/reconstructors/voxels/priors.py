@@ -35,21 +35,29 @@ class Prior(Interface):
     def restore(self, state: State) -> None: ...
 
 
+Denoiser = Callable[[np.ndarray, float], np.ndarray]
+"""(volume (nz, ny, nx) float32 in 1/mm, noise in 1/mm) → volume: a prior of one's own (plug-and-play)."""
+
+
 def prior_of(
-    name: str, rt: Runtime, grid: Grid, tv_iterations: int, image: np.ndarray | None = None, share: float = 0.5
+    prior: str | Denoiser, rt: Runtime, grid: Grid, tv_iterations: int, image: np.ndarray | None = None, share: float = 0.5
 ) -> Prior:
-    """A prior by its name in ``PRIORS``, or by ``package.module:function`` of one's own (``Denoiser``); of piccs the prior
-    image (nz, ny, nx) in 1/mm, and its share. InputError: it has none."""
-    if ":" in name:
-        return OwnPrior(imported(name, "prior"))
+    """A prior by its name in ``PRIORS``, or one's own, itself or by ``package.module:function``; of piccs the prior image
+    (nz, ny, nx) in 1/mm, and its share. InputError: it has none, or what is no function."""
+    if callable(prior) or ":" in prior:
+        own = prior if callable(prior) else imported(prior, "prior")
+        if not callable(own):
+            raise InputError("prior", checks.shown(own), "a function (volume, noise)")
+        return OwnPrior(own)
     tv = TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations)
-    if name == "tv":
+    if prior == "tv":
         return tv
-    if name == "piccs":
+    if prior == "piccs":
         if image is None:
-            raise InputError("--set prior=piccs", "no prior image", "a volume: --initial VOLUME", "or take prior=tv")
+            remedy = "say --initial, or take prior=tv"
+            raise InputError("--set prior=piccs", "no prior image", "a volume to start from", remedy)
         return Piccs(tv, TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations), image, share)
-    return TvAndDct(tv, DctProx(rt, grid.shape)) if name == "dct" else NoPrior()
+    return TvAndDct(tv, DctProx(rt, grid.shape)) if prior == "dct" else NoPrior()
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
@@ -131,10 +139,6 @@ class NoPrior:
 
     def restore(self, state: State) -> None:
         pass
-
-
-Denoiser = Callable[[np.ndarray, float], np.ndarray]
-"""(volume (nz, ny, nx) float32 in 1/mm, noise in 1/mm) → volume: a prior of one's own (plug-and-play)."""
 
 
 class OwnPrior:

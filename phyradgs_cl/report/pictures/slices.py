@@ -1,7 +1,7 @@
 """The slices that a page can show: every one of a small volume, evenly chosen ones of a large one."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,11 @@ class Plane:
     layers: dict[str, list[str]]
     still: bytes
 
+    @property
+    def middle(self) -> int:
+        """Which of ``indices`` the still shows."""
+        return len(self.indices) // 2
+
     def position_mm(self, k: int) -> float:
         """Where the ``k``-th of the slices in the page is."""
         return self.first_mm + self.indices[k] * self.step_mm
@@ -90,6 +95,12 @@ def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Map
         size_mm, slices = (width_mm, height_mm), volume.shape[axis]
         planes.append(Plane(name, letter, right, up, slices, indices, *place, size_mm, pictures, still))
     return planes
+
+
+def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, float]) -> list[Plane]:
+    """The stills of another volume (nz, ny, nx) at the places of ``planes``; black and white: ``window``."""
+    pictures = (_picture(volume, axis, plane.indices[plane.middle], *window) for axis, plane in enumerate(planes))
+    return [replace(plane, layers={}, still=still) for plane, still in zip(planes, pictures, strict=True)]
 
 
 def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:

@@ -3,10 +3,12 @@
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from phyradgs_cl.drawing import round_length
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.markup import Markup, element, joined, json_block
-from phyradgs_cl.report.pictures.png import base64_of, data_uri, diverging
+from phyradgs_cl.report.pictures.png import base64_of, data_uri, diverging, png_bytes
 from phyradgs_cl.report.pictures.slices import Plane, Window
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
@@ -51,7 +53,7 @@ def _slider(name: str, words: str, low: float, high: float, value: float, told: 
 
 
 def _figure(plane: Plane) -> Markup:
-    middle, name = len(plane.indices) // 2, f"{plane.name.capitalize()} slice"
+    middle, name = plane.middle, f"{plane.name.capitalize()} slice"
     slider_id, place_id = f"slider-{plane.name}", f"place-{plane.name}"
     places = {"min": 0, "max": len(plane.indices) - 1, "step": 1, "value": middle}
     slider = element("input", type="range", id=slider_id, **places, aria_describedby=place_id)
@@ -60,21 +62,33 @@ def _figure(plane: Plane) -> Markup:
         element("label", f"{name} ({plane.axis})", for_=slider_id),
         element("output", _place(plane, middle), id=place_id, for_=slider_id),
     )
-    return element("figure", _picture(plane, name), caption, slider, id=f"plane-{plane.name}")
+    picture = _picture(plane, "volume", is_walked=True)
+    return element("figure", picture, caption, slider, id=f"plane-{plane.name}")
 
 
-def _picture(plane: Plane, name: str) -> Markup:
-    """The slice under its cross lines, the names of the directions at its edges, and a bar of a round length."""
+def stills(planes: list[Plane], of: str, high: float) -> Markup:
+    """Pictures that stay as they are, black 0 and white ``high`` in 1/mm or more, and a bar of these values."""
+    figures = []
+    for plane in planes:
+        words = f"{plane.name.capitalize()} slice ({_place(plane, plane.middle)})"
+        figures.append(element("figure", _picture(plane, of), element("figcaption", words)))
+    ramp = data_uri(png_bytes(np.arange(256, dtype=np.uint8)[None]))
+    bar = "0", element("img", src=ramp, alt="from black to white"), f"{number(high)} 1/mm and above"
+    return joined(element("div", *figures, class_="slices"), element("p", *bar, class_="values"))
+
+
+def _picture(plane: Plane, of: str, *, is_walked: bool = False) -> Markup:
+    """The slice, the names of the directions at its edges, a bar of a round length; cross lines where one walks."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img",
         src=data_uri(plane.still),
-        alt=f"{name} of the volume, {plane.right} to the right, {plane.up} up",
+        alt=f"{plane.name.capitalize()} slice of the {of}, {plane.right} to the right, {plane.up} up",
         style=f"aspect-ratio: {width_mm:.6g} / {height_mm:.6g}",
         draggable="false",
     )
-    lines = (element("i", class_=way, aria_hidden="true") for way in ("across", "upwards"))
-    sheet = element("div", image, element("canvas", aria_hidden="true"), class_="sheet")
+    lines = [element("i", class_=way, aria_hidden="true") for way in ("across", "upwards")] if is_walked else []
+    sheet = element("div", image, element("canvas", aria_hidden="true") if is_walked else None, class_="sheet")
     ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
     marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
     bar_mm = round_length(_BAR * width_mm)
