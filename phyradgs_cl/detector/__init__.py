@@ -11,13 +11,13 @@ from phyradgs_cl.detector.noise import (
     tigre_counts,
     tigre_noise,
 )
-from phyradgs_cl.detector.noise_level import noise_level, noise_rms, transmission_weights
+from phyradgs_cl.detector.noise_level import noise_behind, noise_level, noise_rms, transmission_weights
 from phyradgs_cl.detector.saturation import clustered_share, find_saturation
 from phyradgs_cl.detector.spectrum import Spectrum, tube_spectrum
 
 __all__ = [
     "Spectrum", "add_lag", "add_scatter", "add_sparks", "average", "beer_lambert_counts", "beer_lambert_noise",
     "clustered_share", "counts_to_attenuation", "drifting_light", "find_saturation", "frames_to_attenuation",
-    "intensity_average", "lagged", "noise_level", "noise_rms", "pixel_gains", "sample_counts", "tigre_counts",
-    "tigre_noise", "transmission_weights", "tube_spectrum", "without_lag"
+    "intensity_average", "lagged", "noise_behind", "noise_level", "noise_rms", "pixel_gains", "sample_counts",
+    "tigre_counts", "tigre_noise", "transmission_weights", "tube_spectrum", "without_lag"
 ]  # fmt: skip

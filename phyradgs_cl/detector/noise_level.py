@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 _MEDIAN_OF_NORMAL, _FILTER_NORM = 0.6745, 1.5**0.5
 _LARGEST_SAMPLE = 1_000_000
 _TENTHS = 10
+_BEHIND = 5.0  # times the noise: what is larger has met the object
+_FRAMES = 16  # that tell the noise
 
 
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
@@ -53,6 +55,15 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     levels = np.array([np.median(size[tenth == k]) if (tenth == k).any() else 0.0 for k in range(_TENTHS)])
     share = np.bincount(np.digitize(line_integrals[chosen], edges), minlength=_TENTHS) / chosen.sum()
     return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM**2)
+
+
+def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
+    """``noise_rms`` behind the object, from some of the frames: beside it there is less, and half of that is clipped at 0
+    in some files. line_integrals and valid (F, v, u)."""
+    some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
+    frames, usable = line_integrals[some], valid[some]
+    behind = usable & (frames > _BEHIND * noise_level(frames, usable))
+    return noise_rms(frames, behind, behind)
 
 
 def _along_rows(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:

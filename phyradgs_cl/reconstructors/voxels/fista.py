@@ -15,7 +15,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
-from phyradgs_cl.detector import noise_level
+from phyradgs_cl.detector import noise_behind
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.method import Method
@@ -35,6 +35,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
+_SAMPLING = 0.4  # exponent of the views in the weight, measured (docs/results/settings.md)
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
@@ -45,7 +46,8 @@ _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time 
 class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or a function of one's own or its ``package.module:function``: (volume (nz, ny, nx) in 1/mm,
     noise in 1/mm) to a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the
-    total variation from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel.
+    total variation from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel
+    and to how many views there are for so fine a volume.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
     frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
@@ -58,7 +60,7 @@ class FistaOptions(IterativeOptions):
     motion: Motion = PerRow()
     iterations: int = 35
     prior: str | Denoiser = "dct"
-    prior_weight: float = 0.8
+    prior_weight: float = 0.85
     subvoxels: int = 0
     prior_share: float = 0.5
     frames_per_subset: int = 5
@@ -163,8 +165,8 @@ def _run(
     image: np.ndarray | None,
 ) -> Reconstruction:
     """All passes on the scan's grid."""
-    valid = None if scan.pixel_mask is None else np.broadcast_to(scan.pixel_mask == 0, scan.projections.shape)
-    noise = noise_level(np.asarray(scan.projections, np.float32), valid)
+    noise = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
+    noise *= (scan.frames / _across(scan)) ** _SAMPLING
 
     def make(system: System) -> "Fista":
         prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations, image, options.prior_share)
@@ -240,6 +242,12 @@ class Fista:
         self.momentum, self.least = float(progress[0]), float(progress[1])
         self.subsets = self._subsets(int(progress[2]))
         self.prior.restore(state)
+
+
+def _across(scan: Scan) -> float:
+    """How many voxels lie along the volume's side, or pixels on the axis where those are larger."""
+    pixel_mm = min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
+    return max(scan.grid.size_mm[1:]) / max(pixel_mm, *scan.grid.voxel_size_mm[1:])
 
 
 def _gain(system: System) -> float:
