@@ -1,8 +1,8 @@
 """Voxels and splats of one scan together: their errors differ, so that their mean is nearer to the truth than either.
 
 Two estimates of about the same error whose errors correlate by ρ have a mean that is 10 log10(2/(1 + ρ)) dB better. First
-``fista`` on voxels, then Gaussians that start from its volume, then the mean; half their difference says where neither is
-sure.
+``fista`` on voxels, then Gaussians that start from its volume, then a mean in which the better voxels weigh more; half
+their difference says where neither is sure.
 """
 
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ class FusedOptions:
     motion: Motion = Exact()
     iterations: int = 2000
     voxel_iterations: int = FistaOptions.iterations
-    splat_weight: float = 0.5
+    splat_weight: float = 0.2
     prior_weight: float = FistaOptions.prior_weight
     detector_model: str = "scan"
 
@@ -82,7 +82,7 @@ def fused(
     resume: State | None = None,
     initial: np.ndarray | None = None,
 ) -> Reconstruction:
-    """The mean of both volumes in 1/mm, with the Gaussians of one; the seed is the splats'.
+    """The weighted mean of both volumes in 1/mm, with the Gaussians of one; the seed is the splats'.
 
     ``disagreement`` is the map of where they differ, None before there are splats. The fact ``stages`` has those of the
     parts; ``disagreement_per_mm`` is half the RMS of their difference.

@@ -1,0 +1,95 @@
+"""How near the weight that ``fista`` takes from the data comes to the best of a sweep.
+
+    python benchmarks/prior_weight.py run VOLUMES docs/results/prior_weight.jsonl
+    python benchmarks/prior_weight.py table docs/results/prior_weight.jsonl
+
+A line per volume, scan and factor: PSNR in dB with ``factor`` times the default's weight. Runs that are there are not made
+again. Scans are those of benchmarks/tables but for ``--dose`` and ``--views``; voxels are the scan's own (``subvoxels`` 1).
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from scans import files_of, read_lines
+
+from phyradgs_cl.acquisition import PerRow, Scan, Static
+from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions
+from phyradgs_cl.runtime import Runtime
+
+MOTIONS = {"still": Static(), "fly": PerRow()}
+PASSES = 30
+
+
+def scan_of(rt: Runtime, path: Path, size: int, kind: str, views: int, dose: float, seed: int) -> Scan:
+    """A scan of a volume's file: still, or of the protocol with so many views."""
+    protocol = "static" if kind == "still" else {25: "rapid", 50: "standard"}[views]
+    usual = {"size": size, "detector": 2 * size, "noise": "tigre", "dose": dose, "seed": seed, "device": rt}
+    return simulate(path, protocol=protocol, views=views if kind == "still" else None, **usual)  # type: ignore[arg-type]
+
+
+def run(given: argparse.Namespace) -> None:
+    rt = Runtime()
+    there = {_key(line) for line in read_lines(given.lines)}
+    for name, path in files_of(given.volumes, given.names, given.size).items():
+        for kind, views, dose in ((k, v, d) for k in given.kinds for v in given.views for d in given.doses):
+            facts = {"volume": name, "kind": kind, "views": views, "dose": dose, "size": given.size, "seed": given.seed}
+            left = [f for f in given.factors if _key({**facts, "factor": f}) not in there]
+            scan = scan_of(rt, path, given.size, kind, views, dose, given.seed) if left else None
+            for factor in left:
+                weight = factor * FistaOptions().prior_weight
+                chosen = {"prior_weight": weight, "subvoxels": 1, "iterations": PASSES, "motion": MOTIONS[kind]}
+                result = reconstruct(scan, "fista", device=rt, report=False, **chosen)  # type: ignore[arg-type]
+                scores = compare(result.volume, scan.reference)  # type: ignore[union-attr]
+                line = {**facts, "factor": factor, "psnr_db": scores["psnr_db"], "ssim": scores["ssim"]}
+                with given.lines.open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+                print(*line.values(), flush=True)
+
+
+def table(given: argparse.Namespace) -> None:
+    """PSNR with the default's weight, with the best factor for all volumes of a scan, and with each volume's own best."""
+    by_scan: dict[tuple[object, ...], dict[str, dict[float, float]]] = {}
+    for line in read_lines(given.lines):
+        of = by_scan.setdefault((line["kind"], line["views"], line["dose"], line["size"]), {})
+        of.setdefault(str(line["volume"]), {})[float(line["factor"])] = float(line["psnr_db"])  # type: ignore[arg-type]
+    print("| scan | views | photons | voxels | volumes | the default's | one factor's best | each one's best |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for (kind, views, dose, size), volumes in sorted(by_scan.items(), key=str):
+        factors = sorted(set.intersection(*(set(of) for of in volumes.values())))
+        means = [float(np.mean([of[f] for of in volumes.values()])) for f in factors]
+        best = int(np.argmax(means))
+        own = float(np.mean([max(of[f] for f in factors) for of in volumes.values()]))
+        of_one = f"{means[best]:.2f} (×{factors[best]:g})"
+        cells = kind, views, f"{dose:g}", f"{size}³", len(volumes), f"{means[factors.index(1.0)]:.2f}", of_one, f"{own:.2f}"
+        print("| " + " | ".join(map(str, cells)) + " |")
+
+
+def _key(line: dict[str, object]) -> tuple[object, ...]:
+    return tuple(line[name] for name in ("volume", "kind", "views", "dose", "size", "seed", "factor"))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    verbs = parser.add_subparsers(required=True)
+    running = verbs.add_parser("run")
+    running.add_argument("volumes")
+    running.add_argument("--names", help="with commas; all")
+    running.add_argument("--size", type=int, default=64)
+    running.add_argument("--kinds", nargs="+", default=["still"], choices=list(MOTIONS))
+    running.add_argument("--views", nargs="+", type=int, default=[25, 50], help="of fly-scans 25 or 50")
+    running.add_argument("--doses", nargs="+", type=float, default=[1e3, 1e4, 1e5])
+    running.add_argument("--factors", nargs="+", type=float, default=[0.5, 0.71, 1.0, 1.41, 2.0])
+    running.add_argument("--seed", type=int, default=0)
+    showing = verbs.add_parser("table")
+    for verb, function in ((running, run), (showing, table)):
+        verb.add_argument("lines", type=Path, help="a file of one line of JSON per run")
+        verb.set_defaults(function=function)
+    given = parser.parse_args()
+    given.function(given)
+
+
+if __name__ == "__main__":
+    main()
