@@ -75,3 +75,10 @@ def test_noise_goes_and_an_edge_stays(any_rt) -> None:
     found = smooth(noisy, 1.0)
     assert np.abs(found - clean)[..., 8:12].max() < 0.3
     assert (found - clean).std() < 0.5 * (noisy - clean).std()
+
+
+def test_it_holds_what_is_counted(rt) -> None:
+    rt.reset_peak()
+    before, volume_bytes = rt.peak_bytes, 4 * 64**3
+    kept = NonlocalStep(rt, (64,) * 3)
+    assert 0.75 * kept.VOLUMES < (rt.peak_bytes - before) / volume_bytes < kept.VOLUMES - 1

@@ -73,7 +73,7 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
 
     assert with_prior(changed) > plain + 1 and with_prior(changed) > quality(few, changed) + 1
     assert with_prior(scan.reference[:, ::-1].copy(), 0.3) > plain - 1
-    with pytest.raises(InputError, match="prior=piccs: found no prior image.*--initial"):
+    with pytest.raises(InputError, match="--prior piccs: found no prior image.*--initial"):
         run(rt, few, "fista", prior="piccs")
 
 

@@ -63,7 +63,7 @@ def prior_of(
         return Nonlocal(TvPrior(prox, tv_iterations, _TV_SHARE), NonlocalStep(rt, grid.shape), passes)
     if name == "piccs":
         if image is None:
-            raise InputError("--set prior=piccs", "no prior image", "a volume: --initial VOLUME", "or take prior=tv")
+            raise InputError("--prior piccs", "no prior image", "a volume: --initial VOLUME", "or take --prior tv")
         return Piccs(tv, TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations), image, share)
     return NoPrior()
 
