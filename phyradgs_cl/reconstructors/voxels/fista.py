@@ -36,7 +36,7 @@ from phyradgs_cl.runtime import Runtime
 
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
-_VOLUMES, _FRAMES = 16, 3  # held at one time, beside what the prior takes
+_VOLUMES, _FRAMES = 16, 3  # held at one time, with the prior `dct`
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
 _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time for: of 64³ they are, of 128³ not
 

@@ -16,9 +16,11 @@ from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
 
-PRIORS = ("dct", "tv", "nonlocal", "nonlocal+dct", "piccs", "none")
-_TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where TV is not alone
-_ALIKE, _STEP = 4.0, 0.03  # h of the nonlocal weights over the weight; and how far a map goes down their quadratic
+_ALIKE = {"nonlocal": 300.0, "nonlocal+dct": 100.0}  # h of the nonlocal weights over the weight
+_STEP = 0.01  # how far a map goes down their quadratic
+PRIORS = ("dct", "tv", *_ALIKE, "piccs", "none")
+_TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where both are in one step
+_TV_ALIKE_SHARE = 1.6  # where there are nonlocal weights, and no transforms
 
 
 class Prior:
@@ -52,25 +54,26 @@ def prior_of(
     ``passes``; of piccs the prior image (nz, ny, nx) in 1/mm, and its share. InputError: it has none."""
     if ":" in name:
         return OwnPrior(imported(name, "prior"))
+    if name == "none":
+        return NoPrior()
     prox = TvProx(rt, grid.shape, axis_weights(grid))
-    tv = TvPrior(prox, tv_iterations)
     if name == "tv":
-        return tv
-    if name in ("dct", "nonlocal+dct"):
-        plain: TvPrior = TvAndDct(prox, tv_iterations, DctProx(rt, grid.shape))
-        return plain if name == "dct" else Nonlocal(plain, NonlocalStep(rt, grid.shape), passes)
-    if name == "nonlocal":
-        return Nonlocal(TvPrior(prox, tv_iterations, _TV_SHARE), NonlocalStep(rt, grid.shape), passes)
+        return TvPrior(prox, tv_iterations)
     if name == "piccs":
         if image is None:
             raise InputError("--prior piccs", "no prior image", "a volume: --initial VOLUME", "or take --prior tv")
-        return Piccs(tv, TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations), image, share)
-    return NoPrior()
+        change = TvProx(rt, grid.shape, axis_weights(grid))
+        return Piccs(TvPrior(prox, tv_iterations), TvPrior(change, tv_iterations), image, share)
+    if name == "nonlocal":
+        local = TvPrior(prox, tv_iterations, _TV_ALIKE_SHARE)
+    else:
+        local = TvAndDct(prox, tv_iterations, DctProx(rt, grid.shape))
+    return Nonlocal(local, NonlocalStep(rt, grid.shape), _ALIKE[name], passes) if name in _ALIKE else local
 
 
 def volumes_of(name: str) -> int:
     """How many more volumes a prior holds than ``dct``."""
-    return NonlocalStep.VOLUMES if "nonlocal" in name else 0
+    return NonlocalStep.VOLUMES if name in _ALIKE else 0
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
@@ -122,15 +125,15 @@ class Nonlocal(Prior):
     """A step down a nonlocal quadratic, then another map. Its weights come from the volume after a quarter of the passes,
     and anew after half of them: weights that follow the volume for ever sharpen what is not there."""
 
-    def __init__(self, then: Prior, smooth: NonlocalStep, passes: int) -> None:
-        self.then, self.smooth, self.passes = then, smooth, passes
+    def __init__(self, then: Prior, smooth: NonlocalStep, alike: float, passes: int) -> None:
+        self.then, self.smooth, self.alike, self.passes = then, smooth, alike, passes
         self._done, self._is_learned = 0, False
         self._guide: np.ndarray | None = None
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         if self._guide is not None and weight > 0:
             if not self._is_learned:
-                self.smooth.learn(self._guide, _ALIKE * weight)
+                self.smooth.learn(self._guide, self.alike * weight)
                 self._is_learned = True
             volume = space.apply(partial(self.smooth, step=_STEP), volume, self.smooth.shape)
         return self.then(space, volume, weight, nonnegative=nonnegative)
