@@ -4,9 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from tolerances import FLOAT32, FLOAT64
+from tolerances import FLOAT32, FLOAT64, LIKENESS
 
-from phyradgs_cl.objective.nonlocal_step import LARGEST, OFFSETS, NonlocalStep, likeness_of, nonlocal_step
+from phyradgs_cl.objective.nonlocal_step import OFFSETS, NonlocalStep, likeness_of, nonlocal_step
 
 SHAPES = [(5, 6, 7), (17, 4, 20), (3, 8, 33), (2, 1, 9), (1, 2, 16), (1, 1, 1)]
 WIDTH = 1.3  # of normal noise: likenesses from 0 to 1
@@ -20,7 +20,7 @@ def test_the_kernels_are_their_twins(any_rt, shape) -> None:
     for seen in (volume, guide):  # the second time in place of the first
         smooth.learn(seen, WIDTH)
     likeness = smooth.likeness
-    np.testing.assert_allclose(likeness, likeness_of(guide, WIDTH), rtol=0, atol=0.5 / LARGEST + FLOAT32)
+    np.testing.assert_allclose(likeness, likeness_of(guide, WIDTH), rtol=0, atol=LIKENESS)
     found = any_rt.empty(shape)
     assert smooth(on_device, 0.4, out=found) is found
     np.testing.assert_allclose(any_rt.download(found), nonlocal_step(volume, likeness, 0.4), rtol=0, atol=FLOAT32)
