@@ -24,6 +24,7 @@ from phyradgs_cl.objective import (
     total_variation,
 )
 from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
+from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
 from phyradgs_cl.objective.tv_descent import TvDescent, tv_descent
 from phyradgs_cl.objective.tv_prox import TvProx, tv_prox
 from phyradgs_cl.operators import (
@@ -243,6 +244,11 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     found = TvProx(rt, GRID.shape)(volume, 0.2, 4, nonnegative=True)
     yield found, tv_prox(volume, 0.2, 4, nonnegative=True), VALUE
     yield DctProx(rt, GRID.shape)(volume, 0.2, 1, nonnegative=True), dct_prox(volume, 0.2, 1, nonnegative=True), VALUE
+    smooth = NonlocalStep(rt, GRID.shape)
+    smooth.learn(volume, 0.5)
+    likeness = smooth.likeness
+    yield likeness, likeness_of(volume, 0.5), 1 / LARGEST
+    yield smooth(volume, 0.4), nonlocal_step(volume, likeness, 0.4), VALUE
 
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:

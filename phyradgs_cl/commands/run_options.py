@@ -24,6 +24,10 @@ _MOTION = (
     "every line at its own times (per-row), or splats that move while lines integrate (exact); "
     "not every method has all of them."
 )
+_PRIOR = (
+    "The prior, for fista: dct, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own "
+    "(docs: methods.md)."
+)
 _PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2, naf, sax-nerf); the window of fdk."
 _CONFIG = (
     "TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
@@ -56,6 +60,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "iterations": _asked(
         int, "Iterations: one frame each for splats, all frames for voxels.", "preset's: 3000 for splats"
     ),
+    "prior": _asked(str, _PRIOR, "dct", metavar="NAME|MODULE:NAME"),
     "gaussians": _asked(int, "Gaussians at the start.", "preset's: from the grid"),
     "size": options.Size,
     "voxel_mm": options.VoxelMm,

@@ -297,7 +297,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: reconstruct(GOOD, "phyradgs", batch=9, iterations=1), "^batch: found 9"),
         (lambda: reconstruct(GOOD, "sirt", roi_mm=(0, 1)), r"^roi_mm: found"),
         (lambda: reconstruct(GOOD, "sirt", size=4, voxel_mm=1, roi_mm=2), "^size: .*size, voxel_mm and roi_mm"),
-        (lambda: reconstruct(GOOD, "fista", prior="piccs"), "^prior=piccs: found no prior image.*say initial"),
+        (lambda: reconstruct(GOOD, "fista", prior="piccs"), "^prior piccs: found no prior image.*say initial"),
         (lambda: reconstruct(GOOD, "fista", prior=3), "option prior: found 3"),
         (lambda: reconstruct(GOOD, "fista", prior="math:pi"), "^prior: found 3.14.*a function"),
         (lambda: reconstruct(GOOD, "fista", prior=lambda volume, noise: volume[1:]), "^prior: found shape"),

@@ -10,6 +10,7 @@ import typer
 from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS
+from phyradgs_cl.reconstructors.voxels.priors import PRIORS
 
 PROGRAM = "import sys; sys.argv[0] = 'phyradgs'; from phyradgs_cl.__main__ import main; sys.exit(main())"
 
@@ -53,6 +54,12 @@ def test_a_default_is_that_of_the_command(told) -> None:
     for name, default in {"prepare": DEFAULT_STEPS, "reconstruct": "none"}.items():
         steps = told(name, "-h").split("--steps ")[1].split(" --")[0]
         assert f"[default: ({default})]" in " ".join(steps.split()), steps
+
+
+def test_the_priors_are_named(told) -> None:
+    """In words of its own: what knows their names takes a moment to load."""
+    text = " ".join(told("reconstruct", "-h").split("--prior ")[1].split(" --")[0].split())
+    assert text.split("for fista: ")[1].split(";")[0].replace(" or ", ", ").split(", ") == [*PRIORS], text
 
 
 def test_the_tab_key_in_bash() -> None:

@@ -85,6 +85,12 @@ def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
     assert (found.method, found.before.size) == ("sirt", 7)
 
 
+def test_a_prior_is_for_methods_that_have_one() -> None:
+    assert run_settings(None, {"prior": "tv"}, ["prior=dct"]).changes["prior"] == "tv"
+    with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*--method fista has it$"):
+        run_settings(None, {"prior": "tv", "method": "sirt"})
+
+
 def test_a_method_offers_only_what_it_has() -> None:
     for method, offered in (("fdk", "window, extrapolate, motion"), ("sart", "motion, strips, sub_intervals")):
         with pytest.raises(InputError) as caught:

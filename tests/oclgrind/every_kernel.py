@@ -126,7 +126,7 @@ def tiny_scan(rt: Runtime, model: str) -> Scan:
     return simulate(source, GEOMETRY, GRID, options)
 
 
-def method(rt: Runtime, name: str, motion: str) -> None:
+def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
     """A method on a scan of three frames, in the intensity model where it follows the motion."""
     scan = tiny_scan(rt, "log" if motion == "static" else "intensity")
     changes: dict[str, object] = {"motion": motion}
@@ -137,7 +137,7 @@ def method(rt: Runtime, name: str, motion: str) -> None:
     elif name != "fdk":
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
         changes |= {"voxel_iterations": 1} if name == "fused" else {}
-    reconstruct(scan, name, rt, method_options(name, None, changes))
+    reconstruct(scan, name, rt, method_options(name, None, {**changes, **more}))
 
 
 def cases() -> dict[str, Callable[[Runtime], None]]:
@@ -148,6 +148,8 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
     for name in [name for name in METHODS if name not in NEURAL]:
         for motion in ("static", "exact" if name in (*SPLATTING, "fused") else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
+    few: dict[str, object] = {"iterations": 3, "subvoxels": 1}  # weights after the first
+    found["fista nonlocal"] = partial(method, name="fista", motion="static", prior="nonlocal", **few)
     return found
 
 

@@ -36,9 +36,10 @@ def quality(scan: Scan, volume: np.ndarray) -> float:
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     found = {
         prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=40, prior=prior).volume)
-        for prior in ("none", "tv", "dct")
+        for prior in ("none", "tv", "dct", "nonlocal", "nonlocal+dct")
     }
-    assert min(found["tv"], found["dct"]) > found["none"] + 0.5, found
+    without = found.pop("none")
+    assert min(found.values()) > without + 0.5, (found, without)
     few, whole = (
         run(rt, scan, "fista", iterations=3, frames_per_subset=size).record[-1]["residual"] for size in (5, 0)
     )
@@ -48,7 +49,7 @@ def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> Non
 def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
     options = FistaOptions(frames_per_subset=1)
-    prior = prior_of("tv", rt, scan.grid, 5)
+    prior = prior_of("tv", rt, scan.grid, 5, 12)
     algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, 0.01)
     assert len(algorithm.subsets) == scan.frames
     residuals = [algorithm.step() for _ in range(30)]
@@ -73,7 +74,7 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
 
     assert with_prior(changed) > plain + 1 and with_prior(changed) > quality(few, changed) + 1
     assert with_prior(scan.reference[:, ::-1].copy(), 0.3) > plain - 1
-    with pytest.raises(InputError, match="prior=piccs: found no prior image.*--initial"):
+    with pytest.raises(InputError, match="--prior piccs: found no prior image.*--initial"):
         run(rt, few, "fista", prior="piccs")
 
 
@@ -88,7 +89,7 @@ def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
 
 def test_the_weight_follows_the_noise_as_it_comes_back(rt, scan) -> None:
     """A blur, which spreads a ray over voxels, averages it."""
-    prior = prior_of("tv", rt, scan.grid, 5)
+    prior = prior_of("tv", rt, scan.grid, 5, 12)
 
     def weight(motion: Motion, noise: float) -> float:
         return Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, noise).weight
@@ -107,7 +108,7 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
     options = FistaOptions(frames_per_subset=0)
     algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), 0.01)
     algorithm.step()
-    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5), 0.01)
+    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5, 12), 0.01)
     plain.step()
     np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
     assert seen == [algorithm.weight / algorithm.curvature]
@@ -158,9 +159,9 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
     assert run(rt, scan, "fista", iterations=1).disagreement is None
 
 
-@pytest.mark.parametrize("at", [2, 5])
-def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at) -> None:
-    options = method_options("fista", None, {"iterations": 7, "subvoxels": 2})
+@pytest.mark.parametrize(("at", "prior"), [(2, "dct"), (5, "dct"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")])
+def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
+    options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
 
     def stop(progress: Progress) -> None:
         assert progress.iterations == 7

@@ -30,6 +30,7 @@ RUNS = [
     ("sirt", {"iterations": 2, "motion": "per-row"}), ("asd-pocs", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 1, "motion": "per-row"}), ("fista", {"iterations": 1, "motion": "per-row"}),
+    ("fista", {"iterations": 4, "motion": "static", "prior": "nonlocal+dct"}),
 ]
 @pytest.fixture(scope="module")
 def gpu_shaped(scan) -> tuple[list[np.ndarray], set[str]]:

@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors.result import (
     option_facts,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Denoiser, Prior, prior_of
+from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Denoiser, Prior, prior_of, volumes_of
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
@@ -37,7 +37,7 @@ from phyradgs_cl.runtime import Runtime
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
 _SAMPLING = 0.4  # exponent of the views in the weight, measured (docs/results/settings.md)
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
-_VOLUMES, _FRAMES = 16, 3  # held at one time
+_VOLUMES, _FRAMES = 16, 3  # held at one time, with the prior `dct`
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
 _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time for: of 64³ they are, of 128³ not
 
@@ -103,7 +103,7 @@ def fista_stages(
 ) -> list[Stage]:
     """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels; ``image``: of piccs."""
     is_small = math.prod(scan.grid.shape) <= _MOST_PARTED
-    parts = options.subvoxels or (2 if is_small and _has_room(scan.grid, 2, rt) else 1)
+    parts = options.subvoxels or (2 if is_small and _has_room(scan.grid, 2, options.prior, rt) else 1)
     first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
 
     def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
@@ -148,10 +148,11 @@ def block_means(volume: np.ndarray, parts: int) -> np.ndarray:
     return means
 
 
-def _has_room(grid: Grid, parts: int, rt: Runtime) -> bool:
+def _has_room(grid: Grid, parts: int, prior: str | Denoiser, rt: Runtime) -> bool:
     """Whether every rank's device holds the method's volumes with voxels so much smaller."""
     voxels = math.prod(grid.shape) * parts**3
-    holds = voxels <= MOST_VOXELS and rt.room().holds(*[4 * voxels] * (_VOLUMES + 2))
+    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * volumes_of(prior)
+    holds = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
     return not rt.ranks.any(not holds)
 
 
@@ -169,10 +170,12 @@ def _run(
     noise *= (scan.frames / _across(scan)) ** _SAMPLING
 
     def make(system: System) -> "Fista":
-        prior = prior_of(options.prior, rt, scan.grid, options.tv_iterations, image, options.prior_share)
+        prior = prior_of(
+            options.prior, rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share
+        )
         return Fista(system, options, prior, noise)
 
-    sizes = {"volumes": _VOLUMES, "frames": _FRAMES}
+    sizes = {"volumes": _VOLUMES + volumes_of(options.prior), "frames": _FRAMES}
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
 
 
@@ -211,6 +214,7 @@ class Fista:
             self.subsets = self._subsets(-(-len(self.subsets) // 2))
             self.momentum, self.previous = 1.0, self.volume
         self.least = residual if pull_apart else min(self.least, residual)
+        self.prior.end_pass(self.system.space, self.volume)
         return residual
 
     def _step_of(self, subset: System) -> float:

@@ -3,36 +3,42 @@
 from collections.abc import Callable
 from functools import partial
 from typing import Any
-from typing import Protocol as Interface
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.objective import DctProx, TvProx
+from phyradgs_cl.objective import DctProx, NonlocalStep, TvProx
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.reconstructors.checkpoint import count_of
 from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
 
-PRIORS = ("dct", "tv", "piccs", "none")
+_ALIKE = {"nonlocal": 300.0, "nonlocal+dct": 100.0}  # h of the nonlocal weights over the weight
+_STEP = 0.01  # how far a map goes down their quadratic
+PRIORS = ("dct", "tv", *_ALIKE, "piccs", "none")
 _TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where both are in one step
+_TV_ALIKE_SHARE = 1.6  # where there are nonlocal weights, and no transforms
 
 
-class Prior(Interface):
-    """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or what stands for one."""
+class Prior:
+    """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or what stands for one; by itself without a memory."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         """The map of a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
-        ...
+        raise NotImplementedError
+
+    def end_pass(self, space: Space[Any], volume: Any) -> None:
+        """Tells of the volume after a pass over all frames."""
 
     def state(self) -> dict[str, np.ndarray]:
         """What the next map starts from."""
-        ...
+        return {}
 
-    def restore(self, state: State) -> None: ...
+    def restore(self, state: State) -> None:
+        """The inverse of ``state``."""
 
 
 Denoiser = Callable[[np.ndarray, float], np.ndarray]
@@ -40,24 +46,41 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 def prior_of(
-    prior: str | Denoiser, rt: Runtime, grid: Grid, tv_iterations: int, image: np.ndarray | None = None, share: float = 0.5
+    prior: str | Denoiser,
+    rt: Runtime,
+    grid: Grid,
+    tv_iterations: int,
+    passes: int,
+    image: np.ndarray | None = None,
+    share: float = 0.5,
 ) -> Prior:
-    """A prior by its name in ``PRIORS``, or one's own, itself or by ``package.module:function``; of piccs the prior image
-    (nz, ny, nx) in 1/mm, and its share. InputError: it has none, or what is no function."""
+    """A prior by its name in ``PRIORS``, or one's own, itself or by ``package.module:function``, for a run of so many
+    ``passes``; of piccs the prior image (nz, ny, nx) in 1/mm, and its share. InputError: without one, or no function."""
     if callable(prior) or ":" in prior:
         own = prior if callable(prior) else imported(prior, "prior")
         if not callable(own):
             raise InputError("prior", checks.shown(own), "a function (volume, noise)")
         return OwnPrior(own)
-    tv = TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations)
+    if prior == "none":
+        return NoPrior()
+    prox = TvProx(rt, grid.shape, axis_weights(grid))
     if prior == "tv":
-        return tv
+        return TvPrior(prox, tv_iterations)
     if prior == "piccs":
         if image is None:
-            remedy = "say --initial, or take prior=tv"
-            raise InputError("--set prior=piccs", "no prior image", "a volume to start from", remedy)
-        return Piccs(tv, TvPrior(TvProx(rt, grid.shape, axis_weights(grid)), tv_iterations), image, share)
-    return TvAndDct(tv, DctProx(rt, grid.shape)) if prior == "dct" else NoPrior()
+            raise InputError("--prior piccs", "no prior image", "a volume to start from", "say --initial, or take tv")
+        change = TvProx(rt, grid.shape, axis_weights(grid))
+        return Piccs(TvPrior(prox, tv_iterations), TvPrior(change, tv_iterations), image, share)
+    if prior == "nonlocal":
+        local = TvPrior(prox, tv_iterations, _TV_ALIKE_SHARE)
+    else:
+        local = TvAndDct(prox, tv_iterations, DctProx(rt, grid.shape))
+    return Nonlocal(local, NonlocalStep(rt, grid.shape), _ALIKE[prior], passes) if prior in _ALIKE else local
+
+
+def volumes_of(prior: str | Denoiser) -> int:
+    """How many more volumes a prior holds than ``dct``."""
+    return NonlocalStep.VOLUMES if prior in _ALIKE else 0
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
@@ -67,14 +90,14 @@ def axis_weights(grid: Grid) -> tuple[float, float, float]:
     return z, y, x
 
 
-class TvPrior:
-    """Isotropic total variation."""
+class TvPrior(Prior):
+    """Isotropic total variation, with a share of the weight."""
 
-    def __init__(self, prox: TvProx, iterations: int) -> None:
-        self.prox, self.iterations = prox, iterations
+    def __init__(self, prox: TvProx, iterations: int, share: float = 1.0) -> None:
+        self.prox, self.iterations, self.share = prox, iterations, share
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        prox = partial(self.prox, weight=weight, iterations=self.iterations, nonnegative=nonnegative)
+        prox = partial(self.prox, weight=self.share * weight, iterations=self.iterations, nonnegative=nonnegative)
         return space.apply(prox, volume, self.prox.shape)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -87,12 +110,12 @@ class TvPrior:
 class TvAndDct(TvPrior):
     """Total variation, then the shrinkage of block DCTs: alone the latter falls where it is run on."""
 
-    def __init__(self, tv: TvPrior, shrink: DctProx) -> None:
-        super().__init__(tv.prox, tv.iterations)
+    def __init__(self, prox: TvProx, iterations: int, shrink: DctProx) -> None:
+        super().__init__(prox, iterations, _TV_SHARE)
         self.shrink, self.turn = shrink, 0
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        smooth = super().__call__(space, volume, _TV_SHARE * weight, nonnegative=nonnegative)
+        smooth = super().__call__(space, volume, weight, nonnegative=nonnegative)
         shrink = partial(self.shrink, threshold=_DCT_SHARE * weight, turn=self.turn, nonnegative=nonnegative)
         self.turn = (self.turn + 1) % len(TURNS)
         return space.apply(shrink, smooth, self.prox.shape)
@@ -105,7 +128,40 @@ class TvAndDct(TvPrior):
         self.turn = count_of(state, "turn", len(TURNS) - 1)
 
 
-class Piccs:
+class Nonlocal(Prior):
+    """A step down a nonlocal quadratic, then another map. Its weights come from the volume after a quarter of the passes,
+    and anew after half of them: weights that follow the volume for ever sharpen what is not there."""
+
+    def __init__(self, then: Prior, smooth: NonlocalStep, alike: float, passes: int) -> None:
+        self.then, self.smooth, self.alike, self.passes = then, smooth, alike, passes
+        self._done, self._is_learned = 0, False
+        self._guide: np.ndarray | None = None
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        if self._guide is not None and weight > 0:
+            if not self._is_learned:
+                self.smooth.learn(self._guide, self.alike * weight)
+                self._is_learned = True
+            volume = space.apply(partial(self.smooth, step=_STEP), volume, self.smooth.shape)
+        return self.then(space, volume, weight, nonnegative=nonnegative)
+
+    def end_pass(self, space: Space[Any], volume: Any) -> None:
+        self._done += 1
+        if self._done in (-(-self.passes // 4), -(-self.passes // 2)):
+            self._guide, self._is_learned = space.numpy(volume), False
+
+    def state(self) -> dict[str, np.ndarray]:
+        guide = np.zeros(self.smooth.shape, np.float32) if self._guide is None else self._guide
+        return {**self.then.state(), "guide": guide, "passes": np.array(self._done)}
+
+    def restore(self, state: State) -> None:
+        self.then.restore(state)
+        (guide,) = state_arrays(state, ["guide"])
+        self._done = count_of(state, "passes", self.passes)
+        self._guide, self._is_learned = guide if guide.any() else None, False
+
+
+class Piccs(Prior):
     """Total variation of the volume, and that of what it differs from a prior image by: (1 − share) TV(x) + share TV(x − i),
     one map after the other (prior image constrained compressed sensing; Chen, Tang and Leng, Med. Phys. 35 (2008) 660)."""
 
@@ -128,20 +184,14 @@ class Piccs:
         (self.change.prox.dual,) = state_arrays(state, ["dual_of_change"])
 
 
-class NoPrior:
+class NoPrior(Prior):
     """Nothing but x ≥ 0."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
-    def state(self) -> dict[str, np.ndarray]:
-        return {}
 
-    def restore(self, state: State) -> None:
-        pass
-
-
-class OwnPrior:
+class OwnPrior(Prior):
     """A user's denoiser on the host, in the place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
 
     def __init__(self, denoiser: Denoiser) -> None:
@@ -152,9 +202,3 @@ class OwnPrior:
         cleaned = np.asarray(self.denoiser(before, weight), np.float32)
         checks.shape("prior", cleaned, before.shape)
         return space.array(np.maximum(cleaned, 0) if nonnegative else cleaned)
-
-    def state(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def restore(self, state: State) -> None:
-        pass
