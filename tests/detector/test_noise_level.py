@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phyradgs_cl.detector import noise_level
+from phyradgs_cl.detector import noise_behind, noise_level
 
 
 def smooth_frames(noise: float, seed: int = 0) -> np.ndarray:
@@ -28,3 +28,16 @@ def test_pixels_that_are_not_valid_do_not_count() -> None:
     valid[:, :, 10:14] = False
     frames[:, :, 10:14] += 10 * np.random.default_rng(1).normal(size=(5, 40, 4)).astype(np.float32)
     assert noise_level(frames, valid) == pytest.approx(0.02, rel=0.05)
+
+
+def test_the_noise_behind_the_object_does_not_depend_on_the_air() -> None:
+    """Half of air's noise is gone in files that are clipped at 0, and most of their pixels are air."""
+    u = np.linspace(-3, 3, 192)
+    dome = np.maximum(1 - u**2, 0) ** 2 * np.ones((40, 40, 1))
+    noisy = (dome + 0.02 * np.random.default_rng(0).normal(size=dome.shape)).astype(np.float32)
+    every = np.ones(noisy.shape, bool)
+    clipped = np.maximum(noisy, 0)
+    assert noise_level(clipped) < 0.8 * 0.02
+    for frames in (noisy, clipped):
+        assert noise_behind(frames, every) == pytest.approx(0.02, rel=0.08)
+    assert noise_behind(np.zeros((2, 3, 2), np.float32), np.ones((2, 3, 2), bool)) == 0

@@ -1,5 +1,7 @@
 """FISTA with priors over subsets, voxels and splats together, and first volumes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
@@ -10,7 +12,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.reconstructors import METHODS, Progress, method_options, reconstruct
-from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, _noise
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -96,6 +98,14 @@ def test_the_weight_follows_the_noise_as_it_comes_back(rt, scan) -> None:
 
     assert weight(PerRow(), 0.03) == pytest.approx(3 * weight(PerRow(), 0.01), rel=1e-6)
     assert weight(PerRow(), 0.01) < 0.95 * weight(Static(), 0.01)
+
+
+def test_fewer_views_for_so_fine_a_volume_ask_for_less_of_the_prior(rt, scan) -> None:
+    """Half of the views count as noise that is less by 2^0.4; voxels below a pixel change nothing."""
+    half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
+    assert _noise(half) == pytest.approx(0.5**0.4 * _noise(scan), rel=0.1)
+    coarse, own, fine = (_noise(replace(scan, grid=Grid.cube(n, 2.0), reference=None)) for n in (12, 24, 96))
+    assert coarse == pytest.approx((32 * 0.7 / 12) ** 0.4 * own) and own == fine
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:

@@ -166,14 +166,11 @@ def _run(
     image: np.ndarray | None,
 ) -> Reconstruction:
     """All passes on the scan's grid."""
-    noise = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
-    noise *= (scan.frames / _across(scan)) ** _SAMPLING
-
     def make(system: System) -> "Fista":
         prior = prior_of(
             options.prior, rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share
         )
-        return Fista(system, options, prior, noise)
+        return Fista(system, options, prior, _noise(scan))
 
     sizes = {"volumes": _VOLUMES + volumes_of(options.prior), "frames": _FRAMES}
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
@@ -248,10 +245,13 @@ class Fista:
         self.prior.restore(state)
 
 
-def _across(scan: Scan) -> float:
-    """How many voxels lie along the volume's side, or pixels on the axis where those are larger."""
+def _noise(scan: Scan) -> float:
+    """The noise behind the object, dimensionless, times a power of the views per voxel along the volume's side, or per pixel
+    on the axis where those are larger: the fewer there are, the more of what looks like noise is the object's."""
     pixel_mm = min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
-    return max(scan.grid.size_mm[1:]) / max(pixel_mm, *scan.grid.voxel_size_mm[1:])
+    across = max(scan.grid.size_mm[1:]) / max(pixel_mm, *scan.grid.voxel_size_mm[1:])
+    measured = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
+    return float(measured * (scan.frames / across) ** _SAMPLING)
 
 
 def _gain(system: System) -> float:

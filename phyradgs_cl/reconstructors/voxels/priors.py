@@ -20,7 +20,7 @@ _ALIKE = {"nonlocal": 300.0, "nonlocal+dct": 100.0}  # h of the nonlocal weights
 _STEP = 0.01  # how far a map goes down their quadratic
 PRIORS = ("dct", "tv", *_ALIKE, "piccs", "none")
 _TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where both are in one step
-_TV_ALIKE_SHARE = 1.6  # where there are nonlocal weights, and no transforms
+_TV_ALONE_SHARE = 1.6  # without transforms
 
 
 class Prior:
@@ -65,14 +65,14 @@ def prior_of(
         return NoPrior()
     prox = TvProx(rt, grid.shape, axis_weights(grid))
     if prior == "tv":
-        return TvPrior(prox, tv_iterations)
+        return TvPrior(prox, tv_iterations, _TV_ALONE_SHARE)
     if prior == "piccs":
         if image is None:
             raise InputError("--prior piccs", "no prior image", "a volume to start from", "say --initial, or take tv")
         change = TvProx(rt, grid.shape, axis_weights(grid))
         return Piccs(TvPrior(prox, tv_iterations), TvPrior(change, tv_iterations), image, share)
     if prior == "nonlocal":
-        local = TvPrior(prox, tv_iterations, _TV_ALIKE_SHARE)
+        local = TvPrior(prox, tv_iterations, _TV_ALONE_SHARE)
     else:
         local = TvAndDct(prox, tv_iterations, DctProx(rt, grid.shape))
     return Nonlocal(local, NonlocalStep(rt, grid.shape), _ALIKE[prior], passes) if prior in _ALIKE else local
