@@ -1,9 +1,9 @@
 """A number of a method chosen from the scan: by pixels that trials of the method do not see.
 
 Cross-validation (``holdout.py``) in shorter runs on the scan's own grid: the best weight of a coarser one is another. Pixels
-tell of angles that a method has seen, so that where views are few their error is least before the volume is smooth enough. Of
-weights that smooth, the largest is therefore taken whose error is little above the least (as in Breiman et al., Classification
-and Regression Trees, 1984, with a share in place of their standard error; docs/results/settings.md).
+tell of angles that a method has seen: where views are few their error is least before the volume is smooth enough. So of
+weights that smooth, the largest is taken whose error is little above the least (as in Breiman et al., Classification and
+Regression Trees, 1984, with a share in place of their standard error; docs/results/settings.md).
 """
 
 import json
@@ -79,7 +79,10 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
         remedy = f"leave one of the two out, or try values: --tune {name}=A,B,C"
         raise InputError(culprit, f"{name} = {checks.shown(changes[name])} too", "one choice", remedy)
     for value in wish.values:
-        _with(options, name, value)
+        try:
+            _with(options, name, value)
+        except InputError as error:
+            raise InputError(culprit, error.found, error.expected) from error
     if not wish.values and getattr(options, name) == 0:
         raise InputError(culprit, "0 as its value, about which there is nothing to try", "values", f"--tune {name}=A,B,C")
 
@@ -114,9 +117,9 @@ def tuned(
 
 def tuned_words(found: Mapping[str, Any]) -> str:
     """What was chosen, in a line."""
-    tried, errors = found["values"], found["holdout_rms"]
-    told = f"{found['option']} {found['chosen']:.4g}, chosen from {tried[0]:.4g} to {tried[-1]:.4g} in {found['seconds']:.1f} s"
-    return f"{told}: held-out pixels {min(errors):.4g} RMS at best (noise {found['holdout_noise_rms']:.4g})"
+    tried = f"chosen from {found['values'][0]:.4g} to {found['values'][-1]:.4g} in {found['seconds']:.1f} s"
+    error = f"held-out pixels {min(found['holdout_rms']):.4g} RMS at best (noise {found['holdout_noise_rms']:.4g})"
+    return f"{found['option']} {found['chosen']:.4g}, {tried}: {error}"
 
 
 def with_chosen(options: Any, found: Mapping[str, Any]) -> Any:

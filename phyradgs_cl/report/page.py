@@ -21,6 +21,7 @@ from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
+_NARROW = ("metrics", "convergence", "tuning")
 
 
 @np.errstate(all="ignore")  # absurd values are shown as they are
@@ -63,6 +64,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         "slices": sections.slices_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
+        "tuning": sections.tuning_section(run),
         **of_scan,
         "provenance": sections.provenance_section(run),
     }
@@ -82,9 +84,9 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
 
 def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
     """The sections; two that need half the width side by side where there is room."""
-    narrow = [part for name in ("metrics", "convergence") if (part := there.get(name)) is not None]
+    narrow = [part for name in _NARROW if (part := there.get(name)) is not None]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
-    rest = {name: part for name, part in there.items() if name not in ("metrics", "convergence")}
+    rest = {name: part for name, part in there.items() if name not in _NARROW}
     return [rest.pop("slices"), pair, *rest.values()]
 
 

@@ -17,6 +17,7 @@ from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.reconstructors.tune import TUNED
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
@@ -60,6 +61,18 @@ class Run:
         """The convergence record: finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if NUMBER.fits(v)} for line in lines]
+
+
+    @property
+    def tuned(self) -> Mapping[str, Any] | None:
+        """How an option was chosen from the scan, where the provenance says it in numbers."""
+        found: Any = self.stored.provenance.get(TUNED)
+        if not isinstance(found, Mapping) or not isinstance(found.get("option"), str):
+            return None
+        values, errors = found.get("values"), found.get("holdout_rms")
+        if not (isinstance(values, list) and isinstance(errors, list) and len(values) == len(errors) > 1):
+            return None
+        return found if all(map(NUMBER.fits, [*values, *errors, found.get("chosen")])) else None
 
 
 def input_of(stored: StoredVolume) -> InputOptions:
