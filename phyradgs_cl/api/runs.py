@@ -40,7 +40,8 @@ from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import option_facts
-from phyradgs_cl.reconstructors.tune import TUNED, with_chosen
+from phyradgs_cl.reconstructors.tune.trials import TUNED
+from phyradgs_cl.reconstructors.tune.wish import is_told, with_chosen
 from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 _IDENTITY = "run"
@@ -298,7 +299,9 @@ def _state_of(
         raise InputError(
             "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
         )
-    options = with_chosen(options, partial.facts[TUNED]) if TUNED in partial.state else options
+    tuned: Any = partial.facts.get(TUNED)
+    if is_told(tuned) and hasattr(options, tuned["option"]):
+        options = with_chosen(options, tuned)
     then, now = (
         json.dumps(facts, sort_keys=True, default=repr) for facts in (partial.facts.get("options"), option_facts(options))
     )

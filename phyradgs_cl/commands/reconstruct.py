@@ -16,7 +16,7 @@ from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
-from phyradgs_cl.reconstructors.tune import TUNED, tuned_words
+from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import profile_report, run_reconstruction

@@ -16,7 +16,7 @@ from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts
-from phyradgs_cl.reconstructors.tune import wish_of
+from phyradgs_cl.reconstructors.tune.wish import wish_of
 from phyradgs_cl.runtime import Runtime
 
 MEDIAN_EDGES = (0, 3, 5)
@@ -28,7 +28,7 @@ _HIDING = ("holdout", "tune")
 class InputOptions(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
     median_filter: edge of its window in pixels, 0 for none. holdout: percent of the pixels that no method sees
-    (``holdout.py``). tune: the option of the method that such pixels choose (``tune.py``). steps and a table each: as of
+    (``holdout.py``). tune: the option of the method that such pixels choose (``tune/``). steps and a table each: as of
     ``PrepareOptions``.
     """
 

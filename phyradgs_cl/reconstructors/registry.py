@@ -21,7 +21,8 @@ from phyradgs_cl.reconstructors.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import HELD_OUT, ProgressReport, Reconstruction, ignore_progress
-from phyradgs_cl.reconstructors.tune import check_wish, tuned
+from phyradgs_cl.reconstructors.tune.trials import tuned
+from phyradgs_cl.reconstructors.tune.wish import check_wish
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 

@@ -17,7 +17,8 @@ from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import InputOptions, input_options
-from phyradgs_cl.reconstructors.tune import TUNED
+from phyradgs_cl.reconstructors.tune.trials import TUNED
+from phyradgs_cl.reconstructors.tune.wish import is_told
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
@@ -67,12 +68,7 @@ class Run:
     def tuned(self) -> Mapping[str, Any] | None:
         """How an option was chosen from the scan, where the provenance says it in numbers."""
         found: Any = self.stored.provenance.get(TUNED)
-        if not isinstance(found, Mapping) or not isinstance(found.get("option"), str):
-            return None
-        values, errors = found.get("values"), found.get("holdout_rms")
-        if not (isinstance(values, list) and isinstance(errors, list) and len(values) == len(errors) > 1):
-            return None
-        return found if all(map(NUMBER.fits, [*values, *errors, found.get("chosen")])) else None
+        return found if is_told(found) else None
 
 
 def input_of(stored: StoredVolume) -> InputOptions:

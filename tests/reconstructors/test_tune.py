@@ -12,11 +12,12 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, load_volume, prepare, reconstruct, save_scan, save_volume, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path
-from phyradgs_cl.reconstructors import InputOptions, Progress, method_options, tune
+from phyradgs_cl.reconstructors import InputOptions, Progress, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.holdout import held_out
 from phyradgs_cl.reconstructors.result import HELD_OUT
-from phyradgs_cl.reconstructors.tune import TUNED
+from phyradgs_cl.reconstructors.tune import trials
+from phyradgs_cl.reconstructors.tune.trials import TUNED
 from phyradgs_cl.report.page import report_page
 from phyradgs_cl.report.run import load_run
 
@@ -76,8 +77,8 @@ def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:
 @pytest.mark.parametrize("errors, expected", [([4.0, 2.0, 1.0, 2.0, 4.0], 4.0), ([3.0, 2.0, 1.0, 1.0, 2.0], 4 * 2**0.5)])
 def test_between_values_a_parabola_is_least(errors, expected) -> None:
     values = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    assert tune._least(values, np.array(errors)) == pytest.approx(expected)
-    assert tune._least(values[:3], np.array(errors[:3])) == 4.0
+    assert trials._least(values, np.array(errors)) == pytest.approx(expected)
+    assert trials._least(values[:3], np.array(errors[:3])) == 4.0
 
 
 def test_a_run_that_goes_on_does_not_choose_again(rt, scan, file, cli, tmp_path, capsys) -> None:
@@ -108,9 +109,12 @@ def test_a_run_that_goes_on_does_not_choose_again(rt, scan, file, cli, tmp_path,
         assert rest.facts[TUNED] == partial.facts[TUNED] and not any(trials)
     with pytest.raises(InputError, match="resume: found another"):
         reconstruct(scan, **{**given, "tune": "tv_weight=1,2,3"}, resume=partial)
-    spoilt = replace(partial, state={**partial.state, TUNED: np.array(json.dumps({"option": 1}))})
-    with pytest.raises(InputError, match="no choice"):
-        reconstruct(scan, **given, resume=spoilt)
+    for spoilt in ({"option": 1}, {**partial.facts[TUNED], "chosen": "x"}, {**partial.facts[TUNED], "option": "motion"}):
+        state = {**partial.state, TUNED: np.array(json.dumps(spoilt))}
+        with pytest.raises(InputError, match="no choice"):
+            reconstruct(scan, **given, resume=replace(partial, state=state))
+    with pytest.raises(InputError, match="resume: found another method, or other options"):
+        reconstruct(scan, **given, resume=replace(partial, facts={**partial.facts, TUNED: {"option": 1}}))
 
 
 def test_a_command_that_was_stopped_goes_on_with_its_choice(rt, file, tmp_path) -> None:

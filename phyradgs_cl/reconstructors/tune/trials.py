@@ -9,20 +9,19 @@ Regression Trees, 1984, with a share in place of their standard error; docs/resu
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.masked import with_masked
 from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress
+from phyradgs_cl.reconstructors.tune.wish import Wish, is_told, wish_of, with_chosen, with_value
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.text import near_miss
 
 TUNED = "tuned"
 """Where facts and states have what was chosen."""
@@ -36,55 +35,6 @@ _LATER, _PAST = 1.1, 2  # iterations: the next that is looked at, and the last, 
 
 Run = Callable[..., Reconstruction]
 """(scan, options, report=, resume=) to a result."""
-
-
-@dataclass(frozen=True)
-class Wish:
-    """The option to be chosen, and the values to be tried; none: some about the present one."""
-
-    option: str
-    values: tuple[float, ...] = ()
-
-
-def wish_of(text: str) -> Wish:
-    """NAME, or NAME=VALUE,VALUE,VALUE. Raises InputError for other texts."""
-    name, sign, rest = text.partition("=")
-    try:
-        values = tuple(sorted({float(part) for part in rest.split(",")})) if sign else ()
-    except ValueError:
-        values = (np.nan,)
-    if not name.strip() or (sign and len(values) < 3) or not np.isfinite(values).all():
-        expected = "NAME of an option, or NAME=VALUE,VALUE,VALUE with three numbers or more"
-        raise InputError("--tune", repr(text), expected, "write for example --tune tv_weight")
-    return Wish(name.strip(), values)
-
-
-def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any], ends_anywhere: bool) -> None:
-    """InputError for an option that cannot be chosen, or that the user has chosen. ends_anywhere: whether the method's short
-    runs are the beginnings of its long ones."""
-    wish = wish_of(text)
-    culprit, name = f"--tune {wish.option}", wish.option
-    numbers = [f.name for f in fields(options) if _is_number(getattr(options, f.name))]
-    if not ends_anywhere:
-        numbers = [number for number in numbers if number != "iterations"]
-    if name not in numbers:
-        expected = f"one of {', '.join(numbers)}" if numbers else "a method with numbers to choose"
-        remedy = near_miss(name, numbers, "leave --tune out")
-        raise InputError(culprit, f"no number to choose of --method {method}", expected, remedy)
-    if name == "iterations":
-        if wish.values:
-            raise InputError(culprit, "values", "none: every iteration is looked at", "--iterations N says how many at most")
-        return
-    if name in changes:
-        remedy = f"leave one of the two out, or try values: --tune {name}=A,B,C"
-        raise InputError(culprit, f"{name} = {checks.shown(changes[name])} too", "one choice", remedy)
-    for value in wish.values:
-        try:
-            _with(options, name, value)
-        except InputError as error:
-            raise InputError(culprit, error.found, error.expected) from error
-    if not wish.values and getattr(options, name) == 0:
-        raise InputError(culprit, "0 as its value, about which there is nothing to try", "values", f"--tune {name}=A,B,C")
 
 
 def tuned(
@@ -101,7 +51,7 @@ def tuned(
     its facts and in its state, from which a run that goes on takes it. Raises KeyboardInterrupt for a trial that is stopped.
     """
     wish = wish_of(text)
-    found = _chosen(wish, run, scan, options, rt, report, extra) if resume is None else _kept(resume)
+    found = _chosen(wish, run, scan, options, rt, report, extra) if resume is None else _kept(resume, wish.option)
     kept = {TUNED: np.array(json.dumps(found))}
 
     def told(progress: Progress) -> None:
@@ -122,25 +72,9 @@ def tuned_words(found: Mapping[str, Any]) -> str:
     return f"{found['option']} {found['chosen']:.4g}, {tried}: {error}"
 
 
-def with_chosen(options: Any, found: Mapping[str, Any]) -> Any:
-    """The options with what was ``TUNED``, as facts say it; where iterations were, the residual no longer ends the run."""
-    name, value = found["option"], found["chosen"]
-    ends = {"noise_stop": 0.0} if name == "iterations" and getattr(options, "noise_stop", 0) else {}
-    return replace(_with(options, name, value), **ends)
-
-
-def _with(options: Any, name: str, value: float) -> Any:
-    kind = type(getattr(options, name))
-    return replace(options, **{name: round(value) if kind is int else kind(value)})
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _kept(state: State) -> dict[str, Any]:
+def _kept(state: State, option: str) -> dict[str, Any]:
     found = parsed(state, TUNED, dict)
-    if not (isinstance(found.get("option"), str) and _is_number(found.get("chosen"))):
+    if not is_told(found) or found["option"] != option:
         raise InputError(f"checkpoint, array {TUNED}", "no choice", "what a run has written", "start without --resume")
     return found
 
@@ -221,7 +155,7 @@ class _Trials:
     def _try(self, options: Any, values: Sequence[float]) -> None:
         for value in values:
             try:
-                some = _with(options, self.option, value)
+                some = with_value(options, self.option, value)
             except InputError:  # beyond what the method takes
                 continue
             value = getattr(some, self.option)
