@@ -173,6 +173,7 @@ REFUSED = {
     "no values": ("fista-tv --tune tv_weight=a,b,c", "three numbers or more"),
     "beyond the range": ("fista-tv --tune tv_weight=-1,0,1", "a number from 0"),
     "nothing about 0": ("sart --tune noise_stop", "about which there is nothing to try"),
+    "no iterations": ("sart --tune iterations --iterations 0", "about which there is nothing to try"),
     "mixed pixels": ("fista-tv --tune tv_weight --median-filter 3", "median filter"),
 }
 

@@ -29,7 +29,7 @@ _PERCENT, _SEED = 2.0, 21  # of pixels; others than those of --holdout
 _FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 _FURTHER, _MOST_FURTHER = 4.0, 4  # beyond an end of these, if the choice is there
 _SMOOTHING = ("tv_weight", "prior_weight", "tv_share")
-_SHORTER = 3  # trials have so many times fewer iterations
+_SHORTER = 3  # trials of weights have so many times fewer iterations
 _MARGIN = 1.125  # of the least squared error beyond the noise
 _LATER, _PAST = 1.1, 2  # iterations: the next that is looked at, and the last, as multiples of this one and of the best
 
@@ -122,8 +122,9 @@ class _Trials:
         return round(found) if isinstance(tried[0], int) else found
 
     def compare(self, options: Any, values: Sequence[float]) -> None:
-        """Errors of runs at ``values``; or at some about the present one, and further on where the choice is at an end."""
-        if hasattr(options, "iterations"):
+        """Errors of runs at ``values``; or at some about the present one, and further on where the choice is at an end.
+        Smoothing is as good in shorter runs; how far a relaxation goes they would not tell."""
+        if self.option in _SMOOTHING and hasattr(options, "iterations"):
             options = replace(options, iterations=-(-options.iterations // _SHORTER))
         self._try(options, values or [factor * getattr(options, self.option) for factor in _FACTORS])
         for _ in range(0 if values else _MOST_FURTHER):

@@ -45,6 +45,9 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
         expected = f"one of {', '.join(numbers)}" if numbers else "a method with numbers to choose"
         remedy = near_miss(name, numbers, "leave --tune out")
         raise InputError(culprit, f"no number to choose of --method {method}", expected, remedy)
+    if not wish.values and getattr(options, name) == 0:
+        remedy = f"--{name} N" if name == "iterations" else f"--tune {name}=A,B,C"
+        raise InputError(culprit, "0 as its value, about which there is nothing to try", "another", remedy)
     if name == "iterations":
         if wish.values:
             raise InputError(culprit, "values", "none: every iteration is looked at", "--iterations N says how many at most")
@@ -57,8 +60,6 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
             with_value(options, name, value)
         except InputError as error:
             raise InputError(culprit, error.found, error.expected) from error
-    if not wish.values and getattr(options, name) == 0:
-        raise InputError(culprit, "0 as its value, about which there is nothing to try", "values", f"--tune {name}=A,B,C")
 
 
 def with_chosen(options: Any, found: Mapping[str, Any]) -> Any:
