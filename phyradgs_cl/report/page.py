@@ -21,7 +21,6 @@ from phyradgs_cl.report.run import Run, load_run
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
-_NARROW = ("metrics", "convergence", "tuning")
 
 
 @np.errstate(all="ignore")  # absurd values are shown as they are
@@ -84,9 +83,9 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
 
 def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
     """The sections; two that need half the width side by side where there is room."""
-    narrow = [part for name in _NARROW if (part := there.get(name)) is not None]
+    narrow = [part for name in ("metrics", "convergence") if (part := there.get(name)) is not None]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
-    rest = {name: part for name, part in there.items() if name not in _NARROW}
+    rest = {name: part for name, part in there.items() if name not in ("metrics", "convergence")}
     return [rest.pop("slices"), pair, *rest.values()]
 
 
