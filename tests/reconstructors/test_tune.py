@@ -57,21 +57,24 @@ def test_a_bad_weight_is_mended_by_the_scan(rt, scan) -> None:
 
 
 def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:
-    """Of a weight the largest that is little worse; of iterations, and what is no weight, the least itself."""
+    """Of weights the largest, of iterations the fewest whose error is not far above that; of others the least itself."""
     by_weight = reconstruct(scan, "fista", tune="prior_weight=0.2,0.4,0.8,1.6,6.4", device=rt, subvoxels=1, report=False)
     followed = reconstruct(scan, "cgls", tune="iterations", device=rt, **{**SOME, "iterations": 60})
     for found in (by_weight.facts[TUNED], followed.facts[TUNED]):
         values, errors = np.array(found["values"]), np.array(found["holdout_rms"])
-        best, chosen = int(errors.argmin()), found["chosen"]
+        best, chosen = values[errors.argmin()], found["chosen"]
+        beyond = np.maximum(errors**2 - found["holdout_noise_rms"] ** 2, 0)
+        at = np.interp(np.log(chosen), np.log(values), beyond) / beyond.min()
         assert found["holdout_pixels"] > 100 and found["holdout_noise_rms"] > 0 and found["seconds"] > 0
         assert errors[0] > errors.min() < errors[-1]
         if found["option"] == "iterations":
-            assert values[best - 1] < chosen < values[best + 1] and followed.facts["iterations"] == chosen
-            assert values[-1] < 60  # it is not followed on for nothing
+            assert values[0] < chosen < best and followed.facts["iterations"] == chosen and at < 1.8
+            assert best < values[-1] < 60  # it is not followed on for nothing
         else:
-            beyond = np.maximum(errors**2 - found["holdout_noise_rms"] ** 2, 0)
-            assert values[best] <= chosen < values[-1]
-            assert np.interp(np.log(chosen), np.log(values), beyond) <= 1.13 * beyond.min() + 1e-12
+            assert best < chosen < values[-1] and at < 1.21
+    last = reconstruct(scan, "cgls", device=rt, **{**SOME, "iterations": int(values[-1])}, noise_stop=0.0)
+    least = reconstruct(scan, "cgls", device=rt, **{**SOME, "iterations": int(best)}, noise_stop=0.0)
+    assert psnr_db(followed, scan) > psnr_db(least, scan) > psnr_db(last, scan)
 
 
 @pytest.mark.parametrize("errors, expected", [([4.0, 2.0, 1.0, 2.0, 4.0], 4.0), ([3.0, 2.0, 1.0, 1.0, 2.0], 4 * 2**0.5)])

@@ -1,9 +1,9 @@
 """A number of a method chosen from the scan: by pixels that trials of the method do not see.
 
-Cross-validation (``holdout.py``) in shorter runs on the scan's own grid: the best weight of a coarser one is another. Pixels
-tell of angles that a method has seen: where views are few their error is least before the volume is smooth enough. So of
-weights that smooth, the largest is taken whose error is little above the least (as in Breiman et al., Classification and
-Regression Trees, 1984, with a share in place of their standard error; docs/results/settings.md).
+Cross-validation (``holdout.py``) on the scan's own grid: the best weight of a coarser one is another. Pixels tell of angles
+that a method has seen: where views are few their error is least before the volume is smooth enough. So of what smooths, the
+strongest is taken whose error is not far above the least (as in Breiman et al., Classification and Regression Trees, 1984,
+with a share in place of their standard error; docs/results/settings.md).
 """
 
 import json
@@ -28,9 +28,9 @@ TUNED = "tuned"
 _PERCENT, _SEED = 2.0, 21  # of pixels; others than those of --holdout
 _FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 _FURTHER, _MOST_FURTHER = 4.0, 4  # beyond an end of these, if the choice is there
-_SMOOTHING = ("tv_weight", "prior_weight", "tv_share")
+_WEIGHTS = ("tv_weight", "prior_weight", "tv_share")  # of what smooths
 _SHORTER = 3  # trials of weights have so many times fewer iterations
-_MARGIN = 1.125  # of the least squared error beyond the noise
+_MARGIN, _MARGIN_OF_STOPS = 1.2, 1.5  # of the least squared error beyond the noise (docs/results/settings.md)
 _LATER, _PAST = 1.1, 2  # iterations: the next that is looked at, and the last, as multiples of this one and of the best
 
 Run = Callable[..., Reconstruction]
@@ -118,13 +118,19 @@ class _Trials:
         """What the errors so far speak for."""
         tried = sorted(self.errors)
         values, errors = np.array(tried, np.float64), np.array([self.errors[value] for value in tried])
-        found = _smoothest(values, errors, self.noise_rms) if self.option in _SMOOTHING else _least(values, errors)
+        beyond = np.maximum(errors**2 - self.noise_rms**2, 0)
+        if self.option in _WEIGHTS:
+            found = _furthest(values, beyond, _MARGIN)
+        elif self.option == "iterations":
+            found = _furthest(values[::-1], beyond[::-1], _MARGIN_OF_STOPS)
+        else:
+            found = _least(values, errors)
         return round(found) if isinstance(tried[0], int) else found
 
     def compare(self, options: Any, values: Sequence[float]) -> None:
         """Errors of runs at ``values``; or at some about the present one, and further on where the choice is at an end.
         Smoothing is as good in shorter runs; how far a relaxation goes they would not tell."""
-        if self.option in _SMOOTHING and hasattr(options, "iterations"):
+        if self.option in _WEIGHTS and hasattr(options, "iterations"):
             options = replace(options, iterations=-(-options.iterations // _SHORTER))
         self._try(options, values or [factor * getattr(options, self.option) for factor in _FACTORS])
         for _ in range(0 if values else _MOST_FURTHER):
@@ -184,10 +190,9 @@ class _Trials:
         self.errors[value], self.noise_rms = found["holdout_rms"], found["holdout_noise_rms"]
 
 
-def _smoothest(values: np.ndarray, errors: np.ndarray, noise_rms: float) -> float:
-    """The largest of values (n,), between them too, whose squared error beyond the noise is little above the least."""
-    beyond = np.maximum(errors**2 - noise_rms**2, 0)
-    limit = _MARGIN * beyond.min()
+def _furthest(values: np.ndarray, beyond: np.ndarray, margin: float) -> float:
+    """The last of values (n,), between them too, at which ``beyond`` (n,) is at most ``margin`` times its least."""
+    limit = margin * beyond.min()
     within = int(np.flatnonzero(beyond <= limit)[-1])
     if within == len(values) - 1:
         return float(values[-1])
