@@ -71,7 +71,7 @@ def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:
             assert values[0] < chosen < best and followed.facts["iterations"] == chosen and at < 1.8
             assert best < values[-1] < 60  # it is not followed on for nothing
         else:
-            assert best < chosen < values[-1] and at < 1.21
+            assert best < chosen < values[-1] and at < 1.13
     last = reconstruct(scan, "cgls", device=rt, **{**SOME, "iterations": int(values[-1])}, noise_stop=0.0)
     least = reconstruct(scan, "cgls", device=rt, **{**SOME, "iterations": int(best)}, noise_stop=0.0)
     assert psnr_db(followed, scan) > psnr_db(least, scan) > psnr_db(last, scan)
@@ -175,8 +175,8 @@ REFUSED = {
     "too few values": ("fista-tv --tune tv_weight=1,2", "three numbers or more"),
     "no values": ("fista-tv --tune tv_weight=a,b,c", "three numbers or more"),
     "beyond the range": ("fista-tv --tune tv_weight=-1,0,1", "a number from 0"),
-    "nothing about 0": ("sart --tune noise_stop", "about which there is nothing to try"),
-    "no iterations": ("sart --tune iterations --iterations 0", "about which there is nothing to try"),
+    "nothing about 0": ("sart --tune noise_stop", "nothing to try about it"),
+    "no iterations": ("sart --tune iterations --iterations 0", "nothing to try about it"),
     "mixed pixels": ("fista-tv --tune tv_weight --median-filter 3", "median filter"),
 }
 

@@ -30,7 +30,7 @@ _FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 _FURTHER, _MOST_FURTHER = 4.0, 4  # beyond an end of these, if the choice is there
 _WEIGHTS = ("tv_weight", "prior_weight", "tv_share")  # of what smooths
 _SHORTER = 3  # trials of weights have so many times fewer iterations
-_MARGIN, _MARGIN_OF_STOPS = 1.2, 1.5  # of the least squared error beyond the noise (docs/results/settings.md)
+_MARGIN, _MARGIN_OF_STOPS = 1.125, 1.5  # of the least squared error beyond the noise (docs/results/settings.md)
 _LATER, _PAST = 1.1, 2  # iterations: the next that is looked at, and the last, as multiples of this one and of the best
 
 Run = Callable[..., Reconstruction]

@@ -37,29 +37,30 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
     """InputError for an option that cannot be chosen, or that the user has chosen. ends_anywhere: whether the method's short
     runs are the beginnings of its long ones."""
     wish = wish_of(text)
-    culprit, name = f"--tune {wish.option}", wish.option
+    name = wish.option
     numbers = [f.name for f in fields(options) if NUMBER.fits(getattr(options, f.name))]
     if not ends_anywhere:
         numbers = [number for number in numbers if number != "iterations"]
     if name not in numbers:
         expected = f"one of {', '.join(numbers)}" if numbers else "a method with numbers to choose"
         remedy = near_miss(name, numbers, "leave --tune out")
-        raise InputError(culprit, f"no number to choose of --method {method}", expected, remedy)
+        raise InputError("--tune", f"{name}, no number to choose of --method {method}", expected, remedy)
     if not wish.values and getattr(options, name) == 0:
         remedy = f"--{name} N" if name == "iterations" else f"--tune {name}=A,B,C"
-        raise InputError(culprit, "0 as its value, about which there is nothing to try", "another", remedy)
+        raise InputError("--tune", f"{name}, which is 0: there is nothing to try about it", "another value", remedy)
     if name == "iterations":
         if wish.values:
-            raise InputError(culprit, "values", "none: every iteration is looked at", "--iterations N says how many at most")
+            remedy = "--iterations N says how many at most"
+            raise InputError("--tune", "values of iterations", "none: every iteration is looked at", remedy)
         return
     if name in changes:
         remedy = f"leave one of the two out, or try values: --tune {name}=A,B,C"
-        raise InputError(culprit, f"{name} = {checks.shown(changes[name])} too", "one choice", remedy)
+        raise InputError("--tune", f"{name}, which is set to {checks.shown(changes[name])}", "one choice", remedy)
     for value in wish.values:
         try:
             with_value(options, name, value)
         except InputError as error:
-            raise InputError(culprit, error.found, error.expected) from error
+            raise InputError("--tune", f"{name} = {error.found}", error.expected) from error
 
 
 def with_chosen(options: Any, found: Mapping[str, Any]) -> Any:
