@@ -50,8 +50,8 @@ class FistaOptions(IterativeOptions):
     and to how many views there are for so fine a volume.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
-    subsets: of the frames, each with a step of its own; those whose steps pull apart are joined two by two. tv_iterations: dual
-    iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
+    subsets: of the frames, each with a step of its own; those whose steps pull apart are joined two by two.
+    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
