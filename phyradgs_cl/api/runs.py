@@ -287,7 +287,7 @@ def _identity(scan: Scan, before: object, seed: int, initial: np.ndarray | None 
     """What a run that goes on has in common with the one that was interrupted, besides its method: of arrays SHA-256."""
     frames = _sha256(scan.projections, np.packbits(scan.valid))
     start = None if initial is None else _sha256(initial.astype(np.float32))  # as files have it
-    return {"scan": frames, "seed": seed, "steps or other input options": before, "initial": start}
+    return {"scan": frames, "seed": seed, "input (steps, holdout, tune)": before, "initial": start}
 
 
 def _sha256(*arrays: np.ndarray) -> str:

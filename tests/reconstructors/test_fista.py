@@ -191,7 +191,7 @@ def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
     (tmp_path / "own_priors.py").write_text(own)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert not run(rt, scan, "fista", prior="own_priors:nothing", iterations=2).volume.any()
-    with pytest.raises(InputError, match="prior: found own_priors:nobody"):
+    with pytest.raises(InputError, match="--prior: found own_priors:nobody"):
         run(rt, scan, "fista", prior="own_priors:nobody", iterations=2)
-    with pytest.raises(InputError, match="prior: found shape"):
+    with pytest.raises(InputError, match="--prior own_priors:<lambda>: found shape"):
         run(rt, scan, "fista", prior="own_priors:less", iterations=2)

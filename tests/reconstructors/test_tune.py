@@ -169,11 +169,13 @@ REFUSED = {
     "no number": ("fista --tune prior", "no number to choose"),
     "a switch": ("fista --tune nonnegative", "no number to choose"),
     "no method with numbers": ("fdk --tune window", "a method with numbers"),
-    "iterations that plan": ("fista --tune iterations", "no number to choose"),
+    "iterations that plan": ("fista --tune iterations", "no number to choose", "set --iterations"),
     "iterations by values": ("sart --tune iterations=1,2,3", "every iteration is looked at"),
     "two choices": ("fista-tv --tune tv_weight --set tv_weight=0.002", "leave one of the two out"),
-    "too few values": ("fista-tv --tune tv_weight=1,2", "three numbers or more"),
-    "no values": ("fista-tv --tune tv_weight=a,b,c", "three numbers or more"),
+    "too few values": ("fista-tv --tune tv_weight=1,2", "three different finite numbers or more"),
+    "no values": ("fista-tv --tune tv_weight=a,b,c", "numbers with commas between"),
+    "one value thrice": ("fista-tv --tune tv_weight=1,1,1", "three different finite numbers"),
+    "parts of Gaussians": ("phyradgs --tune gaussians=1.5,2,3", "whole numbers"),
     "beyond the range": ("fista-tv --tune tv_weight=-1,0,1", "a number from 0"),
     "nothing about 0": ("sart --tune noise_stop", "nothing to try about it"),
     "no iterations": ("sart --tune iterations --iterations 0", "nothing to try about it"),
@@ -191,6 +193,6 @@ def test_what_cannot_be_chosen_is_refused_in_a_line(refused, file, tmp_path, cas
 def test_python_refuses_the_same(rt, scan) -> None:
     with pytest.raises(InputError, match="leave one of the two out"):
         reconstruct(scan, "fista-tv", tv_weight=0.002, tune="tv_weight", device=rt)
-    with pytest.raises(InputError, match="--tune: found tv_weight, without a method"):
+    with pytest.raises(InputError, match="^tune: found tv_weight, without a method"):
         prepare(scan, "sparks", device=rt, tune="tv_weight")
     assert "tune" not in InputOptions().facts() and InputOptions(tune="a").facts()["tune"] == "a"

@@ -11,6 +11,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.text import near_miss
 
+_STOPS = "its short runs are not the beginnings of long ones; set --iterations"
+
 
 @dataclass(frozen=True)
 class Wish:
@@ -23,14 +25,16 @@ class Wish:
 def wish_of(text: str) -> Wish:
     """NAME, or NAME=VALUE,VALUE,VALUE. Raises InputError for other texts."""
     name, sign, rest = text.partition("=")
+    expected = "NAME of an option, or NAME=VALUE,VALUE,VALUE"
+    if not name.strip():
+        raise InputError("--tune", repr(text), expected, "write for example --tune prior_weight")
     try:
-        values = tuple(sorted({float(part) for part in rest.split(",")})) if sign else ()
+        values = sorted({float(part) for part in rest.split(",")}) if sign else []
     except ValueError:
-        values = (np.nan,)
-    if not name.strip() or (sign and len(values) < 3) or not np.isfinite(values).all():
-        expected = "NAME of an option, or NAME=VALUE,VALUE,VALUE with three numbers or more"
-        raise InputError("--tune", repr(text), expected, "write for example --tune tv_weight")
-    return Wish(name.strip(), values)
+        raise InputError("--tune", f"{rest!r} for {name}", "numbers with commas between") from None
+    if not np.isfinite(values).all() or (sign and len(values) < 3):
+        raise InputError("--tune", f"{rest!r} for {name}", "three different finite numbers or more")
+    return Wish(name.strip(), tuple(values))
 
 
 def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any], ends_anywhere: bool) -> None:
@@ -43,7 +47,7 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
         numbers = [number for number in numbers if number != "iterations"]
     if name not in numbers:
         expected = f"one of {', '.join(numbers)}" if numbers else "a method with numbers to choose"
-        remedy = near_miss(name, numbers, "leave --tune out")
+        remedy = near_miss(name, numbers, "leave --tune out") if name != "iterations" else _STOPS
         raise InputError("--tune", f"{name}, no number to choose of --method {method}", expected, remedy)
     if not wish.values and getattr(options, name) == 0:
         remedy = f"--{name} N" if name == "iterations" else f"--tune {name}=A,B,C"
@@ -57,6 +61,8 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
         remedy = f"leave one of the two out, or try values: --tune {name}=A,B,C"
         raise InputError("--tune", f"{name}, which is set to {checks.shown(changes[name])}", "one choice", remedy)
     for value in wish.values:
+        if isinstance(getattr(options, name), int) and value != round(value):
+            raise InputError("--tune", f"{name} = {value:g}", "whole numbers")
         try:
             with_value(options, name, value)
         except InputError as error:
