@@ -275,7 +275,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: api.prepare("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
         (lambda: api.prepare(GOOD, "spark"), "steps: found .spark"),
         (lambda: api.prepare(GOOD, "rings", rings={"windo": 3}), "windo"),
-        (lambda: api.prepare(GOOD, "rings", holdout=5), "^holdout: found 5 %, without a method"),
+        (lambda: api.prepare(GOOD, "rings", holdout=5), "^holdout: found 5.0, without a method"),
     ],
     "reconstruct": [
         (lambda: reconstruct(GOOD, "sirt", initial="volume.h5"), "initial: found .volume.h5."),
