@@ -20,12 +20,13 @@ from phyradgs_cl.reconstructors.voxels.fista import FistaOptions
 from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"still": Static(), "fly": PerRow()}
+PROTOCOLS = {25: "rapid", 50: "standard"}
 PASSES = 30
 
 
 def scan_of(rt: Runtime, path: Path, size: int, kind: str, views: int, dose: float, seed: int) -> Scan:
     """A scan of a volume's file: still, or of the protocol with so many views."""
-    protocol = "static" if kind == "still" else {25: "rapid", 50: "standard"}[views]
+    protocol = "static" if kind == "still" else PROTOCOLS[views]
     usual = {"size": size, "detector": 2 * size, "noise": "tigre", "dose": dose, "seed": seed, "device": rt}
     return simulate(path, protocol=protocol, views=views if kind == "still" else None, **usual)  # type: ignore[arg-type]
 
@@ -88,6 +89,8 @@ def main() -> None:
         verb.add_argument("lines", type=Path, help="a file of one line of JSON per run")
         verb.set_defaults(function=function)
     given = parser.parse_args()
+    if "fly" in getattr(given, "kinds", ()) and not set(given.views) <= set(PROTOCOLS):
+        parser.error("fly-scans have --views 25 or 50")
     given.function(given)
 
 

@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.reconstructors import METHODS, Progress, method_options, reconstruct
-from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, _noise
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, Misfit, misfit_of
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -52,7 +52,7 @@ def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
     options = FistaOptions(subsets=1000)
     prior = prior_of("tv", rt, scan.grid, 5, 12)
-    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, 0.01)
+    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, Misfit(0.01))
     assert len(algorithm.subsets) == scan.frames
     residuals = [algorithm.step() for _ in range(30)]
     assert 1 <= len(algorithm.subsets) <= scan.frames // 2
@@ -89,23 +89,32 @@ def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
     assert residuals[-1] < 1.1 * min(residuals) and quality(scan, result.volume) > 30
 
 
-def test_the_weight_follows_the_noise_as_it_comes_back(rt, scan) -> None:
+def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None:
     """A blur, which spreads a ray over voxels, averages it."""
     prior = prior_of("tv", rt, scan.grid, 5, 12)
 
-    def weight(motion: Motion, noise: float) -> float:
-        return Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, noise).weight
+    def weight(motion: Motion, misfit: Misfit, density: float = 0.0) -> float:
+        method = Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, misfit)
+        volume = np.zeros(scan.grid.shape, np.float32)
+        volume[4:9, 5:8] = density
+        method.start_from(method.system.space.array(volume))
+        return method.weight
 
-    assert weight(PerRow(), 0.03) == pytest.approx(3 * weight(PerRow(), 0.01), rel=1e-6)
-    assert weight(PerRow(), 0.01) < 0.95 * weight(Static(), 0.01)
+    assert weight(PerRow(), Misfit(0.03)) == pytest.approx(3 * weight(PerRow(), Misfit(0.01)), rel=1e-6)
+    assert weight(PerRow(), Misfit(0.01)) < 0.95 * weight(Static(), Misfit(0.01))
+    assert weight(PerRow(), Misfit(0.03, 0.1), 0.4) == pytest.approx(weight(PerRow(), Misfit(0.05)), rel=1e-6)
 
 
-def test_fewer_views_for_so_fine_a_volume_ask_for_less_of_the_prior(rt, scan) -> None:
-    """Half of the views count as noise that is less by 2^0.4; voxels below a pixel change nothing."""
+def test_edges_count_more_the_larger_the_voxels_and_the_more_the_views(scan) -> None:
+    """Voxels below a pixel change nothing."""
     half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
-    assert _noise(half) == pytest.approx(0.5**0.4 * _noise(scan), rel=0.1)
-    coarse, own, fine = (_noise(replace(scan, grid=Grid.cube(n, 2.0), reference=None)) for n in (12, 24, 96))
-    assert coarse == pytest.approx((32 * 0.7 / 12) ** 0.4 * own) and own == fine
+    whole, fewer = misfit_of(scan), misfit_of(half)
+    assert fewer.noise == pytest.approx(0.5**0.2 * whole.noise, rel=0.1)
+    assert fewer.edges_mm == pytest.approx(0.5**0.7 * whole.edges_mm)
+    coarse, own, fine = (misfit_of(replace(scan, grid=Grid.cube(n, 2.0), reference=None)) for n in (12, 24, 96))
+    pixels = 32 * 0.7 / 12  # per voxel of the coarse grid
+    assert coarse.noise == pytest.approx(pixels**0.2 * own.noise)
+    assert coarse.edges_mm == pytest.approx(pixels**1.7 * own.edges_mm) and own == fine
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
@@ -116,9 +125,9 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
         return volume / 2
 
     options = FistaOptions(subsets=1)
-    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), 0.01)
+    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), Misfit(0.01))
     algorithm.step()
-    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5, 12), 0.01)
+    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5, 12), Misfit(0.01))
     plain.step()
     np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
     assert seen == [algorithm.weight / algorithm.curvature]

@@ -21,7 +21,7 @@ from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
-from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, Misfit
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
 from phyradgs_cl.reconstructors.voxels.priors import NoPrior
 from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, spread_order
@@ -249,7 +249,7 @@ def algorithms(rt, system: System) -> dict[str, Callable[[], object]]:
         "os-sart": lambda: Sart(system, replace(OS_SART, frames_per_subset=2), 0),
         "sirt": lambda: Sirt(system, SirtOptions()), "cgls": lambda: Cgls(system),
         "asd-pocs": lambda: AsdPocs(system, free, 0, TvDescent(rt, VOLUME), 0.0),
-        "fista": lambda: Fista(system, FistaOptions(subsets=1), NoPrior(), 0.0),
+        "fista": lambda: Fista(system, FistaOptions(subsets=1), NoPrior(), Misfit(0.0)),
         "fista-tv": lambda: without_tv(rt, system),
     }
 

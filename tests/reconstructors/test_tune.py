@@ -58,7 +58,8 @@ def test_a_bad_weight_is_mended_by_the_scan(rt, scan) -> None:
 
 def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:
     """Of weights the largest, of iterations the fewest whose error is not far above that; of others the least itself."""
-    by_weight = reconstruct(scan, "fista", tune="prior_weight=.05,.2,.4,.8,1.6,6.4", device=rt, subvoxels=1, report=False)
+    weights = "prior_weight=.01,.05,.2,.4,.8,1.6,6.4"
+    by_weight = reconstruct(scan, "fista", tune=weights, device=rt, subvoxels=1, report=False)
     followed = reconstruct(scan, "cgls", tune="iterations", device=rt, **{**SOME, "iterations": 60})
     for found in (by_weight.facts[TUNED], followed.facts[TUNED]):
         values, errors = np.array(found["values"]), np.array(found["holdout_rms"])

@@ -130,8 +130,8 @@ class SplatRun:
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        """The cloud as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
-        cloud = Gaussians.from_rows(self.parameters())
+        """``present_cloud`` as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
+        cloud = self.present_cloud()
         if self.options.pixel_footprint:  # its field is as sharp as it is: voxels average over their volume, too
             cloud = cloud.averaged(self.grid.voxel_size_mm[::-1])
         volume = voxelise(self.rt, cloud.rows(), self.grid, cutoff_sigma=self.options.cutoff_sigma)

@@ -32,10 +32,10 @@ from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iteratio
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import Runtime, Space
 
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
-_SAMPLING = 0.4  # exponent of the views in the weight, measured (docs/results/settings.md)
+_EDGES, _SAMPLING = 0.55, 0.2  # of what voxels miss, and an exponent, measured (docs/results/settings.md)
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time, with the prior `dct`
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
@@ -46,8 +46,8 @@ _MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time 
 class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or a function of one's own or its ``package.module:function``: (volume (nz, ny, nx) in 1/mm,
     noise in 1/mm) to a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the
-    total variation from the difference to it. prior_weight: strength, relative to the frames' noise as it reaches a voxel
-    and to how many views there are for so fine a volume.
+    total variation from the difference to it. prior_weight: strength, relative to what reaches a voxel of the frames' noise
+    and of what voxels so large miss at edges.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
     subsets: of the frames, each with a step of its own; those whose steps pull apart are joined two by two.
@@ -60,7 +60,7 @@ class FistaOptions(IterativeOptions):
     motion: Motion = PerRow()
     iterations: int = 35
     prior: str | Denoiser = "dct"
-    prior_weight: float = 0.85
+    prior_weight: float = 0.6
     subvoxels: int = 0
     prior_share: float = 0.5
     subsets: int = 5
@@ -170,21 +170,34 @@ def _run(
         prior = prior_of(
             options.prior, rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share
         )
-        return Fista(system, options, prior, _noise(scan))
+        return Fista(system, options, prior, misfit_of(scan))
 
     sizes = {"volumes": _VOLUMES + volumes_of(options.prior), "frames": _FRAMES}
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
 
 
+@dataclass(frozen=True)
+class Misfit:
+    """What no volume of the grid explains in a pixel: noise, dimensionless, and ``edges_mm`` times the density there is, for
+    what voxels miss at edges, which views do not average."""
+
+    noise: float
+    edges_mm: float = 0.0
+
+    def rms(self, density_per_mm: float) -> float:
+        """Of both, dimensionless."""
+        return math.hypot(self.noise, self.edges_mm * density_per_mm)
+
+
 class Fista:
     """The residual that is reported is the pass's own: of every subset just before its step.
 
-    The weight of the prior is ``prior_weight`` times the noise of the gradient: that of the frames, back through Aᵀ, which
-    averages it along a blur.
+    The weight of the prior is ``prior_weight`` times the deviation of what the misfit makes of the gradient, back through
+    Aᵀ, which averages it along a blur. It follows the volume's density from pass to pass.
     """
 
-    def __init__(self, system: System, options: FistaOptions, prior: Prior, noise: float) -> None:
-        self.system, self.options, self.prior = system, options, prior
+    def __init__(self, system: System, options: FistaOptions, prior: Prior, misfit: Misfit) -> None:
+        self.system, self.options, self.prior, self.misfit = system, options, prior, misfit
         space = system.space
         self.volume = space.full(system.volume_shape, 0.0)
         self.previous = self.volume
@@ -192,9 +205,15 @@ class Fista:
         self.finished: str | None = None
         # AᵀA has no negative entry: its largest row sum bounds its norm
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
-        largest = space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
-        self.weight = options.prior_weight * max(noise * _gain(system), _FEWEST * largest)
+        self._smallest = _FEWEST * space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
+        self._gain = _gain(system)
         self.subsets = self._subsets(min(options.subsets, system.frames))
+
+    @property
+    def weight(self) -> float:
+        """The prior's, in the unit of the gradient."""
+        noise = self.misfit.rms(_density(self.system.space, self.volume))
+        return max(self.options.prior_weight * noise * self._gain, self._smallest)
 
     def _subsets(self, count: int) -> list[System]:
         return [self.system.subset(range(first, self.system.frames, count)) for first in spread_order(count)]
@@ -203,8 +222,9 @@ class Fista:
         self.volume = self.previous = volume
 
     def step(self) -> float:
-        squares = sum(self._step_of(subset) ** 2 for subset in self.subsets)
-        residual = float(np.sqrt(squares))
+        weight = self.weight
+        squares = self.system.space.sum_squares(self._step_of(subset, weight) for subset in self.subsets)
+        residual = squares**0.5
         pull_apart = residual > _GROWTH * self.least and len(self.subsets) > 1
         if pull_apart:
             self.subsets = self._subsets(-(-len(self.subsets) // 2))
@@ -213,7 +233,8 @@ class Fista:
         self.prior.end_pass(self.system.space, self.volume)
         return residual
 
-    def _step_of(self, subset: System) -> float:
+    def _step_of(self, subset: System, weight: float) -> Any:
+        """The residual of the subset's frames just before its step."""
         system, space = self.system, self.system.space
         following = float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
         beta = (self.momentum - 1) / following
@@ -221,11 +242,11 @@ class Fista:
         residual = subset.residual(point)
         gradient = subset.back(subset.weighed(residual))
         moved = space.add(point, gradient, len(self.subsets) / self.curvature)
-        volume = self.prior(space, moved, self.weight / self.curvature, nonnegative=self.options.nonnegative)
+        volume = self.prior(space, moved, weight / self.curvature, nonnegative=self.options.nonnegative)
         uphill = space.inner(system.less(point, volume), system.less(volume, self.volume)) > 0
         self.previous, self.volume = self.volume, volume
         self.momentum = 1.0 if uphill else following
-        return space.norm(residual)
+        return residual
 
     def state(self) -> dict[str, np.ndarray]:
         numpy = self.system.space.numpy
@@ -244,13 +265,21 @@ class Fista:
         self.prior.restore(state)
 
 
-def _noise(scan: Scan) -> float:
-    """The noise behind the object, dimensionless, times a power of the views per voxel along the volume's side, or per pixel
-    on the axis where those are larger: the fewer there are, the more of what looks like noise is the object's."""
+def misfit_of(scan: Scan) -> Misfit:
+    """Of a scan on its grid. With n the views per voxel along the volume's side, or per pixel on the axis where those are
+    larger: edges grow with √n, as they are missed in every view alike, and both with a small power of n."""
     pixel_mm = min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
-    across = max(scan.grid.size_mm[1:]) / max(pixel_mm, *scan.grid.voxel_size_mm[1:])
-    measured = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
-    return float(measured * (scan.frames / across) ** _SAMPLING)
+    voxel_mm = max(pixel_mm, *scan.grid.voxel_size_mm[1:])
+    views = scan.frames * voxel_mm / max(scan.grid.size_mm[1:])
+    noise = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
+    power = views**_SAMPLING
+    return Misfit(float(power * noise), float(power * _EDGES * voxel_mm * math.sqrt(views)))
+
+
+def _density(space: Space[Any], volume: Any) -> float:
+    """Of what a volume consists of, in 1/mm: Σ x³ / Σ x²."""
+    squares = space.inner(volume, volume)
+    return max(space.inner(space.multiply(volume, volume), volume) / squares, 0.0) if squares > 0 else 0.0
 
 
 def _gain(system: System) -> float:

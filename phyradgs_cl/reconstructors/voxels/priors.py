@@ -137,11 +137,13 @@ class Nonlocal(Prior):
         self.then, self.smooth, self.alike, self.passes = then, smooth, alike, passes
         self._done, self._is_learned = 0, False
         self._guide: np.ndarray | None = None
+        self._h = 0.0  # of the guide's weights; 0: not known yet
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         if self._guide is not None and weight > 0:
             if not self._is_learned:
-                self.smooth.learn(self._guide, self.alike * weight)
+                self._h = self._h or self.alike * weight
+                self.smooth.learn(self._guide, self._h)
                 self._is_learned = True
             volume = space.apply(partial(self.smooth, step=_STEP), volume, self.smooth.shape)
         return self.then(space, volume, weight, nonnegative=nonnegative)
@@ -149,17 +151,17 @@ class Nonlocal(Prior):
     def end_pass(self, space: Space[Any], volume: Any) -> None:
         self._done += 1
         if self._done in (-(-self.passes // 4), -(-self.passes // 2)):
-            self._guide, self._is_learned = space.numpy(volume), False
+            self._guide, self._is_learned, self._h = space.numpy(volume), False, 0.0
 
     def state(self) -> dict[str, np.ndarray]:
         guide = np.zeros(self.smooth.shape, np.float32) if self._guide is None else self._guide
-        return {**self.then.state(), "guide": guide, "passes": np.array(self._done)}
+        return {**self.then.state(), "guide": guide, "h": np.array(self._h), "passes": np.array(self._done)}
 
     def restore(self, state: State) -> None:
         self.then.restore(state)
-        (guide,) = state_arrays(state, ["guide"])
+        guide, h = state_arrays(state, ["guide", "h"])
         self._done = count_of(state, "passes", self.passes)
-        self._guide, self._is_learned = guide if guide.any() else None, False
+        self._guide, self._is_learned, self._h = guide if guide.any() else None, False, float(h)
 
 
 class Piccs(Prior):
