@@ -106,15 +106,20 @@ def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None
 
 
 def test_edges_count_more_the_larger_the_voxels_and_the_more_the_views(scan) -> None:
-    """Voxels below a pixel change nothing."""
+    """Voxels below a pixel change nothing, and a blur averages."""
     half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
-    whole, fewer = misfit_of(scan), misfit_of(half)
+    whole, fewer = (misfit_of(one, Static()) for one in (scan, half))
     assert fewer.noise == pytest.approx(0.5**0.2 * whole.noise, rel=0.1)
     assert fewer.edges_mm == pytest.approx(0.5**0.7 * whole.edges_mm)
-    coarse, own, fine = (misfit_of(replace(scan, grid=Grid.cube(n, 2.0), reference=None)) for n in (12, 24, 96))
+    grids = (replace(scan, grid=Grid.cube(n, 2.0), reference=None) for n in (12, 24, 96))
+    coarse, own, fine = (misfit_of(one, Static()) for one in grids)
     pixels = 32 * 0.7 / 12  # per voxel of the coarse grid
     assert coarse.noise == pytest.approx(pixels**0.2 * own.noise)
     assert coarse.edges_mm == pytest.approx(pixels**1.7 * own.edges_mm) and own == fine
+    smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (4 / 32 * 5 / 7)  # pixels, half-way from the axis to the side
+    blurred = misfit_of(scan, PerRow(5))
+    assert blurred.noise == whole.noise
+    assert blurred.edges_mm == pytest.approx(whole.edges_mm / np.sqrt(1 + smeared), rel=0.01)
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:

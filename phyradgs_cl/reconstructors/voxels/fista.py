@@ -170,7 +170,7 @@ def _run(
         prior = prior_of(
             options.prior, rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share
         )
-        return Fista(system, options, prior, misfit_of(scan))
+        return Fista(system, options, prior, misfit_of(scan, options.motion))
 
     sizes = {"volumes": _VOLUMES + volumes_of(options.prior), "frames": _FRAMES}
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
@@ -265,15 +265,25 @@ class Fista:
         self.prior.restore(state)
 
 
-def misfit_of(scan: Scan) -> Misfit:
+def misfit_of(scan: Scan, motion: Motion) -> Misfit:
     """Of a scan on its grid. With n the views per voxel along the volume's side, or per pixel on the axis where those are
-    larger: edges grow with √n, as they are missed in every view alike, and both with a small power of n."""
+    larger: edges grow with √n, as they are missed in every view alike, and both with a small power of n. A blur averages
+    what it goes over."""
     pixel_mm = min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
     voxel_mm = max(pixel_mm, *scan.grid.voxel_size_mm[1:])
     views = scan.frames * voxel_mm / max(scan.grid.size_mm[1:])
     noise = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
-    power = views**_SAMPLING
-    return Misfit(float(power * noise), float(power * _EDGES * voxel_mm * math.sqrt(views)))
+    edges_mm = _EDGES * voxel_mm * math.sqrt(views / (1 + _blur_mm(scan, motion) / voxel_mm))
+    return Misfit(views**_SAMPLING * noise, views**_SAMPLING * edges_mm)
+
+
+def _blur_mm(scan: Scan, motion: Motion) -> float:
+    """How far a line's exposure smears what lies half-way between the volume's middle and its side."""
+    cells = motion.cells(scan, scan.frames // 2).still()
+    first, stop = cells.line_cells()[cells.lines // 2]
+    sources_mm = cells.pose[first:stop, :3] - scan.grid.offset_mm[::-1]
+    turn_rad = np.linalg.norm(np.ptp(sources_mm, axis=0)) / np.linalg.norm(sources_mm[0])
+    return float(turn_rad * max(scan.grid.size_mm[1:]) / 4)
 
 
 def _density(space: Space[Any], volume: Any) -> float:
