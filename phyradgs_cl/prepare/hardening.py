@@ -32,7 +32,7 @@ BoneIn = Callable[[np.ndarray], np.ndarray]
 """From a volume (z, y, x), the attenuation in each voxel that is bone's."""
 _LARGEST = 1e3
 _PASSES = 3  # of bone from volume from bone
-_TRIED = (0.85, 0.75, 0.65, 0.55, 0.45, 0.35, 0.2)  # of the densest: what is soft ends here
+_TRIED = (0.85, 0.7, 0.55, 0.45, 0.35, 0.2, 0.1)  # of the densest: what is soft ends here
 _TRIED_PASSES = 2  # each beginning with the frames of the one before
 _TRIED_VOXELS = 48  # along the longest side
 _INSIDE = 0.1  # of the densest: the object
