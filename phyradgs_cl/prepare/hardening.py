@@ -31,7 +31,7 @@ Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """From a volume (z, y, x), the attenuation in each voxel that is bone's."""
 _LARGEST = 1e3
-_PASSES = 3  # of bone from volume from bone
+_PASSES = 4  # of bone from volume from bone
 _TRIED = (0.85, 0.7, 0.55, 0.45, 0.35, 0.2, 0.1)  # of the densest: what is soft ends here
 _TRIED_PASSES = 2  # each beginning with the frames of the one before
 _TRIED_VOXELS = 48  # along the longest side
@@ -103,12 +103,12 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
     if not options.bone_per_mm:
         finer = max(1.0, max(scan.grid.shape) / _TRIED_VOXELS)
         coarse = scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / finer)))
-        soft_to, facts["unexplained"] = find_bone(_smooth(frames, (finer - 1) / 2), spectrum, water, make_model(coarse))
-        if soft_to is None:
+        mixed, facts["unexplained"] = find_bone(_smooth(frames, (finer - 1) / 2), spectrum, water, make_model(coarse))
+        if mixed is None:
             log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
             return scan, {**facts, "left_alone": True}
-        bone_in = partial(_beyond, soft_to)
-        facts |= {"soft_to_per_mm": soft_to} if np.isfinite(soft_to) else {}
+        bone_in = partial(_between, *mixed)
+        facts |= dict(zip(("soft_to_per_mm", "bone_from_per_mm"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
     clean, facts["bone_share"] = straighten_two(frames, spectrum, make_model(scan), water, bone_in)
     return replace(scan, projections=clean), facts
 
@@ -131,24 +131,27 @@ def straighten_two(
 
 def find_bone(
     frames: np.ndarray, spectrum: Spectrum, water: Polynomial, model: Model
-) -> tuple[float | None, dict[str, float]]:
-    """The attenuation, 1/mm, up to which all is soft, with which line integrals (F, v, u) explain themselves best: infinity
-    without bone, None where they do best as they are; and the share that either, and the best with bone, leaves
-    unexplained."""
+) -> tuple[tuple[float, float] | None, dict[str, float]]:
+    """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u) explain
+    themselves best: infinity without bone, None where they do best as they are; and the share that either, and the best with
+    bone, leaves unexplained."""
     clean = straighten(frames, water)
     volume = model.volume(clean)
-    densest = _densest(volume)
-    inside = scipy.ndimage.binary_dilation(volume >= _INSIDE * densest)
+    inside = scipy.ndimage.binary_dilation(volume >= _INSIDE * _densest(volume))
     none = _unexplained(frames, model.volume(frames), inside, model)
-    left = {np.inf: _unexplained(clean, volume, inside, model)}
+    alone = _unexplained(clean, volume, inside, model)
+    left: dict[tuple[float, float], float] = {}
     for share in _TRIED:
         for _ in range(_TRIED_PASSES):
-            clean = _with_bone(_beyond(share * densest, volume), frames, spectrum, model)
+            mixed = share * _densest(volume), _densest(volume)
+            clean = _with_bone(_between(*mixed, volume), frames, spectrum, model)
             volume = model.volume(clean)
-        left[share * densest] = _unexplained(clean, volume, inside, model)
+        left[mixed] = _unexplained(clean, volume, inside, model)
     best = min(left, key=left.__getitem__)
-    told = {"as_they_are": none, "water": left[np.inf], "bone": min(value for at, value in left.items() if np.isfinite(at))}
-    return (best if left[best] < none else None), told
+    told = {"as_they_are": none, "water": alone, "bone": left[best]}
+    if none <= min(alone, left[best]):
+        return None, told
+    return (best if left[best] < alone else (np.inf, np.inf)), told
 
 
 def _unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
@@ -219,12 +222,11 @@ def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
     return np.where(volume >= bone_per_mm, volume, 0)
 
 
-def _beyond(soft_to_per_mm: float, volume: np.ndarray) -> np.ndarray:
-    """What is bone where voxels (z, y, x) mix: none of one that attenuates as soft tissue at most, all of the densest."""
-    densest = _densest(volume)
-    if soft_to_per_mm >= densest:
+def _between(soft_to_per_mm: float, bone_from_per_mm: float, volume: np.ndarray) -> np.ndarray:
+    """What is bone where voxels (z, y, x) mix: none of one that attenuates as soft tissue at most, all of one as bone."""
+    if soft_to_per_mm >= bone_from_per_mm:
         return np.zeros_like(volume)
-    mixed = (volume - soft_to_per_mm) * (densest / (densest - soft_to_per_mm))
+    mixed = (volume - soft_to_per_mm) * (bone_from_per_mm / (bone_from_per_mm - soft_to_per_mm))
     return np.clip(mixed, 0, np.maximum(volume, 0))
 
 
