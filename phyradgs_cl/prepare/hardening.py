@@ -37,7 +37,7 @@ _TRIED_PASSES = 2  # each beginning with the frames of the one before
 _TRIED_VOXELS = 48  # along the longest side
 _INSIDE = 0.1  # of the densest: the object
 _SMOOTH = 1 / 24  # of the panel's longer side: hardening is smoother than what a grid cannot hold
-_NEWTON = 8
+_NEWTON = 3  # leave 1e-12
 _UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
 _SHADOW = 0.1  # of the longest path
 _WATER_TO = 8.0  # largest line integral that the voltage's polynomial is fitted to
@@ -132,9 +132,9 @@ def straighten_two(
 def find_bone(
     frames: np.ndarray, spectrum: Spectrum, water: Polynomial, model: Model
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
-    """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u) explain
-    themselves best: infinity without bone, None where they do best as they are; and the share that either, and the best with
-    bone, leaves unexplained."""
+    """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u)
+    explain themselves best: infinity without bone, None where they do best as they are; and the share that either, and the
+    best with bone, leaves unexplained."""
     clean = straighten(frames, water)
     volume = model.volume(clean)
     inside = scipy.ndimage.binary_dilation(volume >= _INSIDE * _densest(volume))
