@@ -99,7 +99,8 @@ class _Trials:
     def __init__(
         self, scan: Scan, method: str, options: Any, rt: Runtime, before: InputOptions | None
     ) -> None:
-        self.scan, self.method, self.options, self.rt, self.before = scan, method, options, rt, before
+        self.scan, self.method, self.options, self.rt = scan, method, options, rt
+        self.before = before and replace(before, tune="")  # which would be runs in each trial
         self.iterations = 0
 
     def run(self, iterations: int | None) -> float:

@@ -69,7 +69,7 @@ def run_settings(
     settings, origins = _collected(config, given, assignments)
     chosen = _run_settings(settings, origins)
     with chosen.naming_origins():
-        method_options(chosen.method, chosen.preset, chosen.changes)
+        method_options(chosen.method, chosen.preset, chosen.changes, chosen.before.tune)
     return chosen
 
 

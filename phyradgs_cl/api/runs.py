@@ -40,6 +40,8 @@ from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import option_facts
+from phyradgs_cl.reconstructors.tune.trials import TUNED
+from phyradgs_cl.reconstructors.tune.wish import is_told, with_chosen
 from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
 
 _IDENTITY = "run"
@@ -184,7 +186,8 @@ def reconstruct(
     ones are dicts (``control={"every": 50}``). preset: where they start from.
     grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
     (docs/methods.md#the-grid). holdout: percent of the pixels that the method does not see; how far the volume is from them
-    stands in the result's facts (docs/methods.md#quality-without-a-truth).
+    stands in the result's facts (docs/methods.md#quality-without-a-truth). tune: "NAME", or "NAME=VALUE,VALUE,VALUE", of an
+    option that trials on this scan choose, and what they found is in the facts (docs/methods.md#weights-from-the-data).
     seed: of what is drawn at random; the same seed on the same device gives the same bits.
     report: a function that is called with every ``Progress``, of voxels each iteration, of splats every 50 and where ten
     seconds went by; True: a line with rate and time left, on a terminal or in a
@@ -205,8 +208,8 @@ def reconstruct(
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
     given = {name: options.pop(name) for name in input_names(method, preset) if name in options}
-    chosen = method_options(method, preset, options)
     before = input_options(given)
+    chosen = method_options(method, preset, options, before.tune)
     on_its_grid = scan.with_grid(before)
     more: dict[str, Any] = {}
     if initial is not None:
@@ -284,7 +287,7 @@ def _identity(scan: Scan, before: object, seed: int, initial: np.ndarray | None 
     """What a run that goes on has in common with the one that was interrupted, besides its method: of arrays SHA-256."""
     frames = _sha256(scan.projections, np.packbits(scan.valid))
     start = None if initial is None else _sha256(initial.astype(np.float32))  # as files have it
-    return {"scan": frames, "seed": seed, "steps or other input options": before, "initial": start}
+    return {"scan": frames, "seed": seed, "input (steps, holdout, tune)": before, "initial": start}
 
 
 def _sha256(*arrays: np.ndarray) -> str:
@@ -305,6 +308,9 @@ def _state_of(
         raise InputError(
             "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
         )
+    tuned: Any = partial.facts.get(TUNED)
+    if is_told(tuned) and hasattr(options, tuned["option"]):
+        options = with_chosen(options, tuned)
     then, now = (
         json.dumps(facts, sort_keys=True, default=repr) for facts in (partial.facts.get("options"), option_facts(options))
     )

@@ -11,7 +11,7 @@ from phyradgs_cl.workflow import load_scan
 EXAMPLE = "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row"
 
 
-@with_run_options("seed")
+@with_run_options("seed", "tune")
 def estimate_command(scan: Scan, request: RunRequest) -> None:
     """Say how long a reconstruction would take and how much memory, from a few iterations of it."""
     settings = request.settings()

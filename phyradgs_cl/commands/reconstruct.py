@@ -16,6 +16,7 @@ from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import profile_report, run_reconstruction
@@ -68,6 +69,8 @@ def reconstruct_command(
     written = output if result.state is None else partial_path(output)
     how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s"
     say(f"{written}: {how}{scores(metrics)}")
+    if TUNED in result.facts:
+        say(tuned_words(result.facts[TUNED]))
     if profile:
         say(profile_report(runtimes[-1], result))
     if result.state is not None:

@@ -37,6 +37,10 @@ _SET = (
     "Any option of the method by name, as in the file: --set tv_weight=0.002 --set order=random. "
     "Docs: methods.md."
 )
+_TUNE = (
+    "Option of the method that the scan chooses, by the error on pixels that trials do not see: tv_weight, "
+    "prior_weight=0.4,0.8,1.6, iterations. Docs: methods.md."
+)
 _RANKS = "Under mpiexec (docs: cluster.md)"  # a panel of its own at the end of a command's help
 
 
@@ -84,6 +88,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "holdout": _asked(
         float, "Pixels that the method does not see, to say how far its volume is from them.", "0", metavar="PERCENT"
     ),
+    "tune": _asked(str, _TUNE, "none", metavar="NAME[=VALUES]"),
     "median_filter": _asked(int, "Median filter of the frames: 3 or 5 pixels per side, 0 none.", "0"),
     "device": options.Device,
     "memory": options.Memory,

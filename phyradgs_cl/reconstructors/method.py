@@ -30,8 +30,8 @@ _FORM = "a function (scan, options, rt, …)"
 @dataclass(frozen=True)
 class Method:
     """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed, can
-    several ranks share its work, may it start from a volume, and whether it may end before its last iteration with some
-    options.
+    several ranks share its work, may it start from a volume, are short runs the beginnings of longer ones, may it end before
+    its last iteration with some options.
     """
 
     run: Callable[..., Reconstruction]
@@ -39,6 +39,7 @@ class Method:
     is_resumable: bool = True
     is_shared: bool = False
     takes_initial: bool = False
+    ends_anywhere: bool = False
     stops_itself: Callable[[Any], bool] = lambda options: False
 
 

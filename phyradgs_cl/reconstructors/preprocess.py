@@ -16,44 +16,54 @@ from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts
+from phyradgs_cl.reconstructors.tune.wish import wish_of
 from phyradgs_cl.runtime import Runtime
 
 MEDIAN_EDGES = (0, 3, 5)
 MOST_HELD = 50.0
+_HIDING = ("holdout", "tune")
 
 
 @dataclass(frozen=True)
 class InputOptions(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
     median_filter: edge of its window in pixels, 0 for none. holdout: percent of the pixels that no method sees
-    (``holdout.py``). steps and a table each: as of ``PrepareOptions``.
+    (``holdout.py``). tune: the option of the method that such pixels choose (``tune/``). steps and a table each: as of
+    ``PrepareOptions``.
     """
 
     ignore_lag: bool = False
     median_filter: int = 0
     holdout: float = 0.0
+    tune: str = ""
 
     def __post_init__(self) -> None:
         GridChoice.__post_init__(self)
         PrepareOptions.__post_init__(self)
         checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
         checks.within("holdout", self.holdout, 0, MOST_HELD)
-        if self.holdout and self.median_filter:
+        if self.tune:
+            wish_of(self.tune)
+        if self._hiding and self.median_filter:
             found = "a median filter, which mixes held-out pixels into their neighbours"
-            raise InputError("--holdout", found, "frames as they are", "leave one of the two out")
+            raise InputError(f"--{self._hiding[0]}", found, "frames as they are", "leave one of the two out")
+
+    @property
+    def _hiding(self) -> list[str]:
+        """What keeps pixels from a method."""
+        return [name for name in _HIDING if getattr(self, name)]
 
     def facts(self) -> dict[str, object]:
         """What is chosen, by name."""
         plain = {name: value for name, value in asdict(self).items() if name not in STEP_FIELDS and value is not None}
-        if not self.holdout:
-            del plain["holdout"]
-        return {**plain, **self.step_facts()}
+        left_out = set(_HIDING) - set(self._hiding)
+        return {**{name: value for name, value in plain.items() if name not in left_out}, **self.step_facts()}
 
     def check_written(self) -> None:
         """InputError for what makes no sense in a scan that is kept."""
-        if self.holdout:
-            remedy = "give it to the reconstruction, whose error it measures"
-            raise InputError("--holdout", f"{self.holdout:g} %, without a method", "0 where a scan is prepared", remedy)
+        for name in self._hiding:
+            found, remedy = f"{getattr(self, name)}, without a method", "give it to the reconstruction"
+            raise InputError(f"--{name}", found, "none where a scan is prepared", remedy)
 
 
 def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Scan:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -26,6 +27,8 @@ from phyradgs_cl.reconstructors.result import (
     function_name,
     ignore_progress,
 )
+from phyradgs_cl.reconstructors.tune.trials import tuned
+from phyradgs_cl.reconstructors.tune.wish import check_wish
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import near_miss
 
@@ -110,11 +113,13 @@ def usual_preset(method: object) -> str:
     return next(iter(method_of(method).presets))
 
 
-def method_options(method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
+def method_options(
+    method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None, tune: str = ""
+) -> Any:
     """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
-    may be a model of one's own.
+    may be a model of one's own. ``tune``: which option the scan will choose.
     Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
     """
     name, presets = method_name(method), method_of(method).presets
@@ -129,7 +134,10 @@ def method_options(method: object, preset: str | None = None, changes: Mapping[s
         motion = changes.pop("motion", None)
         counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
         base = replace(base, motion=_motion(name, base, motion, counts))
-    return _changed(base, changes, f"--method {name}")
+    options = _changed(base, changes, f"--method {name}")
+    if tune:
+        check_wish(tune, name, options, changes, method_of(method).ends_anywhere)
+    return options
 
 
 def reconstruct(
@@ -149,10 +157,10 @@ def reconstruct(
     ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing. ``initial``: a volume
     in 1/mm and its grid, from which a method starts that can; it is resampled onto the scan's.
     """
-    chosen = method_options(method) if options is None else options
+    asked = InputOptions() if before is None else before
+    chosen = method_options(method, tune=asked.tune) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method_name(method), rt)
-    asked = InputOptions() if before is None else before
     ready = prepared(scan, asked, rt)
     ready.check_sight()
     check_own_motion(getattr(chosen, "motion", None), ready)
@@ -160,7 +168,11 @@ def reconstruct(
         extra["initial"] = _initial(method, *initial, ready.grid)
     held = held_out(ready, asked.holdout) if asked.holdout else None
     seen = ready if held is None else with_masked(ready, held)
-    result = method_of(method).run(seen, chosen, rt, seed=seed, report=report, **extra)
+    run = partial(method_of(method).run, rt=rt, seed=seed)
+    if asked.tune:
+        result = tuned(asked.tune, run, seen, chosen, rt, report, **extra)
+    else:
+        result = run(seen, chosen, report=report, **extra)
     if held is not None and rt.ranks.rank == 0:
         result.facts[HELD_OUT] = holdout_errors(rt, ready, held, result)
     if TOLD in ready.provenance:

@@ -63,6 +63,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         "slices": sections.slices_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
+        "tuning": sections.tuning_section(run),
         **of_scan,
         "provenance": sections.provenance_section(run),
     }

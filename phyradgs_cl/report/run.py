@@ -17,6 +17,8 @@ from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.reconstructors.tune.trials import TUNED
+from phyradgs_cl.reconstructors.tune.wish import is_told
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
@@ -60,6 +62,13 @@ class Run:
         """The convergence record: finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if NUMBER.fits(v)} for line in lines]
+
+
+    @property
+    def tuned(self) -> Mapping[str, Any] | None:
+        """How an option was chosen from the scan, where the provenance says it in numbers."""
+        found: Any = self.stored.provenance.get(TUNED)
+        return found if is_told(found) else None
 
 
 def input_of(stored: StoredVolume) -> InputOptions:

@@ -8,7 +8,7 @@ from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerR
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.frame_pairs import TIMES_PER_LINE, FramePair
-from phyradgs_cl.report.charts.curve import convergence_charts, histogram
+from phyradgs_cl.report.charts.curve import convergence_charts, histogram, tuning_chart
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
@@ -72,6 +72,11 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
 def convergence_section(run: Run) -> Markup | None:
     charts = convergence_charts(run.record)
     return _section("convergence", "Convergence", _charts(charts)) if charts else None
+
+
+def tuning_section(run: Run) -> Markup | None:
+    """What an option was chosen by."""
+    return _section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
 
 
 def scan_section(run: Run) -> Markup:

@@ -127,7 +127,7 @@ def run_reconstruction(
     have too, rank 0 alone writes and has metrics. Raises OutputError while another run is at work on the output.
     """
     leads = ranks is None or ranks.rank == 0
-    options = method_options(job.method, job.preset, job.changes)
+    options = method_options(job.method, job.preset, job.changes, job.before.tune)
     if leads:
         _refuse_foreign_suffix(job.output)
         check_writable(job.output)

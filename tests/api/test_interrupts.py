@@ -113,7 +113,7 @@ def test_another_run_is_not_gone_on_with(rt, scan) -> None:
         (replace(scan, projections=scan.projections[::-1]), {}, "another scan"),
         (replace(scan, pixel_mask=mask), {}, "another scan"),
         (scan, {"seed": 1}, "another seed"),
-        (scan, {"median_filter": 3}, "another steps or other input options"),
+        (scan, {"median_filter": 3}, "another input"),
         (scan, {"initial": partial}, "another initial"),
         (scan, {"grid": wider}, "a volume on Grid"),
     ]:

@@ -43,14 +43,14 @@ def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> Non
     without = found.pop("none")
     assert min(found.values()) > without + 0.5, (found, without)
     few, whole = (
-        run(rt, scan, "fista", iterations=3, frames_per_subset=size).record[-1]["residual"] for size in (5, 0)
+        run(rt, scan, "fista", iterations=3, subsets=count).record[-1]["residual"] for count in (4, 1)
     )
     assert few < 0.8 * whole
 
 
 def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
-    options = FistaOptions(frames_per_subset=1)
+    options = FistaOptions(subsets=1000)
     prior = prior_of("tv", rt, scan.grid, 5, 12)
     algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, 0.01)
     assert len(algorithm.subsets) == scan.frames
@@ -115,7 +115,7 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
         seen.append(noise)
         return volume / 2
 
-    options = FistaOptions(frames_per_subset=0)
+    options = FistaOptions(subsets=1)
     algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), 0.01)
     algorithm.step()
     plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5, 12), 0.01)
@@ -191,7 +191,7 @@ def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
     (tmp_path / "own_priors.py").write_text(own)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert not run(rt, scan, "fista", prior="own_priors:nothing", iterations=2).volume.any()
-    with pytest.raises(InputError, match="prior: found own_priors:nobody"):
+    with pytest.raises(InputError, match="--prior: found own_priors:nobody"):
         run(rt, scan, "fista", prior="own_priors:nobody", iterations=2)
-    with pytest.raises(InputError, match="prior: found shape"):
+    with pytest.raises(InputError, match="--prior own_priors:<lambda>: found shape"):
         run(rt, scan, "fista", prior="own_priors:less", iterations=2)

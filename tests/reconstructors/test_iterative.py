@@ -249,7 +249,7 @@ def algorithms(rt, system: System) -> dict[str, Callable[[], object]]:
         "os-sart": lambda: Sart(system, replace(OS_SART, frames_per_subset=2), 0),
         "sirt": lambda: Sirt(system, SirtOptions()), "cgls": lambda: Cgls(system),
         "asd-pocs": lambda: AsdPocs(system, free, 0, TvDescent(rt, VOLUME), 0.0),
-        "fista": lambda: Fista(system, FistaOptions(frames_per_subset=0), NoPrior(), 0.0),
+        "fista": lambda: Fista(system, FistaOptions(subsets=1), NoPrior(), 0.0),
         "fista-tv": lambda: without_tv(rt, system),
     }
 

@@ -18,7 +18,7 @@ from phyradgs_cl.runtime.layout import GUARD, pitch_of
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista", "fista-tv")
-MOST_BYTES, MOST_WAITS = 1024, 8  # over the bus in an iteration, however many subsets it has
+MOST_BYTES, MOST_WAITS = 1024, 8  # over the bus in an iteration; of fista with three subsets
 MODELS = ("log", "intensity")
 GRID = Grid.cube(20, 2.0)
 
@@ -42,7 +42,7 @@ def options_of(method: str, model: str, iterations: int = 4):
     if method == "cgls":
         changes["noise_stop"] = 0
     if method == "fista":  # one grid: between two the volume comes to the host, once
-        changes["subvoxels"] = 1
+        changes |= {"subvoxels": 1, "subsets": 3}
     return method_options(method, None, changes)
 
 

@@ -9,7 +9,7 @@ import pytest
 from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.report.charts.axes import Axes, decades, ticks
-from phyradgs_cl.report.charts.curve import convergence_charts
+from phyradgs_cl.report.charts.curve import convergence_charts, tuning_chart
 from phyradgs_cl.report.charts.geometry import orbit_drawing, panel_corners, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing
 
@@ -95,6 +95,17 @@ def test_a_record_becomes_a_chart_for_each_quantity_that_changes() -> None:
     (curve,) = shapes(chart[1], "polyline", "curve")
     assert len(curve) < 700 and np.all(np.diff(curve[:, 0]) >= 0)
     assert not convergence_charts([]) and not convergence_charts([{"loss": 1.0}])
+
+
+def test_what_was_tuned_is_drawn_with_the_choice_on_the_curve() -> None:
+    found = {"option": "tv_weight", "chosen": 0.002, "values": [0.001, 0.004, 0.016], "holdout_rms": [3.0, 2.0, 4.0]}
+    caption, drawing = tuning_chart(found)
+    assert "tv_weight: 0.002" in caption and "nan" not in drawing
+    (curve,), marks = shapes(drawing, "polyline", "curve"), dots(drawing, "mark")
+    assert curve[1, 0] == pytest.approx(curve[[0, 2], 0].mean(), abs=0.1)  # values by their ratio
+    assert np.allclose(marks[-1], curve[:2].mean(axis=0), atol=0.1) and len(marks) == 4
+    by_number = tuning_chart({**found, "chosen": 0.004, "values": [0.0, 0.004, 0.016]})[1]
+    assert "nan" not in by_number and shapes(by_number, "polyline", "curve")[0][1, 0] < curve[1, 0]
 
 
 def test_ticks_are_round_and_inside() -> None:

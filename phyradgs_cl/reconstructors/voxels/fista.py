@@ -50,8 +50,8 @@ class FistaOptions(IterativeOptions):
     and to how many views there are for so fine a volume.
 
     subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
-    frames_per_subset: 0 takes all frames at once. Subsets whose steps pull apart are joined two by two. tv_iterations: dual
-    iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
+    subsets: of the frames, each with a step of its own; those whose steps pull apart are joined two by two.
+    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
     """
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -63,7 +63,7 @@ class FistaOptions(IterativeOptions):
     prior_weight: float = 0.85
     subvoxels: int = 0
     prior_share: float = 0.5
-    frames_per_subset: int = 5
+    subsets: int = 5
     tv_iterations: int = 5
     transmission_weights: bool = False  # type: ignore[misc]
 
@@ -74,7 +74,7 @@ class FistaOptions(IterativeOptions):
         checks.within("subvoxels", self.subvoxels, 0, 8)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)
         checks.within("prior_share", self.prior_share, 0, 1)
-        checks.within("frames_per_subset", self.frames_per_subset, 0, 1_000_000)
+        checks.within("subsets", self.subsets, 1, 1_000_000)
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
@@ -194,8 +194,7 @@ class Fista:
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         largest = space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
         self.weight = options.prior_weight * max(noise * _gain(system), _FEWEST * largest)
-        size = options.frames_per_subset or system.frames
-        self.subsets = self._subsets(max(1, round(system.frames / size)))
+        self.subsets = self._subsets(min(options.subsets, system.frames))
 
     def _subsets(self, count: int) -> list[System]:
         return [self.system.subset(range(first, self.system.frames, count)) for first in spread_order(count)]

@@ -1,5 +1,6 @@
 """Priors of volumes by name, as proximal maps that start from where the last one ended."""
 
+import traceback
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from phyradgs_cl.objective import DctProx, NonlocalStep, TvProx
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.reconstructors.checkpoint import count_of
 from phyradgs_cl.reconstructors.method import imported
-from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.reconstructors.result import State, function_name, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
 
 _ALIKE = {"nonlocal": 300.0, "nonlocal+dct": 100.0}  # h of the nonlocal weights over the weight
@@ -57,9 +58,9 @@ def prior_of(
     """A prior by its name in ``PRIORS``, or one's own, itself or by ``package.module:function``, for a run of so many
     ``passes``; of piccs the prior image (nz, ny, nx) in 1/mm, and its share. InputError: without one, or no function."""
     if callable(prior) or ":" in prior:
-        own = prior if callable(prior) else imported(prior, "prior")
+        own = prior if callable(prior) else imported(prior, "--prior")
         if not callable(own):
-            raise InputError("prior", checks.shown(own), "a function (volume, noise)")
+            raise InputError("--prior", checks.shown(own), "a function (volume, noise)")
         return OwnPrior(own)
     if prior == "none":
         return NoPrior()
@@ -195,10 +196,15 @@ class OwnPrior(Prior):
     """A user's denoiser on the host, in the place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
 
     def __init__(self, denoiser: Denoiser) -> None:
-        self.denoiser = denoiser
+        self.denoiser, self.culprit = denoiser, f"--prior {function_name(denoiser)}"
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         before = space.numpy(volume)
-        cleaned = np.asarray(self.denoiser(before, weight), np.float32)
-        checks.shape("prior", cleaned, before.shape)
+        try:
+            made = self.denoiser(before, weight)
+        except Exception as error:  # whatever somebody's function does
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            found = f"{type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
+            raise InputError(self.culprit, found, "a function of (volume, noise) that returns a volume") from error
+        cleaned = checks.numbers(self.culprit, made, before.shape).astype(np.float32)
         return space.array(np.maximum(cleaned, 0) if nonnegative else cleaned)

@@ -172,7 +172,7 @@ def voxel_method(
         )  # fmt: skip
 
     presets, stops = {"default": default}, lambda options: options.noise_stop > 0
-    return Method(run, presets, is_shared=True, takes_initial=True, stops_itself=stops)
+    return Method(run, presets, is_shared=True, takes_initial=True, ends_anywhere=True, stops_itself=stops)
 
 
 class _Iterations:

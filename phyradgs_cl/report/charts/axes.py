@@ -15,18 +15,16 @@ Points = Iterable[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Axes:
-    """A chart area from ``x`` (first, last) and ``y`` (lowest, highest) of the data; ``log``: y in powers of ten."""
+    """A chart area from ``x`` (first, last) and ``y`` (lowest, highest) of the data; ``log``, ``log_x``: logarithmic."""
 
     x: tuple[float, float]
     y: tuple[float, float]
     log: bool = False
+    log_x: bool = False
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Picture coordinates of a point."""
-        low, high = (np.log10(self.y) if self.log else np.array(self.y)).tolist()
-        value = float(np.log10(y)) if self.log else y
-        across = (x - self.x[0]) / ((self.x[1] - self.x[0]) or 1.0)
-        up = (value - low) / ((high - low) or 1.0)
+        across, up = _share(x, self.x, self.log_x), _share(y, self.y, self.log)
         return LEFT + across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - TOP - BOTTOM)
 
     def points(self, points: Points) -> str:
@@ -51,7 +49,7 @@ class Axes:
 
     def frame(self, x_label: str, y_label: str) -> Markup:
         """Axes with ticks, light lines across, and labels."""
-        x_ticks = ticks(*self.x)
+        x_ticks = decades(*self.x) if self.log_x else ticks(*self.x)
         y_ticks = decades(*self.y) if self.log else ticks(*self.y)
         return joined(
             *(self._x_tick(t) for t in x_ticks),
@@ -67,6 +65,12 @@ class Axes:
     def _y_tick(self, at: float) -> Markup:
         line = self.polyline([(self.x[0], at), (self.x[1], at)], "grid")
         return joined(line, self.text(self.x[0], at, number(at), shift=(-7, 4), class_="tick end"))
+
+
+def _share(value: float, ends: tuple[float, float], log: bool) -> float:
+    """How far ``value`` is from the first of two ends to the other."""
+    low, high, at = np.log10([*ends, value]).tolist() if log else (*ends, value)
+    return float((at - low) / ((high - low) or 1.0))
 
 
 def text(x: float, y: float, words: str, *, class_: str = "", turned: bool = False) -> Markup:

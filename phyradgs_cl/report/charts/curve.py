@@ -1,6 +1,7 @@
 """How a run converged: a chart for each quantity of its record that changed."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,24 @@ def convergence_charts(record: Record) -> list[tuple[str, Markup]]:
         if len(points) > 1 and max(values) > min(values):
             charts.append((_caption(name, points), _chart(name, points)))
     return charts[:MOST_CHARTS]
+
+
+def tuning_chart(tuned: Mapping[str, Any]) -> tuple[str, Markup]:
+    """(caption, drawing) of the error on held-out pixels over the values of an option that were tried, and of the choice."""
+    name, chosen, values, errors = (tuned[key] for key in ("option", "chosen", "values", "holdout_rms"))
+    axes = Axes((values[0], values[-1]), (min(errors), max(errors)), log_x=values[0] > 0)
+    along = np.log(values) if axes.log_x else values
+    at = float(np.interp(np.log(chosen) if axes.log_x else chosen, along, errors))
+    drawn = joined(
+        axes.frame(name, "held-out RMS"),
+        axes.polyline(zip(values, errors, strict=True), "curve"),
+        *(axes.dot(value, error, "mark") for value, error in zip(values, errors, strict=True)),
+        axes.polyline([(chosen, axes.y[0]), (chosen, at)], "pose"),
+        axes.dot(chosen, at, "mark", 4.5),
+        axes.text(chosen, at, number(chosen), shift=(0, -10), class_="strong"),
+    )
+    caption = f"{name}: {number(chosen)}, chosen by line integrals that the trials of the method did not see."
+    return caption, svg(drawn, f"Error over {name}", caption)
 
 
 def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:

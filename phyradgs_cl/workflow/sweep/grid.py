@@ -49,7 +49,7 @@ class Setting:
 
     def options(self) -> Any:
         """The method's options, checked."""
-        return method_options(self.method, self.preset, self.changes)
+        return method_options(self.method, self.preset, self.changes, str(self.before.get("tune", "")))
 
     @property
     def label(self) -> str:
@@ -197,7 +197,7 @@ def _checked(values: dict[str, Any]) -> Setting:
         if name in changes:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
     before = {name: changes.pop(name) for name in input_names(method, preset) if name in changes}
-    input_options(before)
+    tune = input_options(before).tune
     nested = _nested(iter(changes.items()))
-    method_options(method, preset, nested)
+    method_options(method, preset, nested, tune)
     return Setting(method, usual_preset(method) if preset is None else preset, nested, before)
