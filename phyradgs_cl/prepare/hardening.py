@@ -57,12 +57,12 @@ class HardeningOptions:
     anode_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        checks.fields_within("hardening.", self, {"polynomial": (-_LARGEST, _LARGEST)})
+        beside_kvp = {"bone_per_mm": (0, _LARGEST), "filter_mm": (0, 50), "anode_deg": (0, 45)}
+        checks.fields_within("hardening.", self, {"polynomial": (-_LARGEST, _LARGEST), **beside_kvp})
         if self.kvp != 0:
             checks.within("hardening.kvp", self.kvp, LOWEST_KVP, HIGHEST_KVP)
-        checks.fields_within("hardening.", self, {"bone_per_mm": (0, _LARGEST), "filter_mm": (0, 50), "anode_deg": (0, 45)})
-        for name, usual in (("bone_per_mm", 0), ("filter_mm", FILTER_MM), ("anode_deg", 0)):
-            if getattr(self, name) != usual and not self.kvp:
+        for name in beside_kvp:
+            if getattr(self, name) != getattr(type(self), name) and not self.kvp:
                 raise InputError(f"hardening.{name}", "given without hardening.kvp", "both, or neither", "state the voltage")
         if self.kvp and any(self.polynomial):
             raise InputError("hardening.kvp", "given with hardening.polynomial", "one of the two", "leave one out")
