@@ -105,17 +105,29 @@ def lines(rt: Runtime, phantom: str, usual: dict[str, Any], left: dict[str, list
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """Markdown, effects and methods in the order in which they stand above."""
-    order = list(dict.fromkeys(line["phantom"] for line in found)), list(EFFECTS), list(METHODS)
-    text = ["| effect | volume | method | clean | clean, step | with it | corrected | regained |", "| --- " * 8 + "|"]
-    names = ("phantom", "effect", "method")
-    for line in sorted(found, key=lambda line: [of.index(line[key]) for of, key in zip(order, names, strict=True)]):
-        stages = [f"{line[key]:.2f}" for key in ("clean", "clean_prepared", "spoilt", "prepared")]
-        if EFFECTS[line["effect"]].told:
-            stages[1] = "told"
-        share = f"{100 * line['regained']:.0f} %".replace("-", "−") if line["clean"] - line["spoilt"] > LOST_DB else ""
-        text.append(f"| {' | '.join([line['effect'], line['phantom'], line['method'], *stages, share])} |")
+    """Markdown: a row per volume and effect, a column per method, and what the step costs a clean scan at worst."""
+    methods = [method for method in METHODS if any(line["method"] == method for line in found)]
+    by_place = {(line["phantom"], line["effect"], line["method"]): line for line in found}
+    head = ["effect", "volume", *(f"{method}: clean, with it, corrected" for method in methods), "clean, step"]
+    text = [f"| {' | '.join(head)} |", "| --- " * len(head) + "|"]
+    for phantom in dict.fromkeys(line["phantom"] for line in found):
+        for name, effect in EFFECTS.items():
+            of = [by_place.get((phantom, name, method)) for method in methods]
+            if not any(of):
+                continue
+            costs = min(line["clean_prepared"] - line["clean"] for line in of if line)
+            last = "told" if effect.told else f"{costs:+.2f}".replace("-", "−")
+            text.append(f"| {' | '.join([name, phantom, *map(_cell, of), last])} |")
     return "\n".join(text)
+
+
+def _cell(line: dict[str, Any] | None) -> str:
+    """PSNR, dB, clean, with the effect and corrected; and the share of the loss that is regained."""
+    if line is None:
+        return ""
+    stages = ", ".join(f"{line[key]:.2f}" for key in ("clean", "spoilt", "prepared"))
+    share = f" ({100 * line['regained']:.0f} %)" if line["clean"] - line["spoilt"] > LOST_DB else ""
+    return (stages + share).replace("-", "−")
 
 
 def main() -> None:
