@@ -67,6 +67,9 @@ EFFECTS = {
     ),
     "120 kVp, bone": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
     "a third cut off": Effect({"truncation": 0.6}, "surroundings", part=0.375),  # of the width; all of it is seen
+    "a third cut off, fine": Effect(
+        {"truncation": 0.6}, "surroundings", {"surroundings": {"coarser": 1.0}}, part=0.375
+    ),
     "all": Effect(
         {"sparks": 1e-4, "rings": 0.01, "drift": 0.02, "scatter": 0.3, "kvp": 120.0},
         "sparks,scatter,air,hardening,rings",
@@ -116,7 +119,7 @@ def table(found: list[dict[str, Any]]) -> str:
             if not any(of):
                 continue
             costs = min(line["clean_prepared"] - line["clean"] for line in of if line)
-            last = "told" if effect.told else f"{costs:+.2f}".replace("-", "−")
+            last = "told" if effect.told else f"{round(costs, 2) + 0:+.2f}".replace("-", "−")
             text.append(f"| {' | '.join([name, phantom, *map(_cell, of), last])} |")
     return "\n".join(text)
 
