@@ -109,11 +109,11 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
             return scan, {**facts, "left_alone": True}
         bone_in = partial(_between, *mixed)
         facts |= dict(zip(("soft_to_per_mm", "bone_from_per_mm"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
-    clean, facts["bone_share"] = straighten_two(frames, spectrum, make_model(scan), water, bone_in)
+    clean, facts["bone_share"] = _straighten_two(frames, spectrum, make_model(scan), water, bone_in)
     return replace(scan, projections=clean), facts
 
 
-def straighten_two(
+def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the volume's attenuation; those of
