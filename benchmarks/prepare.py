@@ -1,33 +1,56 @@
 """What each effect of a real scan costs, and what its step of ``prepare`` gives back: PSNR without it, with it, corrected.
 
-    python benchmarks/prepare.py --size 48 --views 60 --output docs/results/prepare.jsonl
+    python benchmarks/prepare.py docs/results/prepare.jsonl --size 32
+    python benchmarks/prepare.py docs/results/prepare.jsonl --table
 
 A line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on a scan without the effect), ``spoilt`` and
-``prepared``, dB. docs/prepare.md has the table, and the figure that --figure docs/images/prepare.png draws.
+``prepared``, dB. Lines that are there are not made again. docs/prepare.md has the tables, and the figure that
+--figure docs/images/prepare.png draws.
 """
 
 import argparse
 import json
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scans import append, lines_of, read_lines
+
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.api import compare, prepare, reconstruct, simulate
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare import water_polynomial
 from phyradgs_cl.runtime import Runtime
 
 PEAK = 3.0  # of the line integrals: a head's
-METHODS: dict[str, dict[str, Any]] = {"fdk": {"motion": "per-row"}, "fista-tv": {"motion": "per-row", "iterations": 30}}
+METHODS: dict[str, dict[str, Any]] = {
+    "fdk": {"motion": "per-row"},
+    "fista-tv": {"motion": "per-row", "iterations": 30},
+    "phyradgs": {"motion": "exact", "iterations": 800},
+}
+LOST_DB = 0.1  # less is not worth a share of it
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What is planted, the steps that undo it, and their options."""
+    """What is planted, the steps that undo it, and their options. told: the steps believe in the effect. part: of the
+    grid's sides about the middle, reconstructed and compared."""
 
     planted: dict[str, float]
     steps: str
     options: dict[str, Any] = field(default_factory=dict)
+    told: bool = False
+    part: float = 1.0
+
+    def grid(self, whole: Grid) -> Grid:
+        shape = [max(1, round(self.part * n)) for n in whole.shape]
+        return whole.part([(n - m) // 2 for n, m in zip(whole.shape, shape, strict=True)], shape)
+
+    def undone(self, scan: Scan, rt: Runtime) -> Scan:
+        return prepare(scan, self.steps, device=rt, **self.options)
 
 
 EFFECTS = {
@@ -38,9 +61,15 @@ EFFECTS = {
     "rings 5 %, fitted": Effect({"rings": 0.05}, "rings", {"rings": {"method": "fitted"}}),
     "drift 2 %": Effect({"drift": 0.02}, "air"),
     "scatter 0.3, fitted": Effect({"scatter": 0.3}, "scatter"),
-    "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}),
-    "120 kVp, water": Effect({"kvp": 120.0}, "hardening", {"hardening": {"polynomial": water_polynomial(120.0)}}),
+    "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}, told=True),
+    "120 kVp, water": Effect(
+        {"kvp": 120.0}, "hardening", {"hardening": {"polynomial": water_polynomial(120.0)}}, told=True
+    ),
     "120 kVp, bone": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
+    "a third cut off": Effect({"truncation": 0.6}, "surroundings", part=0.375),  # of the width; all of it is seen
+    "a third cut off, fine": Effect(
+        {"truncation": 0.6}, "surroundings", {"surroundings": {"coarser": 1.0}}, part=0.375
+    ),
     "all": Effect(
         {"sparks": 1e-4, "rings": 0.01, "drift": 0.02, "scatter": 0.3, "kvp": 120.0},
         "sparks,scatter,air,hardening,rings",
@@ -49,15 +78,64 @@ EFFECTS = {
 }
 
 
-def scores(rt: Runtime, scan: Scan, method: str, effect: Effect | None = None) -> float:
-    """PSNR, dB, of a method on a scan, after an effect's steps."""
-    before = {} if effect is None else {"steps": effect.steps, **effect.options}
-    result = reconstruct(scan, method, device=rt, **METHODS[method], **before)
-    return float(compare(result.volume, scan.reference)["psnr_db"])
+def volume_of(rt: Runtime, scan: Scan, method: str) -> np.ndarray:
+    return reconstruct(scan, method, device=rt, report=False, **METHODS[method]).volume
+
+
+def psnr_db(volume: np.ndarray, scan: Scan) -> float:
+    return float(compare(volume, scan.reference)["psnr_db"])
+
+
+def lines(rt: Runtime, phantom: str, usual: dict[str, Any], left: dict[str, list[str]]) -> Iterator[dict[str, Any]]:
+    """The lines of a phantom that are ``left``: an effect's methods."""
+    if not left:
+        return
+    clean = simulate(phantom, **usual)
+    clean_volume = cache(lambda method: volume_of(rt, clean, method))
+    for name, methods in left.items():
+        effect = EFFECTS[name]
+        grid = effect.grid(clean.grid)
+        part, spoilt = (scan.on_grid(grid) for scan in (clean, simulate(phantom, **usual, **effect.planted)))
+        clean_prepared, prepared = (effect.undone(scan, rt) for scan in (part, spoilt))
+        for method in methods:
+            whole = replace(clean, reference=clean_volume(method))
+            found = {"clean": psnr_db(whole.on_grid(grid).reference, part)}
+            for stage, scan in (("clean_prepared", clean_prepared), ("spoilt", spoilt), ("prepared", prepared)):
+                found[stage] = psnr_db(volume_of(rt, scan, method), scan)
+            found["regained"] = (found["prepared"] - found["spoilt"]) / max(found["clean"] - found["spoilt"], 1e-2)
+            rounded = {key: round(value, 3) for key, value in found.items()}
+            yield {"effect": name, "phantom": Path(phantom).stem, "method": method, **rounded}
+
+
+def table(found: list[dict[str, Any]]) -> str:
+    """Markdown: a row per volume and effect, a column per method, and what the step costs a clean scan at worst."""
+    methods = [method for method in METHODS if any(line["method"] == method for line in found)]
+    by_place = {(line["phantom"], line["effect"], line["method"]): line for line in found}
+    head = ["effect", "volume", *(f"{method}: clean, with it, corrected" for method in methods), "clean, step"]
+    text = [f"| {' | '.join(head)} |", "| --- " * len(head) + "|"]
+    for phantom in dict.fromkeys(line["phantom"] for line in found):
+        for name, effect in EFFECTS.items():
+            of = [by_place.get((phantom, name, method)) for method in methods]
+            if not any(of):
+                continue
+            costs = min(line["clean_prepared"] - line["clean"] for line in of if line)
+            last = "told" if effect.told else f"{round(costs, 2) + 0:+.2f}".replace("-", "−")
+            text.append(f"| {' | '.join([name, phantom, *map(_cell, of), last])} |")
+    return "\n".join(text)
+
+
+def _cell(line: dict[str, Any] | None) -> str:
+    """PSNR, dB, clean, with the effect and corrected; and the share of the loss that is regained."""
+    if line is None:
+        return ""
+    stages = ", ".join(f"{line[key]:.2f}" for key in ("clean", "spoilt", "prepared"))
+    share = f" ({100 * line['regained']:.0f} %)" if line["clean"] - line["spoilt"] > LOST_DB else ""
+    return (stages + share).replace("-", "−")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("results", type=Path, nargs="?", help="a file of one line of JSON per run")
     parser.add_argument("--size", type=int, default=48)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--dose", type=float, default=1e5)
@@ -65,51 +143,48 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of noise and of what is planted")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--effects", nargs="+", default=list(EFFECTS), choices=list(EFFECTS))
-    parser.add_argument("--output", type=Path)
-    parser.add_argument("--figure", type=Path, help="draw slices of the jaw into this file, and no table")
+    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
+    parser.add_argument("--figure", type=Path, help="draw slices of the jaw into this file, run nothing else")
     given = parser.parse_args()
-    rt, lines = Runtime(), []
+    if given.table:
+        print(table(lines_of(given.results)[1:]))
+        return
+    rt = Runtime()
+    facts = {"size": given.size, "views": given.views, "dose": given.dose, "seed": given.seed, "device": rt.device.name}
     usual = {
         "size": given.size, "detector": 3 * given.size // 2, "views": given.views, "peak": PEAK, "noise": "beer",
-        "dose": given.dose, "exposure_deg": 0.8 * 360 / given.views, "device": rt,
-        "seed": given.seed,
+        "dose": given.dose, "exposure_deg": 0.8 * 360 / given.views, "device": rt, "seed": given.seed,
     }  # fmt: skip
     if given.figure is not None:
         draw(given.figure, rt, usual)
         return
+    there = read_lines(given.results) or [facts]
+    if there[0] != facts:
+        parser.error(f"{given.results}: found runs of {there[0]}; expected {facts}; name another file")
+    if not given.results.exists():
+        append(given.results, facts)
+    done = {(line["effect"], line["phantom"], line["method"]) for line in there[1:]}
     for phantom in given.phantoms:
-        clean_scan = simulate(phantom, **usual)
-        clean = {method: scores(rt, clean_scan, method) for method in given.methods}
-        for name in given.effects:
-            effect = EFFECTS[name]
-            spoilt = simulate(phantom, **usual, **effect.planted)
-            for method in given.methods:
-                found = {
-                    "clean_prepared": scores(rt, clean_scan, method, effect),
-                    "spoilt": scores(rt, spoilt, method),
-                    "prepared": scores(rt, spoilt, method, effect),
-                }
-                line = {"effect": name, "phantom": Path(phantom).stem, "method": method, "clean": clean[method], **found}
-                line["regained"] = (line["prepared"] - line["spoilt"]) / max(line["clean"] - line["spoilt"], 1e-2)
-                lines.append({key: round(v, 3) if isinstance(v, float) else v for key, v in line.items()})
-                print(json.dumps(lines[-1]), flush=True)
-    if given.output is not None:
-        facts = {"size": given.size, "views": given.views, "dose": given.dose, "seed": given.seed, "device": rt.device.name}
-        given.output.write_text("".join(json.dumps(line) + "\n" for line in [facts, *lines]), encoding="utf-8")
+        name = Path(phantom).stem
+        missing = {effect: [m for m in given.methods if (effect, name, m) not in done] for effect in given.effects}
+        for line in lines(rt, phantom, usual, {effect: methods for effect, methods in missing.items() if methods}):
+            print(json.dumps(line), flush=True)
+            append(given.results, line)
 
 
 def draw(path: Path, rt: Runtime, usual: dict[str, Any]) -> None:
     """The middle slice of the jaw by FDK: with each effect, and corrected."""
     from matplotlib.figure import Figure
 
-    shown = [name for name in EFFECTS if name not in ("sparks 0.01 %", "rings 1 %", "drift 2 %", "120 kVp, water")]
+    unseen = ("sparks 0.01 %", "rings 1 %", "drift 2 %", "120 kVp, water")
+    shown = [name for name, effect in EFFECTS.items() if name not in unseen and effect.part == 1]
     figure = Figure(figsize=(2 * len(shown), 4.4), layout="constrained")
     axes = figure.subplots(2, len(shown))
     for name, (above, below) in zip(shown, axes.T, strict=True):
         effect = EFFECTS[name]
         scan = simulate("jaw", **usual, **effect.planted)
-        for axis, before in ((above, {}), (below, {"steps": effect.steps, **effect.options})):
-            volume = reconstruct(scan, "fdk", device=rt, **METHODS["fdk"], **before).volume
+        for axis, shown_scan in ((above, scan), (below, effect.undone(scan, rt))):
+            volume = volume_of(rt, shown_scan, "fdk")
             axis.imshow(volume[volume.shape[0] // 2, ::-1], cmap="gray", vmin=0, vmax=0.9 * scan.reference.max())
             axis.set_axis_off()
         above.set_title(name, fontsize=9)

@@ -125,6 +125,7 @@ def simulate(
     protocol: str = "rapid",
     size: int = 64,
     detector: int | None = None,
+    truncation: float = 0.0,
     device: Device = None,
     **options: Any,
 ) -> Scan:
@@ -133,7 +134,7 @@ def simulate(
     phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
     size: voxels along the longest side of grid and reference. detector: columns, rows in proportion.
-    device: what ``--device`` takes, or a Runtime.
+    truncation: share of the columns cut off, half at each side. device: what ``--device`` takes, or a Runtime.
     options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
     readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
@@ -141,7 +142,7 @@ def simulate(
     """
     if not isinstance(phantom, str | Path):
         raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
-    described = scanner_for(scanner, detector)
+    described = scanner_for(scanner, detector, truncation=truncation)
     chosen = scanner_options(described, protocol, **options)
     is_toml = str(phantom).endswith(".toml")
     of = str(phantom) if phantom in PHANTOMS else (load_beads(Path(phantom)) if is_toml else load_attenuation(phantom))

@@ -1,7 +1,8 @@
 """A tube's spectrum and two materials: how line integrals of soft tissue and bone add up in a beam of many energies.
 
-Kramers' law (Phil. Mag. 46 (1923) 836) behind aluminium; attenuation from NIST's tables (Hubbell and Seltzer, NISTIR 5632),
-interpolated in the logarithms. Both materials attenuate as stated in the thinnest layer; thicker ones less and less.
+Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode (Poludniowski et al., Med. Phys. 48 (2021) 3630), behind
+aluminium; attenuation from NIST's tables (Hubbell and Seltzer, NISTIR 5632), interpolated in the logarithms. Both materials
+attenuate as stated in the thinnest layer; thicker ones less and less.
 """
 
 from dataclasses import dataclass
@@ -9,20 +10,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from phyradgs_cl import checks
+
 Array = NDArray[np.floating]
 _ENERGY_KEV = np.array([15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0])
 # Mass attenuation in cm²/g of water, cortical bone (ICRU-44) and aluminium
 _WATER = np.array([1.673, 0.8096, 0.3756, 0.2683, 0.2269, 0.2059, 0.1837, 0.1707, 0.1505])
 _BONE = np.array([9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855, 0.1480])
 _ALUMINIUM = np.array([7.955, 3.441, 1.128, 0.5685, 0.3681, 0.2778, 0.2018, 0.1704, 0.1378])
-_ALUMINIUM_G_PER_CM3, _FILTER_CM = 2.699, 0.5
+_ALUMINIUM_G_PER_CM3 = 2.699
+_STEP_KEV = 2.0  # of SpekPy's energies: finer ones change a half-value layer by less than a thousandth
 LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0
+FILTER_MM = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """weight (E,): share of the recorded signal per energy, sum 1; soft, bone (E,): attenuation there over its mean."""
+    """energy_kev (E,); weight (E,): share of the recorded signal per energy, sum 1; soft, bone (E,): attenuation there over
+    its mean."""
 
+    energy_kev: Array
     weight: Array
     soft: Array
     bone: Array
@@ -38,14 +45,28 @@ class Spectrum:
         return self.weight, self.soft, self.bone
 
 
-def tube_spectrum(kvp: float) -> Spectrum:
-    """The spectrum of a tube at ``kvp`` kV behind 5 mm of aluminium, on a panel that adds up energy."""
-    energy_kev = np.linspace(15.0, kvp, 40, endpoint=False)
-    light = (kvp - energy_kev) / energy_kev * energy_kev  # photons, each of which counts as its energy
-    light *= np.exp(-_at(energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 * _FILTER_CM)
+def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0.0) -> Spectrum:
+    """The spectrum of a tube at ``kvp`` kV behind ``filter_mm`` of aluminium, on a panel that adds up energy: SpekPy's for a
+    tungsten anode of ``anode_deg``, by Kramers' law at 0. InputError: an anode without the package spekpy."""
+    energy_kev, photons = _tungsten(kvp, anode_deg) if anode_deg else _kramers(kvp)
+    light = photons * energy_kev * np.exp(-_at(energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 * filter_mm / 10)
     weight = light / light.sum()
     soft, bone = _at(energy_kev, _WATER), _at(energy_kev, _BONE)
-    return Spectrum(weight, soft / (weight @ soft), bone / (weight @ bone))
+    return Spectrum(energy_kev, weight, soft / (weight @ soft), bone / (weight @ bone))
+
+
+def _kramers(kvp: float) -> tuple[Array, Array]:
+    """Energies (E,) in keV and photons of each, without a filter."""
+    energy_kev = np.linspace(_ENERGY_KEV[0], kvp, 40, endpoint=False)
+    return energy_kev, (kvp - energy_kev) / energy_kev
+
+
+def _tungsten(kvp: float, anode_deg: float) -> tuple[Array, Array]:
+    """As ``_kramers``, characteristic lines included."""
+    spekpy = checks.package("spekpy", "the package that hardening.anode_deg asks", "phyradgs-cl[spectrum]")
+    energy_kev, photons = spekpy.Spek(kvp=kvp, th=anode_deg, dk=_STEP_KEV).get_spectrum(diff=False)
+    known = energy_kev >= _ENERGY_KEV[0]
+    return energy_kev[known], photons[known]
 
 
 def _at(energy_kev: Array, table: Array) -> Array:

@@ -2,29 +2,42 @@
 
 By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume is
 reprojected, and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100),
-again as the volume gets better. Or, of an object of one material, by the scan's consistency with its own reprojection: how
-line integrals grow with the path through the segmented volume says the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41
-(2008) 242).
+again as the volume gets better. Where bone begins is stated, or it is tried: the frames that their own reprojection explains
+best win, those as they are and those of water alone among them. Or, of an object of one material, by the scan's consistency
+with its own reprojection: how line integrals grow with the path through the segmented volume says the polynomial (Krumm,
+Kasperl and Franz, NDT & E Int. 41 (2008) 242).
 """
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import Spectrum, tube_spectrum
-from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
+from phyradgs_cl.detector.spectrum import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
+log = logging.getLogger(__name__)
+
 Polynomial = tuple[float, float, float]
+BoneIn = Callable[[np.ndarray], np.ndarray]
+"""From a volume (z, y, x), the attenuation in each voxel that is bone's."""
 _LARGEST = 1e3
-_DENSE = 1.5  # times the mean of what is soft: from here the densest class is another material
-_LEAST_SHARE = 1e-3  # of the object: a material of less cannot be fitted
-_PASSES = 3  # of bone from volume from bone
-_NEWTON = 8
+_PASSES = 4  # of bone from volume from bone
+_TRIED = (0.85, 0.7, 0.55, 0.45, 0.35, 0.2, 0.1)  # of the densest: what is soft ends here
+_TRIED_PASSES = 2  # each beginning with the frames of the one before
+_TRIED_VOXELS = 48  # along the longest side
+_INSIDE = 0.1  # of the densest: the object
+_SMOOTH = 1 / 24  # of the panel's longer side: hardening is smoother than what a grid cannot hold
+_NEWTON = 3  # leave 1e-12
 _UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
 _SHADOW = 0.1  # of the longest path
 _WATER_TO = 8.0  # largest line integral that the voltage's polynomial is fitted to
@@ -34,19 +47,23 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 @dataclass(frozen=True)
 class HardeningOptions:
     """polynomial: of p², p³ and p⁴; kvp: tube voltage, kV, whose spectrum is taken; neither: fitted to one material.
-    bone_per_mm: attenuation from which a voxel is bone, beside kvp; 0: where the volume's values part by themselves."""
+    Beside kvp, bone_per_mm: attenuation from which a voxel is bone, 0: tried; filter_mm: of aluminium; anode_deg: angle of a
+    tungsten anode, whose spectrum is SpekPy's, 0: Kramers' law."""
 
     polynomial: Polynomial = _NONE
     kvp: float = 0.0
     bone_per_mm: float = 0.0
+    filter_mm: float = FILTER_MM
+    anode_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        checks.fields_within("hardening.", self, {"polynomial": (-_LARGEST, _LARGEST)})
+        beside_kvp = {"bone_per_mm": (0, _LARGEST), "filter_mm": (0, 50), "anode_deg": (0, 45)}
+        checks.fields_within("hardening.", self, {"polynomial": (-_LARGEST, _LARGEST), **beside_kvp})
         if self.kvp != 0:
             checks.within("hardening.kvp", self.kvp, LOWEST_KVP, HIGHEST_KVP)
-        checks.within("hardening.bone_per_mm", self.bone_per_mm, 0, _LARGEST)
-        if self.bone_per_mm and not self.kvp:
-            raise InputError("hardening.bone_per_mm", "given without hardening.kvp", "both, or neither", "state the voltage")
+        for name in beside_kvp:
+            if getattr(self, name) != getattr(type(self), name) and not self.kvp:
+                raise InputError(f"hardening.{name}", "given without hardening.kvp", "both, or neither", "state the voltage")
         if self.kvp and any(self.polynomial):
             raise InputError("hardening.kvp", "given with hardening.polynomial", "one of the two", "leave one out")
 
@@ -59,10 +76,10 @@ def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
     return (p + up**2 * (square + up * (cube + up * fourth))).astype(np.float32)
 
 
-def water_polynomial(kvp: float) -> Polynomial:
-    """The polynomial that makes line integrals of water straight, up to 8, behind a tube at ``kvp`` kV."""
+def water_polynomial(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0.0) -> Polynomial:
+    """The polynomial that makes line integrals of water straight, up to 8, behind a tube as of ``tube_spectrum``."""
     true = np.linspace(0.05, _WATER_TO, 80)
-    seen = tube_spectrum(kvp).hardened(true)
+    seen = tube_spectrum(kvp, filter_mm, anode_deg).hardened(true)
     basis = np.stack([seen**2, seen**3, seen**4], axis=1) / true[:, None]
     found = np.linalg.lstsq(basis, (true - seen) / true, rcond=None)[0]
     return float(found[0]), float(found[1]), float(found[2])
@@ -70,33 +87,94 @@ def water_polynomial(kvp: float) -> Polynomial:
 
 def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """The scan with straight line integrals."""
-    frames = unmasked_frames(scan)
     if options.kvp:
-        spectrum, water = tube_spectrum(options.kvp), water_polynomial(options.kvp)
-        clean, bone = straighten_two(frames, spectrum, make_model(scan), water, options.bone_per_mm)
-        return replace(scan, projections=clean), {"kvp": options.kvp, "bone_share": bone}
-    fitted = not any(options.polynomial)
+        return _by_voltage(scan, options, make_model)
+    frames, fitted = unmasked_frames(scan), not any(options.polynomial)
     polynomial = fit_polynomial(frames, make_model(scan)) if fitted else options.polynomial
     facts = {"polynomial": list(polynomial), "fitted": fitted}
     return replace(scan, projections=straighten(frames, polynomial)), facts
 
 
-def straighten_two(
-    frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial, bone_per_mm: float = 0.0
+def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    tube = (options.kvp, options.filter_mm, options.anode_deg)
+    frames, spectrum, water = unmasked_frames(scan), tube_spectrum(*tube), water_polynomial(*tube)
+    facts: Facts = {"kvp": options.kvp}
+    bone_in = partial(_from, options.bone_per_mm)
+    if not options.bone_per_mm:
+        finer = max(1.0, max(scan.grid.shape) / _TRIED_VOXELS)
+        coarse = scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / finer)))
+        mixed, facts["unexplained"] = find_bone(_smooth(frames, (finer - 1) / 2), spectrum, water, make_model(coarse))
+        if mixed is None:
+            log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
+            return scan, {**facts, "left_alone": True}
+        bone_in = partial(_between, *mixed)
+        facts |= dict(zip(("soft_to_per_mm", "bone_from_per_mm"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
+    clean, facts["bone_share"] = _straighten_two(frames, spectrum, make_model(scan), water, bone_in)
+    return replace(scan, projections=clean), facts
+
+
+def _straighten_two(
+    frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
-    """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the object's voxels; those of water
-    where no bone is found. ``bone_per_mm``: as of ``HardeningOptions``."""
+    """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the volume's attenuation; those of
+    water where no bone is found."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.volume(clean)
-        masks = _materials(volume, bone_per_mm)
-        if masks is None or masks[1] is None:
+        bone = bone_in(volume)
+        if not bone.any():
             break
-        bone = masks[1]
-        share = float(bone.sum() / max(masks[0].sum(), 1))
-        dense = np.maximum(model.frames(np.where(bone, volume, 0).astype(np.float32)), 0)
-        clean = (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
+        share = float(bone.sum() / np.maximum(volume, 0).sum())
+        clean = _with_bone(bone, frames, spectrum, model)
     return clean, share
+
+
+def find_bone(
+    frames: np.ndarray, spectrum: Spectrum, water: Polynomial, model: Model
+) -> tuple[tuple[float, float] | None, dict[str, float]]:
+    """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u)
+    explain themselves best: infinity without bone, None where they do best as they are; and the share that either, and the
+    best with bone, leaves unexplained."""
+    clean = straighten(frames, water)
+    volume = model.volume(clean)
+    inside = scipy.ndimage.binary_dilation(volume >= _INSIDE * _densest(volume))
+    none = _unexplained(frames, model.volume(frames), inside, model)
+    alone = _unexplained(clean, volume, inside, model)
+    left: dict[tuple[float, float], float] = {}
+    for share in _TRIED:
+        for _ in range(_TRIED_PASSES):
+            mixed = share * _densest(volume), _densest(volume)
+            clean = _with_bone(_between(*mixed, volume), frames, spectrum, model)
+            volume = model.volume(clean)
+        left[mixed] = _unexplained(clean, volume, inside, model)
+    best = min(left, key=left.__getitem__)
+    told = {"as_they_are": none, "water": alone, "bone": left[best]}
+    if none <= min(alone, left[best]):
+        return None, told
+    return (best if left[best] < alone else (np.inf, np.inf)), told
+
+
+def _unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
+    """The share of line integrals (F, v, u) that what is ``inside`` of their volume leaves, smooth; less what the same way
+    leaves of that object's own."""
+
+    def reprojected(whole: np.ndarray) -> np.ndarray:
+        return model.frames(np.where(inside, np.maximum(whole, 0), 0).astype(np.float32))
+
+    once = reprojected(volume)
+    left = frames - 2 * once + reprojected(model.volume(once))
+    left = _smooth(left, _SMOOTH * max(frames.shape[1:]))
+    return float(np.sqrt(np.mean(left**2) / max(float(np.mean(frames**2)), 1e-20)))
+
+
+def _smooth(frames: np.ndarray, sigma: float) -> np.ndarray:
+    return scipy.ndimage.gaussian_filter(frames, (0, sigma, sigma)) if sigma > 0 else frames
+
+
+def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
+    """Straight line integrals, where what is ``bone`` (z, y, x) is known."""
+    dense = np.maximum(model.frames(bone.astype(np.float32)), 0)
+    return (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
@@ -139,22 +217,21 @@ def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, f
     return path, level, float(found[1] / found[0] ** 2), left
 
 
-def _materials(volume: np.ndarray, bone_per_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """The object and, if there is any, what is bone in it (z, y, x) bool, from ``bone_per_mm`` on if that is not 0; None
-    where nothing stands out."""
-    from skimage.filters import threshold_multiotsu  # slow to import
+def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
+    """What is bone where voxels (z, y, x) are one or the other."""
+    return np.where(volume >= bone_per_mm, volume, 0)
 
-    values = volume[_measured(volume.shape)]
-    if np.ptp(values) == 0:
-        return None
-    low, high = threshold_multiotsu(values, classes=3)
-    inside, dense = volume >= low, volume >= (bone_per_mm or high)
-    if bone_per_mm:
-        return inside, dense if dense.any() else None
-    soft = inside & ~dense
-    many = dense.sum() > _LEAST_SHARE * inside.sum() and soft.any()
-    has_bone = bool(many and volume[dense].mean() > _DENSE * volume[soft].mean())
-    return inside, dense if has_bone else None
+
+def _between(soft_to_per_mm: float, bone_from_per_mm: float, volume: np.ndarray) -> np.ndarray:
+    """What is bone where voxels (z, y, x) mix: none of one that attenuates as soft tissue at most, all of one as bone."""
+    if soft_to_per_mm >= bone_from_per_mm:
+        return np.zeros_like(volume)
+    mixed = (volume - soft_to_per_mm) * (bone_from_per_mm / (bone_from_per_mm - soft_to_per_mm))
+    return np.clip(mixed, 0, np.maximum(volume, 0))
+
+
+def _densest(volume: np.ndarray) -> float:
+    return float(np.percentile(volume[_measured(volume.shape)], 99.9))
 
 
 def _measured(shape: tuple[int, ...]) -> np.ndarray:

@@ -122,9 +122,12 @@ def test_a_simulation_takes_the_options_of_the_command(rt, scan) -> None:
 
 def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:
     options = ["--phantom", "jaw", "--size", "8", "--detector", "10", "--views", "2", "--noise", "beer", "--seed", "4"]
-    assert load_cli().run(["simulate", *options, "--readout", "columns", "-o", str(tmp_path / "scan.h5")]) == 0
-    ours = api.simulate("jaw", size=8, detector=10, views=2, noise="beer", seed=4, readout_axis="columns", device=rt)
+    options += ["--readout", "columns", "--truncation", "0.4", "-o", str(tmp_path / "scan.h5")]
+    assert load_cli().run(["simulate", *options]) == 0
+    usual = {"size": 8, "detector": 10, "views": 2, "noise": "beer", "seed": 4, "readout_axis": "columns", "device": rt}
+    ours = api.simulate("jaw", truncation=0.4, **usual)
     theirs = api.load_scan(tmp_path / "scan.h5")
+    assert ours.projections.shape == (2, 10, 6)
     assert np.array_equal(ours.projections, theirs.projections) and ours.shutter == theirs.shutter
     assert ours.provenance == theirs.provenance and ours.provenance["simulated"] == "phantom jaw"
 
@@ -141,6 +144,7 @@ def test_a_volume_file_can_be_scanned(rt, scan, tmp_path) -> None:
     [
         (lambda: api.simulate("foot", dosis=3), "option dosis.*dose"),
         (lambda: api.simulate("foot", size=0), "size"),
+        (lambda: api.simulate("foot", truncation=2), "^truncation: found 2"),
         (lambda: api.simulate("elbow"), "elbow"),
         (lambda: api.simulate("foot", protocol="slow"), "protocol"),
         (lambda: api.load_scan("nowhere.h5"), "nowhere.h5"),

@@ -12,6 +12,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import (
     STEPS,
     TOLD,
+    Model,
     find_dead,
     find_sparks,
     remove_scatter,
@@ -20,6 +21,7 @@ from phyradgs_cl.prepare import (
     straighten,
     water_polynomial,
 )
+from phyradgs_cl.prepare.hardening import find_bone
 from phyradgs_cl.prepare.surroundings import surrounding_grid
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -140,6 +142,38 @@ def test_scatter_and_polynomials_in_closed_form() -> None:
     np.testing.assert_allclose(straighten(seen, water_polynomial(120.0)), water, rtol=2e-3)
 
 
+def _exact_model(shape: tuple[int, int, int], rays: tuple[int, int, int]) -> Model:
+    """Random rays, more than voxels, and their least squares: what no grid spoils."""
+    along = np.random.default_rng(3).random((np.prod(rays), np.prod(shape))) ** 4 / 20
+    back = np.linalg.pinv(along)
+
+    def volume(frames: np.ndarray) -> np.ndarray:
+        return (back @ frames.ravel()).reshape(shape).astype(np.float32)
+
+    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), lambda: np.zeros(shape), volume)
+
+
+def test_bone_is_what_the_beam_says_and_not_the_densest_of_three_classes() -> None:
+    """Soft tissue, a skull of which the beam knows nothing, teeth; and frames that do not bend are left as they are."""
+    volume = np.full((6, 6, 6), 0.2, np.float32)
+    volume[:, 1], volume[2:4, 2:4, 2:4] = 0.5, 1.5
+    model, spectrum, water = _exact_model(volume.shape, (8, 9, 9)), tube_spectrum(120.0), water_polynomial(120.0)
+    soft, teeth = model.frames(volume * (volume < 1)), model.frames(volume * (volume > 1))
+    bent = spectrum.hardened(soft, teeth).astype(np.float32)
+    mixed, unexplained = find_bone(bent, spectrum, water, model)
+    assert mixed is not None and 0.45 < mixed[0] < mixed[1], (mixed, unexplained)
+    assert unexplained["bone"] < 0.5 * unexplained["water"] < 0.5 * unexplained["as_they_are"], unexplained
+    assert find_bone(soft + teeth, spectrum, water, model)[0] is None
+    only_soft = spectrum.hardened(soft + teeth).astype(np.float32)
+    assert find_bone(only_soft, spectrum, water, model)[0] == (np.inf, np.inf)
+
+
+def test_frames_that_no_correction_explains_better_stay_as_they_are(rt, planted, caplog) -> None:
+    found = prepared(planted(), input_options({"steps": "hardening", "hardening": {"kvp": 120.0}}), rt)
+    assert found.projections is planted().projections and found.provenance[TOLD][0]["left_alone"]
+    assert "stay as they are" in caplog.text
+
+
 def test_one_material_says_its_own_polynomial(rt, planted) -> None:
     """A ball of water: its path through the volume tells how line integrals bend; an object of many is refused."""
     scan = simulate("spheres", size=24, detector=36, views=40, exposure_deg=7.0, peak=4.0, device=rt)
@@ -182,6 +216,7 @@ def test_what_is_no_step_or_no_option_of_one(planted) -> None:
         (lambda: input_options({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
         (lambda: input_options({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
         (lambda: input_options({"steps": "hardening", "hardening": {"bone_per_mm": 0.1}}), "without hardening.kvp"),
+        (lambda: input_options({"steps": "hardening", "hardening": {"anode_deg": 12}}), "without hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 80, "polynomial": [1, 0, 0]}}), "one of the two"),
         (lambda: prepared(full, InputOptions(steps="air")), "pixels of air"),
