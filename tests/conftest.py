@@ -29,6 +29,17 @@ from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate  #
 
 Cloud = Callable[..., np.ndarray]
 
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--gpu-shape", action="store_true", help="drive every device of this process as a GPU is driven")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--gpu-shape"):
+        own, shape = Runtime.__init__, {"lanes": 1, "pixel_items": True}
+        Runtime.__init__ = lambda *args, **given: own(*args, **(given if "lanes" in given else shape | given))  # type: ignore
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:

@@ -43,7 +43,7 @@ class FusedOptions:
     MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), Exact())
 
     motion: Motion = Exact()
-    iterations: int = 2000
+    iterations: int = 1500
     voxel_iterations: int = FistaOptions.iterations
     splat_weight: float = 0.2
     prior_weight: float = FistaOptions.prior_weight

@@ -12,7 +12,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.reconstructors import METHODS, Progress, method_options, reconstruct
-from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, Misfit, misfit_of
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
+from phyradgs_cl.reconstructors.voxels.misfit import Misfit, misfit_of
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate

@@ -21,8 +21,9 @@ from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
-from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, Misfit
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
+from phyradgs_cl.reconstructors.voxels.misfit import Misfit
 from phyradgs_cl.reconstructors.voxels.priors import NoPrior
 from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, spread_order
 from phyradgs_cl.reconstructors.voxels.sirt import Sirt, SirtOptions

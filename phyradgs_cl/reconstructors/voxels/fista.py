@@ -15,7 +15,6 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
-from phyradgs_cl.detector import noise_behind
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.method import Method
@@ -27,15 +26,15 @@ from phyradgs_cl.reconstructors.result import (
     option_facts,
     state_arrays,
 )
+from phyradgs_cl.reconstructors.voxels.misfit import Misfit, density, gain, misfit_of
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Denoiser, Prior, prior_of, volumes_of
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime, Space
+from phyradgs_cl.runtime import Runtime
 
 _GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
-_EDGES, _SAMPLING = 0.55, 0.2  # of what voxels miss, and an exponent, measured (docs/results/settings.md)
 _FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
 _VOLUMES, _FRAMES = 16, 3  # held at one time, with the prior `dct`
 _FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
@@ -176,19 +175,6 @@ def _run(
     return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """What no volume of the grid explains in a pixel: noise, dimensionless, and ``edges_mm`` times the density there is, for
-    what voxels miss at edges, which views do not average."""
-
-    noise: float
-    edges_mm: float = 0.0
-
-    def rms(self, density_per_mm: float) -> float:
-        """Of both, dimensionless."""
-        return math.hypot(self.noise, self.edges_mm * density_per_mm)
-
-
 class Fista:
     """The residual that is reported is the pass's own: of every subset just before its step.
 
@@ -206,13 +192,13 @@ class Fista:
         # AᵀA has no negative entry: its largest row sum bounds its norm
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         self._smallest = _FEWEST * space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
-        self._gain = _gain(system)
+        self._gain = gain(system)
         self.subsets = self._subsets(min(options.subsets, system.frames))
 
     @property
     def weight(self) -> float:
         """The prior's, in the unit of the gradient."""
-        noise = self.misfit.rms(_density(self.system.space, self.volume))
+        noise = self.misfit.rms(density(self.system.space, self.volume))
         return max(self.options.prior_weight * noise * self._gain, self._smallest)
 
     def _subsets(self, count: int) -> list[System]:
@@ -263,38 +249,3 @@ class Fista:
         self.momentum, self.least = float(progress[0]), float(progress[1])
         self.subsets = self._subsets(int(progress[2]))
         self.prior.restore(state)
-
-
-def misfit_of(scan: Scan, motion: Motion) -> Misfit:
-    """Of a scan on its grid. With n the views per voxel along the volume's side, or per pixel on the axis where those are
-    larger: edges grow with √n, as they are missed in every view alike, and both with a small power of n. A blur averages
-    what it goes over."""
-    pixel_mm = min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
-    voxel_mm = max(pixel_mm, *scan.grid.voxel_size_mm[1:])
-    views = scan.frames * voxel_mm / max(scan.grid.size_mm[1:])
-    noise = noise_behind(np.asarray(scan.projections, np.float32), scan.valid)
-    edges_mm = _EDGES * voxel_mm * math.sqrt(views / (1 + _blur_mm(scan, motion) / voxel_mm))
-    return Misfit(views**_SAMPLING * noise, views**_SAMPLING * edges_mm)
-
-
-def _blur_mm(scan: Scan, motion: Motion) -> float:
-    """How far a line's exposure smears what lies half-way between the volume's middle and its side."""
-    cells = motion.cells(scan, scan.frames // 2).still()
-    first, stop = cells.line_cells()[cells.lines // 2]
-    sources_mm = cells.pose[first:stop, :3] - scan.grid.offset_mm[::-1]
-    turn_rad = np.linalg.norm(np.ptp(sources_mm, axis=0)) / np.linalg.norm(sources_mm[0])
-    return float(turn_rad * max(scan.grid.size_mm[1:]) / 4)
-
-
-def _density(space: Space[Any], volume: Any) -> float:
-    """Of what a volume consists of, in 1/mm: Σ x³ / Σ x²."""
-    squares = space.inner(volume, volume)
-    return max(space.inner(space.multiply(volume, volume), volume) / squares, 0.0) if squares > 0 else 0.0
-
-
-def _gain(system: System) -> float:
-    """The deviation of Aᵀε in mm in the middle half of the volume, ε one draw of white noise of deviation 1."""
-    drawn = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
-    back = system.adjoint(system.masked(system.weighed(system.space.array(drawn))))
-    middle = tuple(slice(n // 4, n - n // 4) for n in system.volume_shape)
-    return float(system.space.numpy(back)[middle].std(dtype=np.float64))

@@ -1,10 +1,13 @@
-"""How near the weight that ``fista`` takes from the data comes to the best of a sweep.
+"""How near a default of ``fista`` comes to the best of a sweep: the weight that it takes from the data, or its passes.
 
-    python benchmarks/prior_weight.py run VOLUMES docs/results/prior_weight.jsonl
-    python benchmarks/prior_weight.py table docs/results/prior_weight.jsonl
+    python benchmarks/sweep.py run VOLUMES docs/results/prior_weight.jsonl
+    python benchmarks/sweep.py run VOLUMES docs/results/passes.jsonl --option iterations --holdout 2
+    python benchmarks/sweep.py table docs/results/prior_weight.jsonl
 
-A line per volume, scan and factor: PSNR in dB with ``factor`` times the default's weight. Runs that are there are not made
-again. Scans are those of benchmarks/tables but for ``--dose`` and ``--views``; voxels are the scan's own (``subvoxels`` 1).
+A line per volume, scan and factor: PSNR in dB with ``factor`` times the default of the option, and with ``--holdout`` the
+error on so many percent of the pixels, which are kept from it. Runs that are there are not made again. Scans are those of
+benchmarks/tables but for ``--dose`` and ``--views``; weights are swept with 30 passes on the scan's own voxels
+(``subvoxels`` 1), passes as they are by default.
 """
 
 import argparse
@@ -21,7 +24,9 @@ from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"still": Static(), "fly": PerRow()}
 PROTOCOLS = {25: "rapid", 50: "standard"}
-PASSES = 30
+USUAL = {"prior_weight": {"subvoxels": 1, "iterations": 30}, "iterations": {}}
+"""What else is set where an option is swept."""
+SCAN = ("kind", "views", "dose", "size")
 
 
 def scan_of(rt: Runtime, path: Path, size: int, kind: str, views: int, dose: float, seed: int) -> Scan:
@@ -40,31 +45,37 @@ def run(given: argparse.Namespace) -> None:
             left = [f for f in given.factors if _key({**facts, "factor": f}) not in there]
             scan = scan_of(rt, path, given.size, kind, views, dose, given.seed) if left else None
             for factor in left:
-                weight = factor * FistaOptions().prior_weight
-                chosen = {"prior_weight": weight, "subvoxels": 1, "iterations": PASSES, "motion": MOTIONS[kind]}
-                result = reconstruct(scan, "fista", device=rt, report=False, **chosen)  # type: ignore[arg-type]
+                usual = getattr(FistaOptions(), given.option)
+                chosen = {**USUAL[given.option], given.option: type(usual)(factor * usual), "motion": MOTIONS[kind]}
+                chosen |= {"holdout": given.holdout, "device": rt, "report": False}
+                result = reconstruct(scan, "fista", **chosen)  # type: ignore[arg-type]
                 scores = compare(result.volume, scan.reference)  # type: ignore[union-attr]
                 line = {**facts, "factor": factor, "psnr_db": scores["psnr_db"], "ssim": scores["ssim"]}
+                line.update(result.facts.get("held_out", {}))
                 with given.lines.open("a") as file:
                     file.write(json.dumps(line) + "\n")
                 print(*line.values(), flush=True)
 
 
 def table(given: argparse.Namespace) -> None:
-    """PSNR with the default's weight, with the best factor for all volumes of a scan, and with each volume's own best."""
-    by_scan: dict[tuple[object, ...], dict[str, dict[float, float]]] = {}
+    """PSNR with the default, with the best factor for all volumes of a scan, with each volume's own best, and, where pixels
+    were held out, with the factor of their least error."""
+    scans: dict[tuple[object, ...], dict[str, dict[float, dict[str, float]]]] = {}
     for line in read_lines(given.lines):
-        of = by_scan.setdefault((line["kind"], line["views"], line["dose"], line["size"]), {})
-        of.setdefault(str(line["volume"]), {})[float(line["factor"])] = float(line["psnr_db"])  # type: ignore[arg-type]
-    print("| scan | views | photons | voxels | volumes | the default's | one factor's best | each one's best |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for (kind, views, dose, size), volumes in sorted(by_scan.items(), key=str):
+        of = scans.setdefault(tuple(line[name] for name in SCAN), {}).setdefault(str(line["volume"]), {})
+        of[float(line["factor"])] = line  # type: ignore[arg-type, assignment]
+    print("| scan | views | photons | voxels | volumes | the default's | one factor's best | each one's best | held-out's |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for scan, volumes in sorted(scans.items(), key=str):
         factors = sorted(set.intersection(*(set(of) for of in volumes.values())))
-        means = [float(np.mean([of[f] for of in volumes.values()])) for f in factors]
-        best = int(np.argmax(means))
-        own = float(np.mean([max(of[f] for f in factors) for of in volumes.values()]))
-        of_one = f"{means[best]:.2f} (×{factors[best]:g})"
-        cells = kind, views, f"{dose:g}", f"{size}³", len(volumes), f"{means[factors.index(1.0)]:.2f}", of_one, f"{own:.2f}"
+        psnr_db = np.array([[of[factor]["psnr_db"] for factor in factors] for of in volumes.values()])
+        means, best, shown = psnr_db.mean(0), int(psnr_db.mean(0).argmax()), ""
+        if all("holdout_rms" in of[factor] for of in volumes.values() for factor in factors):
+            errors = np.array([[of[factor]["holdout_rms"] for factor in factors] for of in volumes.values()])
+            shown = f"{np.take_along_axis(psnr_db, errors.argmin(1)[:, None], 1).mean():.2f}"
+        kind, views, dose, size = scan
+        cells = [kind, views, f"{dose:g}", f"{size}³", len(volumes), f"{means[factors.index(1.0)]:.2f}"]
+        cells += [f"{means[best]:.2f} (×{factors[best]:g})", f"{psnr_db.max(1).mean():.2f}", shown]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 
@@ -83,6 +94,8 @@ def main() -> None:
     running.add_argument("--views", nargs="+", type=int, default=[25, 50], help="of fly-scans 25 or 50")
     running.add_argument("--doses", nargs="+", type=float, default=[1e3, 1e4, 1e5])
     running.add_argument("--factors", nargs="+", type=float, default=[0.5, 0.71, 1.0, 1.41, 2.0])
+    running.add_argument("--option", choices=list(USUAL), default="prior_weight")
+    running.add_argument("--holdout", type=float, default=0.0, help="percent of the pixels")
     running.add_argument("--seed", type=int, default=0)
     showing = verbs.add_parser("table")
     for verb, function in ((running, run), (showing, table)):
