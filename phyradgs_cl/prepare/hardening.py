@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import Spectrum, tube_spectrum
 from phyradgs_cl.detector.spectrum import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import GridChoice
+from phyradgs_cl.prepare.consistency import coarse_model, densest, object_in, smooth, unexplained
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
@@ -34,9 +33,6 @@ _LARGEST = 1e3
 _PASSES = 4  # of bone from volume from bone
 _TRIED = (0.85, 0.7, 0.55, 0.45, 0.35, 0.2, 0.1)  # of the densest: what is soft ends here
 _TRIED_PASSES = 2  # each beginning with the frames of the one before
-_TRIED_VOXELS = 48  # along the longest side
-_INSIDE = 0.1  # of the densest: the object
-_SMOOTH = 1 / 24  # of the panel's longer side: hardening is smoother than what a grid cannot hold
 _NEWTON = 3  # leave 1e-12
 _UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
 _SHADOW = 0.1  # of the longest path
@@ -101,9 +97,8 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
     facts: Facts = {"kvp": options.kvp}
     bone_in = partial(_from, options.bone_per_mm)
     if not options.bone_per_mm:
-        finer = max(1.0, max(scan.grid.shape) / _TRIED_VOXELS)
-        coarse = scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / finer)))
-        mixed, facts["unexplained"] = find_bone(_smooth(frames, (finer - 1) / 2), spectrum, water, make_model(coarse))
+        model, blur = coarse_model(scan, make_model)
+        mixed, facts["unexplained"] = find_bone(smooth(frames, blur), spectrum, water, model)
         if mixed is None:
             log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
             return scan, {**facts, "left_alone": True}
@@ -137,38 +132,21 @@ def find_bone(
     best with bone, leaves unexplained."""
     clean = straighten(frames, water)
     volume = model.volume(clean)
-    inside = scipy.ndimage.binary_dilation(volume >= _INSIDE * _densest(volume))
-    none = _unexplained(frames, model.volume(frames), inside, model)
-    alone = _unexplained(clean, volume, inside, model)
+    inside = object_in(volume)
+    none = unexplained(frames, model.volume(frames), inside, model)
+    alone = unexplained(clean, volume, inside, model)
     left: dict[tuple[float, float], float] = {}
     for share in _TRIED:
         for _ in range(_TRIED_PASSES):
-            mixed = share * _densest(volume), _densest(volume)
+            mixed = share * densest(volume), densest(volume)
             clean = _with_bone(_between(*mixed, volume), frames, spectrum, model)
             volume = model.volume(clean)
-        left[mixed] = _unexplained(clean, volume, inside, model)
+        left[mixed] = unexplained(clean, volume, inside, model)
     best = min(left, key=left.__getitem__)
     told = {"as_they_are": none, "water": alone, "bone": left[best]}
     if none <= min(alone, left[best]):
         return None, told
     return (best if left[best] < alone else (np.inf, np.inf)), told
-
-
-def _unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
-    """The share of line integrals (F, v, u) that what is ``inside`` of their volume leaves, smooth; less what the same way
-    leaves of that object's own."""
-
-    def reprojected(whole: np.ndarray) -> np.ndarray:
-        return model.frames(np.where(inside, np.maximum(whole, 0), 0).astype(np.float32))
-
-    once = reprojected(volume)
-    left = frames - 2 * once + reprojected(model.volume(once))
-    left = _smooth(left, _SMOOTH * max(frames.shape[1:]))
-    return float(np.sqrt(np.mean(left**2) / max(float(np.mean(frames**2)), 1e-20)))
-
-
-def _smooth(frames: np.ndarray, sigma: float) -> np.ndarray:
-    return scipy.ndimage.gaussian_filter(frames, (0, sigma, sigma)) if sigma > 0 else frames
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
@@ -228,13 +206,3 @@ def _between(soft_to_per_mm: float, bone_from_per_mm: float, volume: np.ndarray)
         return np.zeros_like(volume)
     mixed = (volume - soft_to_per_mm) * (bone_from_per_mm / (bone_from_per_mm - soft_to_per_mm))
     return np.clip(mixed, 0, np.maximum(volume, 0))
-
-
-def _densest(volume: np.ndarray) -> float:
-    return float(np.percentile(volume[_measured(volume.shape)], 99.9))
-
-
-def _measured(shape: tuple[int, ...]) -> np.ndarray:
-    """The middle of a volume (z, y, x), where a cone beam's views are complete enough: bool."""
-    z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in shape)
-    return (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)

@@ -2,7 +2,8 @@
 
 Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for all thicknesses, where Sun and Star-Lack
 (Phys. Med. Biol. 55 (2010) 6695) take several. Its height and width are stated, or it is the sum of Gaussians, none of them
-negative, that explains best the light that the panel sees beside the object beyond that of the flats.
+negative, that explains best the light that the panel sees beside the object beyond that of the flats. It may say too little
+of what is behind the object: the kernel is made higher where the frames that it leaves then explain themselves much better.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +14,9 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.prepare.air import enough_air
+from phyradgs_cl.prepare.consistency import coarse_model, object_in, smooth, unexplained
 from phyradgs_cl.prepare.masked import unmasked_frames
-from phyradgs_cl.prepare.step import Facts, MakeModel
+from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 Kernel = dict[float, float]
 _REACHES = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)  # of the panel's longer side
@@ -23,6 +25,8 @@ _LEAST_PRIMARY = 0.05  # of what was measured
 _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the object
 _FITTED_FRAMES = 24
 _USUAL_REACH = 0.18
+_RAISED, _MOST_RAISED = 1.25, 8  # the kernel's height, step by step
+_BETTER = 0.8  # of what the kernel of the air leaves unexplained: more is not worth leaving it
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,29 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
     return {width: height for width, height in kernel.items() if height > 0}
 
 
+def raised(kernel: Kernel, frames: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
+    """The kernel so many times as high that line integrals (F, v, u), blurred by so many pixels, explain themselves best; as
+    it is where they hardly gain."""
+    if not kernel:
+        return kernel
+    coarse = smooth(frames, blur)
+    inside = object_in(model.volume(coarse))
+
+    def left(height: float) -> float:
+        clean = remove_scatter(coarse, times(height))
+        return unexplained(clean, model.volume(clean), inside, model)
+
+    def times(height: float) -> Kernel:
+        return {width: height * own for width, own in kernel.items()}
+
+    height, least = 1.0, (before := left(1.0))
+    for _ in range(_MOST_RAISED):
+        if (further := left(_RAISED * height)) >= least:
+            break
+        height, least = _RAISED * height, further
+    return times(height) if least < _BETTER * before else kernel
+
+
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """The scan without scatter."""
     frames = unmasked_frames(scan)
@@ -65,7 +92,7 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
         kernel = {reach: _height_for(frames, options.to_primary, reach)}
     else:
         air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
-        kernel = fit_scatter(frames, air, options.reach)
+        kernel = raised(fit_scatter(frames, air, options.reach), frames, *coarse_model(scan, make_model))
     clean = remove_scatter(frames, kernel)
     facts = {"reach": list(kernel), "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
     return replace(scan, projections=clean), facts

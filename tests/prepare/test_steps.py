@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, reconstruct, simulate
@@ -22,6 +23,7 @@ from phyradgs_cl.prepare import (
     water_polynomial,
 )
 from phyradgs_cl.prepare.hardening import find_bone
+from phyradgs_cl.prepare.scatter import raised
 from phyradgs_cl.prepare.surroundings import surrounding_grid
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -151,6 +153,19 @@ def _exact_model(shape: tuple[int, int, int], rays: tuple[int, int, int]) -> Mod
         return (back @ frames.ravel()).reshape(shape).astype(np.float32)
 
     return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), lambda: np.zeros(shape), volume)
+
+
+def test_a_kernel_is_raised_to_what_frames_say() -> None:
+    """From half its height to nearly all of it; the right one stays."""
+    volume = np.random.default_rng(4).random((6, 6, 6)).astype(np.float32)
+    model = _exact_model(volume.shape, (8, 9, 9))
+    frames = model.frames(volume)
+    frames *= 2 / frames.max()
+    lost = np.exp(-frames) * frames
+    scattered = -np.log(np.exp(-frames) + 0.8 * gaussian_filter(lost, (0, 2.7, 2.7), mode="constant"))
+    (height,) = raised({0.3: 0.4}, scattered, model).values()
+    assert 0.6 < height < 1.0 and raised({0.3: 0.8}, scattered, model) == {0.3: 0.8}
+    assert raised({}, scattered, model) == {}
 
 
 def test_bone_is_what_the_beam_says_and_not_the_densest_of_three_classes() -> None:
