@@ -35,8 +35,10 @@ __kernel void voxel_backward(
     __global float *sums)            /* (stride, SUMS): w, w x y z, w xx xy xz yy yz zz in voxels */
 {
     const int g = (int)get_global_id(0) / ACROSS;
+#if GROUP == 1 /* else groups are as many as Gaussians, and PoCL 3.0 makes stray writes of a return before barriers */
     if (g >= count)
         return;
+#endif
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     __global const float *rec = records + (size_t)g * VOXEL_RECORD;
     __global const int *whole = (__global const int *)rec;
@@ -68,12 +70,11 @@ __kernel void voxel_backward(
     const vf all[SUM_COUNT] = {w_, x_, y_, z_, xx, xy, xz, yy, yz, zz};
 #if GROUP > 1
     __local float tree[SUM_COUNT * GROUP];
-    if (whole[VOX_HI + 2] >= whole[VOX_LO + 2]) { /* most Gaussians are nowhere near a small volume */
+    if (whole[VOX_HI + 2] >= whole[VOX_LO + 2]) /* most Gaussians are nowhere near a small volume */
         group_sums(all, SUM_COUNT, tree, out);
-        return;
-    }
-    for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)
-        out[f] = 0.0f;
+    else
+        for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)
+            out[f] = 0.0f;
 #else
     for (int f = 0; f < SUM_COUNT; ++f)
         out[f] = v_sum(all[f]);

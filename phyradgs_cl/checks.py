@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.text import near_miss
 
 _LONGEST_SHOWN = 80
 
@@ -43,7 +44,8 @@ def one_of(culprit: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError unless `value` is among `allowed`, which the message lists."""
     choices = list(allowed)
     if value not in choices:
-        raise InputError(culprit, repr(value), "one of " + ", ".join(repr(choice) for choice in choices))
+        remedy = near_miss(value, (choice for choice in choices if isinstance(choice, str)), "")
+        raise InputError(culprit, shown(value), "one of " + ", ".join(repr(choice) for choice in choices), remedy)
 
 
 def finite(culprit: str, array: ArrayLike) -> None:

@@ -69,6 +69,12 @@ def rt() -> Runtime:
     return Runtime()
 
 
+@pytest.fixture(scope="session")
+def banded_rt() -> Runtime:
+    """As a CPU is driven, whatever ``--gpu-shape`` says."""
+    return Runtime(lanes=8, pixel_items=False)
+
+
 @pytest.fixture(scope="session", params=["own lanes", "lanes 1", "work-items as lanes", "float pairs"])
 def any_rt(request: pytest.FixtureRequest) -> Runtime:
     """Every way in which kernels are built: the device's own vectors, scalars, a GPU's work-groups, no float64."""

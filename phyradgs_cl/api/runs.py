@@ -125,7 +125,9 @@ def simulate(
     protocol: str = "rapid",
     size: int = 64,
     detector: int | None = None,
+    detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0,
+    pixel_samples: int = 1,
     device: Device = None,
     **options: Any,
 ) -> Scan:
@@ -134,7 +136,8 @@ def simulate(
     phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
     size: voxels along the longest side of grid and reference. detector: columns, rows in proportion.
-    truncation: share of the columns cut off, half at each side. device: what ``--device`` takes, or a Runtime.
+    detector_offset_mm: of the panel's centre (v, u). truncation: share of the columns cut off, half at each side.
+    pixel_samples: rays along each side of a pixel. device: what ``--device`` takes, or a Runtime.
     options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
     readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
@@ -142,12 +145,13 @@ def simulate(
     """
     if not isinstance(phantom, str | Path):
         raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
-    described = scanner_for(scanner, detector, truncation=truncation)
+    described = scanner_for(scanner, detector, detector_offset_mm, truncation)
     chosen = scanner_options(described, protocol, **options)
     is_toml = str(phantom).endswith(".toml")
     of = str(phantom) if phantom in PHANTOMS else (load_beads(Path(phantom)) if is_toml else load_attenuation(phantom))
     name = f"volume {phantom}"
-    return simulated_scan(runtime_of(device), of, described, chosen, size=size, name=name)
+    rt = runtime_of(device)
+    return simulated_scan(rt, of, described, chosen, size=size, pixel_samples=pixel_samples, name=name)
 
 
 @naming_arguments()

@@ -3,7 +3,7 @@
 Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for all thicknesses, where Sun and Star-Lack
 (Phys. Med. Biol. 55 (2010) 6695) take several. Its height and width are stated, or it is the sum of Gaussians, none of them
 negative, that explains best the light that the panel sees beside the object beyond that of the flats. It may say too little
-of what is behind the object: the kernel is made higher where the frames that it leaves then explain themselves much better.
+of what is behind the object: the kernel is made higher as long as the frames that it leaves explain themselves as well.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the
 _FITTED_FRAMES = 24
 _USUAL_REACH = 0.18
 _RAISED, _MOST_RAISED = 1.25, 8  # the kernel's height, step by step
-_BETTER = 0.8  # of what the kernel of the air leaves unexplained: more is not worth leaving it
+_AS_WELL = 1.05  # times the least unexplained: air says too little far more often than too much
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """The kernel so many times as high that line integrals (F, v, u), blurred by so many pixels, explain themselves best; as
-    it is where they hardly gain."""
+    """The kernel as high as leaves line integrals (F, v, u), blurred by so many pixels, about as well explained as any
+    height does."""
     if not kernel:
         return kernel
     coarse = smooth(frames, blur)
@@ -76,12 +76,12 @@ def raised(kernel: Kernel, frames: np.ndarray, model: Model, blur: float = 0.0) 
     def times(height: float) -> Kernel:
         return {width: height * own for width, own in kernel.items()}
 
-    height, least = 1.0, (before := left(1.0))
+    height, least = 1.0, left(1.0)
     for _ in range(_MOST_RAISED):
-        if (further := left(_RAISED * height)) >= least:
+        if (further := left(_RAISED * height)) > _AS_WELL * least:
             break
-        height, least = _RAISED * height, further
-    return times(height) if least < _BETTER * before else kernel
+        height, least = _RAISED * height, min(least, further)
+    return times(height)
 
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

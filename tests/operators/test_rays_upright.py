@@ -79,7 +79,8 @@ def test_lines_without_cells_are_zero(cpu_rt) -> None:
     assert not frames[0, 17:34].any() and frames[0, :17].any() and frames[0, 34:].any()
 
 
-def test_a_subset_and_batches_of_frames(rt) -> None:
+def test_a_subset_and_batches_of_frames(banded_rt) -> None:
+    rt = banded_rt
     cells, x = tables("static", TALL_PANEL, frames=5), noise(GRID.shape, 105)
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
     operator = RayOperator(rt, GRID, TALL_PANEL, cells)
@@ -91,7 +92,8 @@ def test_a_subset_and_batches_of_frames(rt) -> None:
         np.testing.assert_array_equal(operator.subset([4, 1]).forward(x), expected[[4, 1]])
 
 
-def test_without_room_for_the_turned_volume(rt, monkeypatch) -> None:
+def test_without_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
+    rt = banded_rt
     cells, x = tables("static", TALL_PANEL), noise(GRID.shape, 106)
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
     operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(GRID, TALL_PANEL, "rows")

@@ -137,15 +137,15 @@ def test_an_axially_symmetric_cloud_does_not_move(rt, make_geometry) -> None:
         assert_near(render(rt, rows, table), static, STANDING_PICTURE)
 
 
-def test_launches_do_not_grow_with_the_micro_views(rt, make_cloud, orbit, monkeypatch) -> None:
+def test_launches_do_not_grow_with_the_micro_views(banded_rt, make_cloud, orbit, monkeypatch) -> None:
     """Preparation, gather and both adjoint passes once a frame, 1 micro-view or 40 (no serial loop)."""
     launched, counts = note_launches(monkeypatch), []
     for strips, sub_intervals in ((1, 1), (8, 5)):
         table = micro_view_cells(orbit, Shutter(0.5, 0.4), 0, START_S, SHAPE[0], strips, sub_intervals)
         assert table.count == strips * sub_intervals
         launched.clear()
-        cells = DeviceCells.upload(rt, table)
-        SplatProjector(rt, *SHAPE).project_adjoint(make_cloud(4, 36), cells, np.ones(SHAPE))
+        cells = DeviceCells.upload(banded_rt, table)
+        SplatProjector(banded_rt, *SHAPE).project_adjoint(make_cloud(4, 36), cells, np.ones(SHAPE))
         counts.append(list(launched))
     assert counts[0] == counts[1]
     for kernel in ("splat_prepare", "splat_forward_rows", "splat_backward_rows", "splat_chain"):

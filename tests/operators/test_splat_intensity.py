@@ -110,7 +110,7 @@ def test_no_line_has_two_cells_in_a_layer(make_table, motion) -> None:
     assert len(weights) == max(by_line)
 
 
-def test_launches_do_not_grow_with_the_cells(rt, make_cloud, make_table, monkeypatch) -> None:
+def test_launches_do_not_grow_with_the_cells(banded_rt, make_cloud, make_table, monkeypatch) -> None:
     names, table = note_launches(monkeypatch), make_table("exact")
-    projector(rt, table).project(make_cloud(4, 65), DeviceCells.upload(rt, table))
+    projector(banded_rt, table).project(make_cloud(4, 65), DeviceCells.upload(banded_rt, table))
     assert names.count("splat_forward_rows") == 1 and names.count("intensity_merge") == 1

@@ -128,12 +128,13 @@ class _Trials:
         return round(found) if isinstance(tried[0], int) else found
 
     def compare(self, options: Any, values: Sequence[float]) -> None:
-        """Errors of runs at ``values``; or at some about the present one, and further on where the choice is at an end.
-        Smoothing is as good in shorter runs; how far a relaxation goes they would not tell."""
+        """Errors of runs at ``values``; or at some about the present one, and further on where the choice is at an end, but
+        for whole numbers, with which runs may grow. Smoothing is as good in shorter runs; how far a relaxation goes they
+        would not tell."""
         if self.option in _WEIGHTS and hasattr(options, "iterations"):
             options = replace(options, iterations=-(-options.iterations // _SHORTER))
         self._try(options, values or [factor * getattr(options, self.option) for factor in _FACTORS])
-        for _ in range(0 if values else _MOST_FURTHER):
+        for _ in range(0 if values or isinstance(getattr(options, self.option), int) else _MOST_FURTHER):
             tried = sorted(self.errors)
             if self.choice >= tried[-1]:
                 self._try(options, [_FURTHER * tried[-1]])
