@@ -16,9 +16,9 @@ from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.arc import view_arc
+from phyradgs_cl.reconstructors.fdk.beyond import reprojected, whole_object
 from phyradgs_cl.reconstructors.fdk.extrapolate import WAYS, extrapolated
 from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter
-from phyradgs_cl.reconstructors.fdk.reprojected import reprojected, whole_object
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
     check_orbit,

@@ -3,7 +3,7 @@
 cosine: rows end in a quarter of a cosine (as Ohnesorge et al., Med. Phys. 27 (2000) 39, smooth theirs). cylinder: in the
 chords of a cylinder that goes on from the row's last values and slope (Hsieh et al., Med. Phys. 31 (2004) 2385), of the
 attenuation that the squares of what the row shows are a parabola for. Both only keep the cut from ringing into the volume:
-what lies beyond the panel stays unknown. reprojected: ``reprojected.py``.
+what lies beyond the panel stays unknown. reprojected: ``beyond.py``.
 """
 
 import numpy as np
