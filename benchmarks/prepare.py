@@ -33,6 +33,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "fista": {"motion": "per-row"},
 }
 USUAL = ["fdk", "fista-tv", "phyradgs"]
+BOXES = (20, 22, 26, 28, 32)  # with the margin, of a grid of 32; a margin of half the part is 24
 GAUSSIANS = 1000  # at least, in a box of any size
 LOST_DB = 0.1  # less is not worth a share of it
 
@@ -79,12 +80,17 @@ EFFECTS = {
     ),
     "120 kVp, bone": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
     "a third cut off": Effect({"truncation": 0.6}, "", part=0.375, margin=0.5),  # of the width
-    "a third cut off, wide": Effect({"truncation": 0.6}, "", part=0.375, margin=0.83),  # the scan's whole grid
     "all": Effect(
         {"sparks": 1e-4, "rings": 0.01, "drift": 0.02, "scatter": 0.3, "kvp": 120.0},
         "sparks,scatter,air,hardening,rings",
         {"hardening": {"kvp": 120.0}},
     ),
+}
+
+USUAL_EFFECTS = list(EFFECTS)
+EFFECTS |= {
+    f"a third cut off, {box} of 32": Effect({"truncation": 0.6}, "", part=0.375, margin=(box / 12 - 1) / 2)
+    for box in BOXES
 }
 
 
@@ -153,7 +159,7 @@ def main() -> None:
     parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"], help="names, or files of volumes")
     parser.add_argument("--seed", type=int, default=0, help="of noise and of what is planted")
     parser.add_argument("--methods", nargs="+", default=USUAL, choices=list(METHODS))
-    parser.add_argument("--effects", nargs="+", default=list(EFFECTS), choices=list(EFFECTS))
+    parser.add_argument("--effects", nargs="+", default=USUAL_EFFECTS, choices=list(EFFECTS))
     parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     parser.add_argument("--figure", type=Path, help="draw slices of the jaw into this file, run nothing else")
     given = parser.parse_args()

@@ -149,7 +149,7 @@ def _exact_model(shape: tuple[int, int, int], rays: tuple[int, int, int]) -> Mod
     def volume(frames: np.ndarray) -> np.ndarray:
         return (back @ frames.ravel()).reshape(shape).astype(np.float32)
 
-    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), lambda: np.zeros(shape), volume)
+    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), volume)
 
 
 def test_bone_is_what_the_beam_says_and_not_the_densest_of_three_classes() -> None:
