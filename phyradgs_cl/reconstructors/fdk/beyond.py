@@ -1,7 +1,7 @@
 """Objects wider than the panel: rows that go on beyond it as a volume on a grid that holds the object has them.
 
-The volume explains the frames by FISTA-TV (as Ruchala et al., Phys. Med. Biol. 47 (2002) 3567, iterate to complete what a
-panel cuts off). What the panel has seen stays as it was measured.
+The volume explains the frames by FISTA-TV. What the panel has seen stays as it was measured, so that FDK adds to that volume
+what frames tell beyond it.
 """
 
 from dataclasses import replace
