@@ -202,9 +202,8 @@ class Scan:
             return self
         reference = self.reference
         if reference is not None:
-            first = grid.start_in(self.grid)
-            parts = None if first is None else [slice(s, s + n) for s, n in zip(first, grid.shape, strict=True)]
-            reference = None if parts is None else reference[tuple(parts)]
+            part = grid.slices_in(self.grid)
+            reference = None if part is None else reference[part]
         return replace(self, grid=grid, reference=reference)
 
     def with_grid(self, choice: GridChoice) -> "Scan":

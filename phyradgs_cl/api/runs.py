@@ -189,10 +189,11 @@ def reconstruct(
     method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md).
     options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested
     ones are dicts (``control={"every": 50}``). preset: where they start from.
-    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different
-    (docs/methods.md#the-grid). holdout: percent of the pixels that the method does not see; how far the volume is from them
-    stands in the result's facts (docs/methods.md#quality-without-a-truth). tune: "NAME", or "NAME=VALUE,VALUE,VALUE", of an
-    option that trials on this scan choose, and what they found is in the facts (docs/methods.md#weights-from-the-data).
+    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different, and
+    ``margin_mm`` how much beyond is filled and not kept (docs/methods.md#the-grid). holdout: percent of the pixels that the
+    method does not see; how far the volume is from them stands in the result's facts
+    (docs/methods.md#quality-without-a-truth). tune: "NAME", or "NAME=VALUE,VALUE,VALUE", of an option that trials on this
+    scan choose, and what they found is in the facts (docs/methods.md#weights-from-the-data).
     seed: of what is drawn at random; the same seed on the same device gives the same bits.
     report: a function that is called with every ``Progress``, of voxels each iteration, of splats every 50 and where ten
     seconds went by; True: a line with rate and time left, on a terminal or in a

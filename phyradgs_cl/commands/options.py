@@ -53,3 +53,5 @@ Size = Annotated[Any, _numbers(_SIZE, "N|Z,Y,X")]
 VoxelMm = Annotated[Any, _numbers("Sides of a voxel, mm; the box stays as it is, but for whole voxels.", "D|Z,Y,X")]
 _ROI = "Box of the volume, mm about the axis, or sides about the middle of the scan's; the voxels stay as they are."
 RoiMm = Annotated[Any, _numbers(_ROI, "D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")]
+_MARGIN = "Beyond the box, mm: voxels that the method fills and that are not kept, for objects larger than box or panel."
+MarginMm = Annotated[Any, option(_MARGIN, "0", parser=numbers, metavar="D|Z,Y,X")]

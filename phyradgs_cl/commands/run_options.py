@@ -69,6 +69,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "size": options.Size,
     "voxel_mm": options.VoxelMm,
     "roi_mm": options.RoiMm,
+    "margin_mm": options.MarginMm,
     "seed": _asked(int, "Seed of cloud, frame order and sub-volumes.", "0"),
     "preset": _asked(str, _PRESET, "the method's first"),
     "batch": _asked(

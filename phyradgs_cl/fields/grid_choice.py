@@ -20,15 +20,17 @@ class GridChoice:
 
     size: voxels (z, y, x), or one count: along the longest side, the others in proportion. voxel_mm: sides of a voxel
     (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame, or its sides (z, y, x), or one
-    length of all, about the middle of the scan's grid.
+    length of all, about the middle of the scan's grid. margin_mm: how far beyond this box (z, y, x), or in all directions,
+    methods fill voxels that are not kept.
 
     Raises:
-        InputError: what is no such numbers or out of range, a box that ends before it begins, or all three.
+        InputError: what is no such numbers or out of range, a box that ends before it begins, or all three of the first.
     """
 
     size: int | tuple[int, ...] | None = None
     voxel_mm: float | tuple[float, ...] | None = None
     roi_mm: tuple[float, ...] | None = None
+    margin_mm: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -50,6 +52,11 @@ class GridChoice:
             if len(ends_mm) == 6 and any(b - a < 1 / _LARGEST_MM for a, b in zip(ends_mm[::2], ends_mm[1::2], strict=True)):
                 raise InputError("--roi-mm", checks.shown(self.roi_mm), "Z0 below Z1, Y0 below Y1, X0 below X1")
             object.__setattr__(self, "roi_mm", ends_mm)
+        if self.margin_mm is not None:
+            widths_mm = _numbers("--margin-mm", self.margin_mm, (1, 3), "20 or 0,20,20")
+            for width_mm in widths_mm:
+                checks.within("--margin-mm", width_mm, 0, _LARGEST_MM)
+            object.__setattr__(self, "margin_mm", widths_mm if len(widths_mm) == 3 else widths_mm * 3)
         if self.size is not None and self.voxel_mm is not None and self.roi_mm is not None:
             expected = "at most two of --size, --voxel-mm and --roi-mm, which say the third"
             raise InputError("--size", "all three", expected, "leave one out")
@@ -79,6 +86,14 @@ class GridChoice:
         voxel_mm = sides_mm / shape if self.voxel_mm is None else self.voxel_mm
         return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
 
+    def with_margin(self, grid: Grid) -> Grid:
+        """``grid`` with as many of its voxels around it as make ``margin_mm``. Raises InputError for too many."""
+        if self.margin_mm is None:
+            return grid
+        around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _ROUNDING)
+        shape = self._whole(grid.shape + 2 * around, "--margin-mm")
+        return grid.part(triple(int(-n) for n in around), shape)
+
     def _box_mm(self, grid: Grid) -> np.ndarray:
         """Where the voxels are to begin and end (3, 2): the box that is asked for, else that of ``grid``."""
         if self.roi_mm is None:
@@ -99,9 +114,10 @@ class GridChoice:
         shape = self._whole(np.maximum(np.ceil(high - _ROUNDING) - start, 1))
         return grid.part(triple(int(n) for n in start), shape)
 
-    def _whole(self, shape: np.ndarray) -> tuple[int, int, int]:
+    def _whole(self, shape: np.ndarray, culprit: str = "") -> tuple[int, int, int]:
         if np.prod(shape) > MOST_VOXELS:
-            culprit = "--voxel-mm" if self.voxel_mm is not None else "--size" if self.size is not None else "--roi-mm"
+            implied = "--voxel-mm" if self.voxel_mm is not None else "--size" if self.size is not None else "--roi-mm"
+            culprit = culprit or implied
             found = " × ".join(f"{n:.6g}" for n in shape)
             raise InputError(culprit, f"a grid of {found}", f"at most {MOST_VOXELS:.3g} voxels")
         return triple(int(n) for n in shape)

@@ -105,16 +105,15 @@ class Grid:
         )
         return Grid(shape, self.voxel_size_mm, (z, y, x))
 
-    def start_in(self, whole: "Grid") -> tuple[int, int, int] | None:
-        """The first voxel (z, y, x) of a grid that is a part of ``whole``; None for one that is not."""
+    def slices_in(self, whole: "Grid") -> tuple[slice, slice, slice] | None:
+        """Where (z, y, x) a grid is that is a part of ``whole``; None for one that is not."""
         if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
             return None
         exact = np.subtract(self.first_centre_mm, whole.first_centre_mm) / whole.voxel_size_mm
         start = np.round(exact)
         if np.abs(exact - start).max() > _SAME_PLACE or (start < 0).any() or (start + self.shape > whole.shape).any():
             return None
-        z, y, x = (int(n) for n in start)
-        return z, y, x
+        return triple(slice(int(s), int(s) + n) for s, n in zip(start, self.shape, strict=True))
 
     def scaled(self, factor: float) -> "Grid":
         """The same voxels with every length multiplied by ``factor``."""

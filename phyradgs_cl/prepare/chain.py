@@ -16,7 +16,6 @@ from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
 from phyradgs_cl.prepare.sparks import SparkOptions, mask_sparks
 from phyradgs_cl.prepare.step import Facts, MakeModel, Step
-from phyradgs_cl.prepare.surroundings import SurroundingOptions, subtract_surroundings
 from phyradgs_cl.text import near_miss
 
 log = logging.getLogger(__name__)
@@ -28,7 +27,6 @@ STEPS: Mapping[str, Step] = {
     "air": normalise_air,
     "hardening": correct_hardening,
     "rings": remove_rings,
-    "surroundings": subtract_surroundings,
 }
 """In the order in which they are done, whatever the order in which they are asked for."""
 DEFAULT_STEPS = "sparks,dead,rings"
@@ -49,7 +47,6 @@ class PrepareOptions:
     air: AirOptions = AirOptions()
     hardening: HardeningOptions = HardeningOptions()
     rings: RingOptions = RingOptions()
-    surroundings: SurroundingOptions = SurroundingOptions()
 
     def __post_init__(self) -> None:
         checks.one_of("flats", self.flats, WAYS)

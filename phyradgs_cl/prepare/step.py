@@ -14,12 +14,10 @@ Facts = dict[str, Any]
 @dataclass(frozen=True)
 class Model:
     """A scan's own way from frames (F, v, u) to a volume (z, y, x) and back, on its grid, for steps that ask the object.
-    fitted: the volume that explains the scan's valid pixels by what is on the grid, regularised: one with little total
-    variation that explains frames, both of which take a while."""
+    regularised: one with little total variation that explains frames, which takes a while."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
-    fitted: Callable[[], np.ndarray]
     regularised: Callable[[np.ndarray], np.ndarray]
 
 

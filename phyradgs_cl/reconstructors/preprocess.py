@@ -26,7 +26,7 @@ _HIDING = ("holdout", "tune")
 
 @dataclass(frozen=True)
 class InputOptions(PrepareOptions, GridChoice):
-    """size, voxel_mm, roi_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
+    """size, voxel_mm, roi_mm, margin_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
     median_filter: edge of its window in pixels, 0 for none. holdout: percent of the pixels that no method sees
     (``holdout.py``). tune: the option of the method that such pixels choose (``tune/``). steps and a table each: as of
     ``PrepareOptions``.
@@ -61,14 +61,14 @@ class InputOptions(PrepareOptions, GridChoice):
 
     def check_written(self) -> None:
         """InputError for what makes no sense in a scan that is kept."""
-        for name in self._hiding:
+        for name in [*self._hiding, *(["margin_mm"] if self.margin_mm is not None else [])]:
             found, remedy = f"{getattr(self, name)}, without a method", "give it to the reconstruction"
-            raise InputError(f"--{name}", found, "none where a scan is prepared", remedy)
+            raise InputError(f"--{name.replace('_', '-')}", found, "none where a scan is prepared", remedy)
 
 
 def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Scan:
-    """The scan as a method gets it; the scan itself where nothing is to be done. ``rt``: where steps that ask the object
-    reconstruct and project it."""
+    """The scan as a method gets it, on a grid with its margin; the scan itself where nothing is to be done. ``rt``: where
+    steps that ask the object reconstruct and project it."""
     scan = prepare(_begun(scan, options), options, partial(_model, rt))
     if options.median_filter > 0:
         scan = replace(scan, projections=median_frames(scan, options.median_filter))
@@ -85,6 +85,7 @@ def stages(scan: Scan, options: InputOptions, rt: Runtime) -> Iterator[tuple[str
 def _begun(scan: Scan, options: InputOptions) -> Scan:
     """The scan as the first step gets it."""
     scan = scan.with_grid(options)
+    scan = scan.on_grid(options.with_margin(scan.grid))
     return scan if options.ignore_lag else without_lag(scan)
 
 

@@ -161,6 +161,8 @@ def reconstruct(
     chosen = method_options(method, tune=asked.tune) if options is None else options
     if rt.ranks.size > 1:
         _check_ranks(method_name(method), rt)
+    if asked.margin_mm is not None:
+        _check_margin(method, chosen)
     ready = prepared(scan, asked, rt)
     ready.check_sight()
     check_own_motion(getattr(chosen, "motion", None), ready)
@@ -177,7 +179,7 @@ def reconstruct(
         result.facts[HELD_OUT] = holdout_errors(rt, ready, held, result)
     if TOLD in ready.provenance:
         result.facts[TOLD] = ready.provenance[TOLD]
-    return result
+    return result if asked.margin_mm is None else result.within(asked.of(scan.grid))
 
 
 def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.ndarray:
@@ -192,6 +194,14 @@ def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.n
         box_mm = np.round(grid.box_mm, 3).tolist()
         raise InputError("--initial", f"a volume in {box_mm} mm (z, y, x)", "one that meets the scan's grid")
     return first
+
+
+def _check_margin(method: object, options: Any) -> None:
+    """InputError where a method would do nothing with voxels beyond the box."""
+    if (way := getattr(options, "extrapolate", None)) not in (None, "reprojected"):
+        found = f"--method {method_name(method)} with extrapolate={way}, whose voxels do not depend on each other"
+        remedy = "add --set extrapolate=reprojected, or leave it out"
+        raise InputError("--margin-mm", found, "a method that explains frames by what is in the box", remedy)
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:

@@ -10,15 +10,13 @@ from phyradgs_cl.prepare import Model
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
-from phyradgs_cl.reconstructors.voxels.sart import OS_METHOD, OS_SART
 from phyradgs_cl.runtime import Runtime
 
-_ITERATIONS = 5
 _LITTLE_VARIATION = FistaTvOptions(motion=PerRow(sub_intervals=1), iterations=30, tv_weight=0.002)
 
 
 def reprojection(rt: Runtime, scan: Scan) -> Model:
-    """FDK and OS-SART with every line at the middle of its own exposure, and rays at the same times, on the scan's grid."""
+    """FDK with every line at the middle of its own exposure, and rays at the same times, on the scan's grid."""
     motion = LineMiddles()
     options = FdkOptions(window="hann", motion=motion)
     tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
@@ -27,12 +25,8 @@ def reprojection(rt: Runtime, scan: Scan) -> Model:
     def volume(frames: np.ndarray) -> np.ndarray:
         return fdk(replace(scan, projections=np.asarray(frames, np.float32)), options, rt).volume
 
-    def fitted() -> np.ndarray:
-        times = replace(OS_SART, motion=PerRow(sub_intervals=1), iterations=_ITERATIONS)
-        return OS_METHOD.run(scan, times, rt).volume
-
     def regularised(frames: np.ndarray) -> np.ndarray:
         own = replace(scan, projections=np.asarray(frames, np.float32))
         return fista_tv.METHOD.run(own, _LITTLE_VARIATION, rt).volume
 
-    return Model(volume, operator.forward, fitted, regularised)
+    return Model(volume, operator.forward, regularised)

@@ -66,6 +66,13 @@ class Reconstruction:
             return ""
         return f", stopped after {done} of {asked} iterations ({reason})"
 
+    def within(self, grid: Grid) -> "Reconstruction":
+        """The part of it that is on ``grid``, with all Gaussians; the result itself where that is no part of its own."""
+        if (part := grid.slices_in(self.grid)) is None:
+            return self
+        disagreement = None if self.disagreement is None else self.disagreement[part].copy()
+        return replace(self, volume=self.volume[part].copy(), grid=grid, disagreement=disagreement)
+
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
         """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.

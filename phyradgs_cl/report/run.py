@@ -103,9 +103,11 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
     facts = scan_summary(found, str(known) if scan_path is None else None)
     if known is not None and facts["sha256"] != known:
         notes.append("The scan shown here is not the file that this volume was reconstructed from: its hash differs.")
-    flats = input_of(stored).flats
-    whole = read_scan(found, flat_correction(flats))
-    whole = replace(whole, provenance={**whole.provenance, "flats": flats})
+    before = input_of(stored)
+    if before.margin_mm is not None:
+        notes.append("What the method filled beyond the box is discarded: frames computed from the volume lack it.")
+    whole = read_scan(found, flat_correction(before.flats))
+    whole = replace(whole, provenance={**whole.provenance, "flats": before.flats})
     scan = whole.on_grid(stored.grid)
     if whole.reference is not None and scan.reference is None:
         notes.append("The scan's reference is on another grid than the volume and is not shown.")

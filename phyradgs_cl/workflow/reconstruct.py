@@ -194,9 +194,10 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
         found = "%d strips are more than the %d lines of %s: one strip per line is the most there is"
         log.warning(found, motion.strips, scan.lines, job.scan)
-    grid = scan.with_grid(job.before).grid
+    grid = job.before.with_margin(scan.with_grid(job.before).grid)
     if grid != scan.grid and hasattr(options, "iterations") and cuts(grid, scan.grid, scan.geometry):
-        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; fdk does not"
+        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it"
+        found += "; --margin-mm has that filled beside the box, and discards it"
         log.warning(found, job.scan, job.method)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:

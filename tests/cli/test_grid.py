@@ -49,6 +49,14 @@ def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_pa
     assert cli.run([*command, "--roi", INSIDE]) == 0
     (line,) = [r.getMessage() for r in caplog.records if "field of view" in r.getMessage()]
     assert "--method sirt puts what lies beyond into it" in line
+    caplog.clear()
+    alone = read_volume(tmp_path / "v.h5")
+    assert cli.run([*command, "--roi", INSIDE, "--margin-mm", "0.5"]) == 0
+    assert caplog.records == []
+    found = read_volume(tmp_path / "v.h5")
+    assert found.grid == alone.grid and found.metrics["psnr_db"] > alone.metrics["psnr_db"] + 3
+    assert found.provenance["input"]["margin_mm"] == [0.5] * 3
+    assert "filled beyond the box is discarded" in load_run(tmp_path / "v.h5", scan).notes[-1]
 
 
 def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, monkeypatch) -> None:
@@ -65,6 +73,7 @@ def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, mo
     assert cli.run([*command, "--size", "6"]) == 0
     os.replace(kept, f"{output}.checkpoint.npz")
     refused([*command, "--size", "7", "--resume"], "a run with other input.size (6, now 7)")
+    refused([*command, "--size", "6", "--margin-mm", "0.1", "--resume"], "a run with other input.margin_mm")
     assert cli.run([*command, "--size", "6", "--resume"]) == 0
 
 
@@ -74,5 +83,5 @@ def test_an_estimate_is_of_the_grid_that_is_chosen(cli, scan, capsys) -> None:
         assert cli.run(["estimate", str(scan), *SIRT, "--size", size]) == 0
         told.append(capsys.readouterr().out)
     assert told[0] != told[1]
-    assert cli.run(["estimate", str(scan), *SIRT, "--roi", INSIDE]) == 0
+    assert cli.run(["estimate", str(scan), *SIRT, "--roi", INSIDE, "--margin-mm", "0.2"]) == 0
     assert "time " in capsys.readouterr().out

@@ -56,6 +56,7 @@ def test_what_is_chosen(choice, shape, voxel_mm, offset_mm) -> None:
         ({"roi_mm": (-1e12, 2, -4, 4, 0, 4)}, "--roi-mm: found -1000000000000.0"),
         ({"roi_mm": (-1e6, 1e6, -1e6, 1e6, 0, 4)}, "--roi-mm: found a grid of"),
         ({"roi_mm": BOX, "size": 4, "voxel_mm": 1}, "--size: found all three"),
+        ({"margin_mm": -1}, "--margin-mm: found -1.0"), ({"margin_mm": (1, 2)}, "--margin-mm: found .*three"),
     ],
 )
 def test_what_is_refused(choice, error) -> None:
@@ -65,6 +66,17 @@ def test_what_is_refused(choice, error) -> None:
 
 def test_a_part_of_a_grid_knows_its_place() -> None:
     part = GRID.part((1, 2, 3), (4, 5, 6))
-    assert part.start_in(GRID) == (1, 2, 3) and GRID.start_in(GRID) == (0, 0, 0)
+    assert part.slices_in(GRID) == (slice(1, 5), slice(2, 7), slice(3, 9))
+    assert GRID.slices_in(GRID) == tuple(slice(0, n) for n in GRID.shape)
     for other in (GRID, GRID.scaled(1.1), Grid(part.shape, part.voxel_size_mm, (1.2, 2.0, 3.0))):
-        assert other.start_in(part) is None
+        assert other.slices_in(part) is None
+
+
+def test_a_margin_is_whole_voxels_around_the_box() -> None:
+    for margin_mm, shape in ((0, GRID.shape), (2, (14, 24, 42)), ((0, 0.1, 4.1), (10, 22, 46))):
+        wide = GridChoice(margin_mm=margin_mm).with_margin(GRID)
+        assert wide.shape == shape and wide.offset_mm == pytest.approx(GRID.offset_mm), margin_mm
+        assert GRID.slices_in(wide) is not None
+    assert GridChoice(size=5).with_margin(GRID) is GRID
+    with pytest.raises(InputError, match="--margin-mm: found a grid of"):
+        GridChoice(margin_mm=1e8).with_margin(GRID)

@@ -24,7 +24,6 @@ from phyradgs_cl.prepare import (
 )
 from phyradgs_cl.prepare.hardening import find_bone
 from phyradgs_cl.prepare.scatter import raised
-from phyradgs_cl.prepare.surroundings import surrounding_grid
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.reprojection import reprojection
@@ -152,7 +151,7 @@ def _exact_model(shape: tuple[int, int, int], rays: tuple[int, int, int]) -> Mod
     def volume(frames: np.ndarray) -> np.ndarray:
         return (back @ frames.ravel()).reshape(shape).astype(np.float32)
 
-    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), lambda: np.zeros(shape), volume)
+    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), volume)
 
 
 def test_a_kernel_is_raised_to_what_frames_say() -> None:
@@ -242,18 +241,3 @@ def test_what_is_no_step_or_no_option_of_one(planted) -> None:
         with pytest.raises(InputError, match=told):
             call()
     assert set(STEPS) <= set(vars(InputOptions()))
-
-
-def test_a_part_of_the_object_is_freed_of_what_surrounds_it(rt, planted) -> None:
-    """Voxels of the middle half by OS-SART: what lies beyond no longer ends up in them; the grid holds whole coarse
-    voxels."""
-    scan = planted()
-    half = scan.grid.part((7, 7, 7), (14, 14, 14))
-    roi_mm = tuple(float(end) for end in half.box_mm.ravel())
-    truth = scan.on_grid(half).reference
-    usual = {"motion": "per-row", "iterations": 5, "roi_mm": roi_mm, "device": rt}
-    plain, freed = (reconstruct(scan, "os-sart", steps=steps, **usual).volume for steps in ("", "surroundings"))
-    errors = [float(np.sqrt(np.mean((volume - truth) ** 2))) for volume in (plain, freed)]
-    assert errors[1] < 0.5 * errors[0], errors
-    about, inside = surrounding_grid(half, 2.0, 2.0)
-    assert about.part(tuple(s.start for s in inside), (7, 7, 7)).box_mm == pytest.approx(half.box_mm)

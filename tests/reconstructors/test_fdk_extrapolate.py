@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
+from phyradgs_cl.api import reconstruct, simulate
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import fdk_volume
+from phyradgs_cl.reconstructors.fdk.beyond import reprojected
 from phyradgs_cl.reconstructors.fdk.extrapolate import extrapolated
 
 BEYOND = 20  # pixels at each side of a panel of 41
@@ -52,3 +54,48 @@ def test_the_cut_rings_less_into_a_truncated_body(rt, caplog) -> None:
     with caplog.at_level(logging.WARNING):
         np.testing.assert_array_equal(volume("cylinder", 0.4), volume("none", 0.4))
     assert "displaced detector are not extrapolated" in caplog.text
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_rows_go_on_as_a_volume_has_them(rt, axis) -> None:
+    """Half the columns of a wide panel, with a pose for every line; lines beyond the panel have the pose of the last."""
+    body = EllipsoidPhantom((Ellipsoid((0.1, 0.0, 0.0), (0.7, 0.9, 0.6), 0.5),), "ball")
+    grid = Grid((24, 40, 40), (0.05, 0.05, 0.05))
+    lines = np.arange(8) if axis == "rows" else np.clip(np.arange(-10, 30), 0, 19)
+    angles = np.arange(3)[:, None] + 0.01 * lines
+    full, half = (ConeGeometry(8.0, 10.0, (8, columns), (0.15, 0.07)).pose(angles) for columns in (40, 20))
+    pixels = pixel_centres(full, (8, 40))  # (F, lines, v, u, 3): each line's own
+    source = np.broadcast_to(full[:, :, None, None, :3], pixels.shape)
+    of_lines = body.line_integrals(source, pixels).astype(np.float32)
+    number = np.arange(len(lines))
+    whole = of_lines[:, number, number] if axis == "rows" else of_lines[:, number, :, number].transpose(1, 2, 0)
+    poses = half if axis == "rows" else half[:, 10:30]
+    frames = whole[..., 10:30]
+    found, count = reprojected(rt, frames, poses, axis, body.voxelise(grid), grid)
+    np.testing.assert_array_equal(found[..., count : count + 20], frames)
+    assert count >= 10 and np.abs(whole[..., :10]).max() > 0.1
+    off = found[..., count - 10 : count + 30] - whole
+    assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(whole**2))
+    assert not found[..., [0, -1]].any()  # all of the grid is seen
+
+
+def test_a_box_of_an_object_wider_than_the_panel(rt) -> None:
+    """Three quarters of what the lost columns cost are regained, and a whole panel's volume stays as it was; Ctrl-C ends
+    it before there is a volume."""
+    usual = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 5.0, "device": rt}
+    whole, cut = simulate("jaw", **usual), simulate("jaw", **usual, truncation=0.6)
+    box = {"roi_mm": [0.375 * side for side in whole.grid.size_mm], "device": rt, "motion": "per-row"}
+    more = {"margin_mm": 3 * whole.grid.voxel_size_mm[0], "extrapolate": "reprojected"}
+    best, same, spoilt, regained = (
+        reconstruct(scan, "fdk", **box, **how).volume for scan in (whole, cut) for how in ({}, more)
+    )
+    np.testing.assert_allclose(same, best, atol=0.02 * best.max())
+    error = [float(np.sqrt(np.mean((volume - best) ** 2))) for volume in (spoilt, regained)]
+    assert error[1] < 0.25 * error[0], error
+
+    def stop(progress) -> None:
+        assert "beyond the panel" in progress.quantity and progress.state is None
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="before there was a volume"):
+        reconstruct(cut, "fdk", **box, **more, report=stop)

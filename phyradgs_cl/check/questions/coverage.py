@@ -59,8 +59,8 @@ def check_coverage(scan: Scan) -> Finding:
     if level <= threshold:
         return Finding(_QUESTION, OK, level, threshold, "line integral", text)
     advice = (
-        "the object reaches beyond the panel (or air is not 0: check the flats). Expect a bright rim; FDK suffers most "
-        "(--set extrapolate=cylinder helps), iterative methods less with a grid that holds the whole object"
+        "the object reaches beyond the panel (or air is not 0: check the flats). Expect a bright rim, unless the method has "
+        "a box as large as the object: --roi-mm of what is wanted and --margin-mm; fdk with --set extrapolate=reprojected"
     )
     return Finding(_QUESTION, SUSPICIOUS, level, threshold, "line integral", text, advice)
 

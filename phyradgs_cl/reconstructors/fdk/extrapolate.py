@@ -3,12 +3,12 @@
 cosine: rows end in a quarter of a cosine (as Ohnesorge et al., Med. Phys. 27 (2000) 39, smooth theirs). cylinder: in the
 chords of a cylinder that goes on from the row's last values and slope (Hsieh et al., Med. Phys. 31 (2004) 2385), of the
 attenuation that the squares of what the row shows are a parabola for. Both only keep the cut from ringing into the volume:
-what lies beyond the panel stays unknown.
+what lies beyond the panel stays unknown. reprojected: ``beyond.py``.
 """
 
 import numpy as np
 
-WAYS = ("none", "cosine", "cylinder")
+WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # of the panel's columns, added at each side
 _SLOPE_PIXELS = 5  # that the slope at the edge is measured over
 _NOISE = 0.01  # of the largest line integral: an edge below it is air
