@@ -20,10 +20,13 @@ def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
 
 
 def default_grid(geometry: ConeGeometry) -> Grid:
-    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
-    side_mm = 2 * field_of_view_mm(geometry)[1]
+    """The cube that is as wide as the field of view of a full turn, but no higher than what a panel of few rows sees, in
+    voxels of one pixel pitch at the axis."""
+    half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
-    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)
+    wide = max(1, math.ceil(2 * radius_mm / voxel_mm))
+    high = max(1, min(wide, round(2 * half_height_mm / voxel_mm)))
+    return Grid((high, wide, wide), (voxel_mm,) * 3)
 
 
 def misses(grid: Grid, geometry: ConeGeometry) -> bool:

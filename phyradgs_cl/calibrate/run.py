@@ -244,8 +244,11 @@ def _limited(one: Parameter, level: Level | BeadLevel, old: float, new: float) -
 
 
 def _ask(problem: Reduced, least: float, search: _Search) -> None:
-    """Which parameters the frames tell, of whose signals ``least`` is left, and what they cannot tell apart."""
-    search.known = identifiable(problem, least)
+    """Which parameters the frames tell: of whose signals ``least`` is left, to more than nothing; and what they cannot tell
+    apart."""
+    shared = identifiable(problem, least)
+    deviations = problem.only(shared).deviations() if shared else ()
+    search.known = tuple(n for n, d in zip(shared, deviations, strict=True) if PARAMETERS[n].is_told(float(d)))
     search.alike = [in_words(weights) for weights in alike(problem, least)]
     search.shares = dict(zip(problem.names, problem.shares.tolist(), strict=True))
 
