@@ -41,7 +41,7 @@ class Parameter:
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
     def is_told(self, deviation: float) -> bool:
-        """Whether a value with this standard deviation (in the field's unit) says anything: an angle's of few rows is all round."""
+        """Whether a value with this standard deviation, in the field's unit, says anything: an angle may be all round."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
