@@ -53,6 +53,15 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 
+def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
+    """How far behind the middle of ``grid`` the panel of a pose (12,) stands; below half the grid's width it stands in it,
+    and rays end there."""
+    source, first, step_u, step_v = pose.reshape(4, 3)
+    away = np.cross(step_u, step_v)
+    away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)
+    return float((first - np.array(grid.offset_mm)[::-1]) @ away)
+
+
 def cuts(grid: Grid, whole: Grid, geometry: ConeGeometry) -> bool:
     """Whether ``grid`` ends, by more than a voxel, inside of what is seen of the box of ``whole``."""
     half_mm = np.array(field_of_view_mm(geometry))
