@@ -20,10 +20,13 @@ def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
 
 
 def default_grid(geometry: ConeGeometry) -> Grid:
-    """The cube that is as wide as the field of view of a full turn, in voxels of one pixel pitch at the axis."""
-    side_mm = 2 * field_of_view_mm(geometry)[1]
+    """The cube that is as wide as the field of view of a full turn, but no higher than what a panel of few rows sees, in
+    voxels of one pixel pitch at the axis."""
+    half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
-    return Grid((max(1, math.ceil(side_mm / voxel_mm)),) * 3, (voxel_mm,) * 3)
+    wide = max(1, math.ceil(2 * radius_mm / voxel_mm))
+    high = max(1, min(wide, round(2 * half_height_mm / voxel_mm)))
+    return Grid((high, wide, wide), (voxel_mm,) * 3)
 
 
 def misses(grid: Grid, geometry: ConeGeometry) -> bool:
@@ -48,6 +51,15 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str
         return "behind the panel"
     planes = np.concatenate([inward, away[None]])  # of the pyramid of rays, and the source's own
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
+
+
+def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
+    """How far behind the middle of ``grid`` the panel of a pose (12,) stands; below half the grid's width it stands in it,
+    and rays end there."""
+    source, first, step_u, step_v = pose.reshape(4, 3)
+    away = np.cross(step_u, step_v)
+    away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)
+    return float((first - np.array(grid.offset_mm)[::-1]) @ away)
 
 
 def cuts(grid: Grid, whole: Grid, geometry: ConeGeometry) -> bool:

@@ -1,5 +1,6 @@
 """A scan: what was measured, where the gantry was, and the grid that is asked for."""
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -8,7 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.field_of_view import default_grid, field_of_view_mm, hidden, misses
+from phyradgs_cl.acquisition.field_of_view import (
+    default_grid,
+    field_of_view_mm,
+    hidden,
+    misses,
+    panel_behind_mm,
+)
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
@@ -20,6 +27,7 @@ from phyradgs_cl.text import near_miss
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+log = logging.getLogger(__name__)
 DETECTOR_MODELS = ("log", "intensity")
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 _OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels that may be broken
@@ -225,8 +233,18 @@ class Scan:
         for frame, start_s in enumerate(self.frame_start_s):
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
+    def warn_of_near_panel(self) -> None:
+        """Says where the panel, as the first frame opens, stands in the grid: no ray sees what is behind it."""
+        (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))
+        behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2
+        if 0 <= behind_mm < half_mm:
+            text = "the panel stands %.4g mm behind the middle of the grid, inside of it: rays end there. %s"
+            log.warning(text, behind_mm, "Of a parallel beam state distances that clear the object")
+
     def check_sight(self) -> None:
-        """InputError for a grid that no ray meets in any frame, as each opens: its volume would be 0."""
+        """InputError for a grid that no ray meets in any frame, as each opens: its volume would be 0. A panel inside of it
+        is said."""
+        self.warn_of_near_panel()
         places = set()
         for frame, start_s in enumerate(self.frame_start_s):
             (pose,) = checked_poses(self.trajectory, frame, np.array([start_s]))

@@ -55,7 +55,7 @@ def fly_scan(
     flats, darks: (n, rows, columns) counts without an object, and without a beam (0 when None).
     mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used.
     quantity: what ``frames`` hold, "attenuation", "transmission" or "counts", where ``flats`` do not say it.
-    grid: the cube that a full turn sees, in voxels of one pixel at the axis, when None.
+    grid: the cube that a full turn sees, no higher than the panel does, in voxels of one pixel at the axis, when None.
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range, and angles that turn against the exposure.

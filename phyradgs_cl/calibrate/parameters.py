@@ -16,6 +16,7 @@ _STEP_PX = 0.25  # how far a derivative's differences move the image at its edge
 _TIMING_STEP, _LEAST_TIME = 0.1, 0.7  # of the time that is stated: of a difference, and what may be taken off
 _PER_ONE = 50.0  # what moves nothing is tried by half a percent, and stepped by four at most
 _MOST_TILT_RAD = math.radians(2.0)
+_LEAST_KNOWN_RAD = math.radians(10.0)  # standard deviation of an angle that says nothing: sines are straight no further
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,10 @@ class Parameter:
         if self.unit == "deg":
             return min(step, _MOST_TILT_RAD)
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
+
+    def is_told(self, deviation: float) -> bool:
+        """Whether a value with this standard deviation, in the field's unit, says anything: an angle may be all round."""
+        return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
         """The lowest value of the field that is tried: times stay above 0."""

@@ -1,5 +1,6 @@
 """From coarse to fine: a volume, the signals that it leaves, a step of what they tell, and again."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,6 +27,7 @@ from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placem
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
 from phyradgs_cl.calibrate.views import find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
+from phyradgs_cl.check.questions.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 from phyradgs_cl.check.variants import reversed_readout
@@ -34,6 +36,7 @@ from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
+log = logging.getLogger(__name__)
 Maker = Callable[..., Level | BeadLevel]
 Report = Callable[[int, int, str], None]
 DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
@@ -104,6 +107,7 @@ def calibrate(
     asks_lag = any(one.name == "lag" for one in parameters)
     ready = [prepared(one, InputOptions(ignore_lag=asks_lag)) for one in (scan, *others)]
     _check(ready, [one.name for one in parameters], per_view, phantom)
+    _warn_of_truncation(ready[0], phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     stages = STAGES if phantom is None else BEAD_STAGES
     levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
@@ -121,22 +125,31 @@ def calibrate(
         if not search.known:
             break
     kept = _corrections(search)
-    change, views = change_of(kept), None
-    table = ([] if order is None else [order]) + _table(scan, parameters, search, kept)
+    change, views, table_of_views = change_of(kept), None, []
     if per_view:
         report(len(levels), len(levels), "views")
         find = find_wobble if per_view == WOBBLE else find_sway
         wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
-        table, views = table + wobble.table, wobble.views
+        views, table_of_views = wobble.views, wobble.table
     report(len(levels), len(levels), "residuals")
     level = make(ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
+    if views is None and _rms(after) > _rms(before):  # what explains the frames worse is not what was wrong
+        kept, change, after, search.known = {}, Change(), before, ()
+    table = ([] if order is None else [order]) + _table(scan, parameters, search, kept) + table_of_views
     corrected = moved(scan, change, views) if kept or views is not None else scan
     corrected = evenly_lit(corrected, change.drift) if change.drift else corrected
     calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
     told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
     return replace(calibration, scan=replace(corrected, provenance=told))
+
+
+def _warn_of_truncation(scan: Scan, phantom: EllipsoidPhantom | None) -> None:
+    """Says where the object is wider than what is seen, unless its shape is known."""
+    if phantom is None and check_coverage(scan).unit == CUT_OFF:
+        text = "calibrate: the object reaches beyond the panel, which can look like a panel that stands elsewhere: %s"
+        log.warning(text, "give it a grid that holds the whole object (--roi-mm), and look at slices before and after")
 
 
 def _start(rt: Runtime, scan: Scan) -> dict[str, float]:
@@ -244,8 +257,11 @@ def _limited(one: Parameter, level: Level | BeadLevel, old: float, new: float) -
 
 
 def _ask(problem: Reduced, least: float, search: _Search) -> None:
-    """Which parameters the frames tell, of whose signals ``least`` is left, and what they cannot tell apart."""
-    search.known = identifiable(problem, least)
+    """Which parameters the frames tell: of whose signals ``least`` is left, to more than nothing; and what they cannot tell
+    apart."""
+    shared = identifiable(problem, least)
+    deviations = problem.only(shared).deviations() if shared else ()
+    search.known = tuple(n for n, d in zip(shared, deviations, strict=True) if PARAMETERS[n].is_told(float(d)))
     search.alike = [in_words(weights) for weights in alike(problem, least)]
     search.shares = dict(zip(problem.names, problem.shares.tolist(), strict=True))
 

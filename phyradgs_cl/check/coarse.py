@@ -16,6 +16,7 @@ _MOST_VOXELS = 64  # per side
 _MARGIN = 1  # voxels: an object that fills the box, cut off at coarse voxels' centres, fits better where it is made smaller
 _SMOOTH = 0.8  # of a block: standard deviation
 _KEPT_COLUMNS = 12  # of blocks, where the panel has as many
+_NARROW = 3  # times the columns, where the panel is lower than a block: a row of few blocks says little
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,9 @@ def coarse(scan: Scan, level: Level) -> Scan:
     """The scan with at most 60 frames, spread evenly, its pixels averaged in blocks, and a grid to match; no reference. Rows
     and columns that fill no block are left out at the far end; a block of lines opens when its lines do on average."""
     shape = scan.geometry.detector_shape
-    block = min(math.ceil(max(shape) / level.columns), shape[0], max(1, shape[1] // _KEPT_COLUMNS))
+    block = min(math.ceil(max(shape) / level.columns), max(1, shape[1] // _KEPT_COLUMNS))
+    if block > shape[0]:
+        block = max(shape[0], math.ceil(block / _NARROW))
     small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), _SMOOTH * block), block)
     return replace(small, grid=coarse_grid(scan.grid, small.geometry, level.voxels))
 
@@ -75,23 +78,25 @@ def some_frames(scan: Scan, chosen: np.ndarray) -> Scan:
 
 
 def binned(scan: Scan, block: int) -> Scan:
-    """Blocks of ``block`` × ``block`` pixels as one pixel each: the mean of those that are valid, masked below half."""
-    rows, columns = (n // block for n in scan.geometry.detector_shape)
+    """Blocks of ``block`` × ``block`` pixels as one pixel each, no larger than the panel: the mean of those that are valid,
+    masked below half."""
     if block == 1:
         return replace(scan, reference=None)
-    shape = (scan.frames, rows, block, columns, block)
-    inside = (slice(None), slice(rows * block), slice(columns * block))
+    high, wide = blocks = blocks_of(scan.geometry, block)
+    rows, columns = scan.geometry.detector_shape[0] // high, scan.geometry.detector_shape[1] // wide
+    shape = (scan.frames, rows, high, columns, wide)
+    inside = (slice(None), slice(rows * high), slice(columns * wide))
     weight = scan.valid[inside].reshape(shape)
     values = np.asarray(scan.projections)[inside].reshape(shape)
     share = weight.mean((2, 4))
     mean = (values * weight).mean((2, 4)) / np.where(share > 0, share, 1.0)
-    geometry = _binned_panel(scan.geometry, block)
-    shutter, later_s = _binned_shutter(scan, block)
+    geometry = _binned_panel(scan.geometry, blocks)
+    shutter, later_s = _binned_shutter(scan, blocks[scan.shutter.axis == "columns"])
     return replace(
         scan,
         projections=mean.astype(np.float32),
         geometry=geometry,
-        trajectory=with_path(scan, block=block).trajectory,
+        trajectory=with_path(scan, blocks=blocks).trajectory,
         shutter=shutter,
         frame_start_s=np.asarray(scan.frame_start_s) + later_s,
         pixel_mask=share < _LEAST_VALID if (share < _LEAST_VALID).any() else None,
@@ -99,26 +104,33 @@ def binned(scan: Scan, block: int) -> Scan:
     )
 
 
+def blocks_of(geometry: ConeGeometry, block: int) -> tuple[int, int]:
+    """Rows and columns of a block of ``block`` pixels per side: a panel of few rows is no higher."""
+    rows, columns = geometry.detector_shape
+    return min(block, rows), min(block, columns)
+
+
 def coarse_grid(grid: Grid, geometry: ConeGeometry, voxels: float) -> Grid:
-    """The same box and a voxel around it, in cubes (nearly) of a pixel at the axis over ``voxels`` wide, never
-    finer than the scan's own."""
-    pixel_mm = min(geometry.pixel_size_mm) / geometry.magnification
-    wanted_mm = max(pixel_mm / voxels, max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
-    shape = [max(1, math.ceil(side / wanted_mm - 1e-6)) for side in grid.size_mm]
+    """The same box and a voxel around it, in voxels of (nearly) a pixel at the axis over ``voxels``, never finer than the
+    scan's own."""
+    high_mm, wide_mm = (pitch / geometry.magnification / voxels for pitch in geometry.pixel_size_mm)
+    least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
+    wanted_mm = (max(high_mm, least_mm), *(max(wide_mm, least_mm),) * 2)
+    shape = [max(1, math.ceil(side / wanted - 1e-6)) for side, wanted in zip(grid.size_mm, wanted_mm, strict=True)]
     voxel = [side / n for side, n in zip(grid.size_mm, shape, strict=True)]
     nz, ny, nx = (n + 2 * _MARGIN for n in shape)
     return Grid((nz, ny, nx), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
-def _binned_panel(geometry: ConeGeometry, block: int) -> ConeGeometry:
+def _binned_panel(geometry: ConeGeometry, blocks: tuple[int, int]) -> ConeGeometry:
     """The panel of the whole blocks; pixels that are left out at the far end move its middle."""
-    shape = tuple(n // block for n in geometry.detector_shape)
-    lost = [n - m * block for n, m in zip(geometry.detector_shape, shape, strict=True)]
+    shape = [n // block for n, block in zip(geometry.detector_shape, blocks, strict=True)]
+    lost = [n % block for n, block in zip(geometry.detector_shape, blocks, strict=True)]
     pitch, offset = geometry.pixel_size_mm, geometry.detector_offset_mm
     return replace(
         geometry,
         detector_shape=(shape[0], shape[1]),
-        pixel_size_mm=(pitch[0] * block, pitch[1] * block),
+        pixel_size_mm=(pitch[0] * blocks[0], pitch[1] * blocks[1]),
         detector_offset_mm=(offset[0] - lost[0] / 2 * pitch[0], offset[1] - lost[1] / 2 * pitch[1]),
     )
 

@@ -12,7 +12,7 @@ from phyradgs_cl.check.coarse import FINE, QUICK, coarse, some_frames
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.check.questions.angles import check_angles
 from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
-from phyradgs_cl.check.questions.coverage import NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
+from phyradgs_cl.check.questions.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
 from phyradgs_cl.check.questions.distances import DISTANCES, check_distances
 from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
@@ -87,7 +87,8 @@ def check(
         finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
     add(finding)
     scan = _without(scan, dead)
-    if add(check_coverage(scan)).unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
+    coverage = add(check_coverage(scan))
+    if coverage.unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
         return leave_the_rest()
     quick = coarse(scan, QUICK)
     fits = check_consistency(rt, quick)
@@ -99,7 +100,10 @@ def check(
     pitch_mm = scan.geometry.pixel_size_mm[1]
     quick = _under(quick, is_reversed, offset, centre)
     add(check_distances(rt, quick) if fits.sees_angles else _looks_alike(DISTANCES))
-    add(check_gain(rt, quick))
+    gain = check_gain(rt, quick)
+    if gain.verdict == SUSPICIOUS and coverage.unit == CUT_OFF:  # what leaves the panel takes its attenuation along
+        gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
+    add(gain)
     if asks_readout:
         fine = _under(some_frames(coarse(scan, FINE), fits.kept), is_reversed, offset, centre)
         add(check_readout(rt, fine) if fits.sees_angles else _looks_alike(READOUT))

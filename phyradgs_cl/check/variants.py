@@ -19,8 +19,8 @@ class Path:
     """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields.
 
     is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
-    on its side. shift_px: the panel moves along u, in its own columns. block: pixels become blocks. frames (F,): which of
-    ``base`` are used; None: all.
+    on its side. shift_px: the panel moves along u, in its own columns. blocks: of how many rows and columns blocks of pixels
+    are. frames (F,): which of ``base`` are used; None: all.
     """
 
     base: Trajectory
@@ -28,7 +28,7 @@ class Path:
     offset_u_mm: float = 0.0
     is_reversed: bool = False
     shift_px: float = 0.0
-    block: int = 1
+    blocks: tuple[int, int] = (1, 1)
     frames: np.ndarray | None = None
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
@@ -38,8 +38,9 @@ class Path:
         if self.is_reversed:
             pose = self._mirrored(pose)
         pose[..., 3:6] += self.shift_px * pose[..., 6:9]
-        pose[..., 3:6] += (self.block - 1) / 2 * (pose[..., 6:9] + pose[..., 9:12])
-        pose[..., 6:] *= self.block
+        for block, step in zip(self.blocks, (slice(9, 12), slice(6, 9)), strict=True):
+            pose[..., 3:6] += (block - 1) / 2 * pose[..., step]
+            pose[..., step] *= block
         return pose
 
     def _mirrored(self, pose: np.ndarray) -> np.ndarray:

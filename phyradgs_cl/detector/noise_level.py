@@ -39,10 +39,11 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
     Noise grows with what a ray loses: it is estimated by tenths of the line integrals, and taken where the pixels lie. From
     the median of |second differences along rows of those along columns|, which no straight edge along either survives
-    (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300).
+    (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300); of a panel of fewer than three rows along rows alone.
     """
     usable, differences, means = valid, line_integrals, line_integrals
-    for cut in (_along_rows, _along_columns):
+    cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
+    for cut in cuts:
         left, middle, right = cut(differences)
         differences = middle - 0.5 * (left + right)
         means = np.mean(cut(means), axis=0, dtype=np.float32)
@@ -54,7 +55,7 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     tenth = np.digitize(mean, edges)
     levels = np.array([np.median(size[tenth == k]) if (tenth == k).any() else 0.0 for k in range(_TENTHS)])
     share = np.bincount(np.digitize(line_integrals[chosen], edges), minlength=_TENTHS) / chosen.sum()
-    return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM**2)
+    return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM ** len(cuts))
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:

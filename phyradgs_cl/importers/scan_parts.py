@@ -28,7 +28,7 @@ def put_together(
     lag: float = 0.0,
 ) -> Scan:
     """A scan of line integrals, row 0 the lowest already; the grid is the cone's cube where none is given."""
-    return Scan(
+    scan = Scan(
         projections=integrals.values,
         geometry=geometry,
         trajectory=trajectory,
@@ -44,6 +44,8 @@ def put_together(
         lag=lag,
         saturation=integrals.saturation,
     )
+    scan.warn_of_near_panel()
+    return scan
 
 
 def with_options(geometry: ConeGeometry, options: ImportOptions) -> ConeGeometry:

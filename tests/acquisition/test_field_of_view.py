@@ -28,6 +28,15 @@ def test_the_box_that_the_cones_fill() -> None:
     assert field_of_view_mm(shifted) == pytest.approx((25 * 640 / 800, 240, 240))
 
 
+def test_a_panel_that_stands_in_the_grid_is_said(scan, caplog) -> None:
+    """As of a parallel beam, whose panel somebody puts at the axis."""
+    for to_panel_mm, is_said in ((800.0, False), (601.0, False), (599.0, True), (400.5, True)):
+        geometry = replace(GEOMETRY, source_to_detector_mm=to_panel_mm)
+        caplog.clear()
+        replace(scan, geometry=geometry, trajectory=CircularOrbit(geometry, ConstantSpeed(0.3, 1.0))).check_sight()
+        assert ("inside of it: rays end there" in caplog.text) == is_said, to_panel_mm
+
+
 def test_a_grid_that_ends_inside_of_what_is_seen() -> None:
     for roi_mm, is_cut in [
         ((-200, 200, -200, 200, -200, 200), False),

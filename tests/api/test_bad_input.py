@@ -390,7 +390,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: rays().intensity.intensity, "intensity: .*line integrals"),
         (lambda: splats().intensity.intensity, "intensity: .*line integrals"),
         (lambda: rays().to_device("x"), "values: found str"),
-        (lambda: rays().to_device(FRAMES[:, 0]), r"values: found shape \(4, 8\); expected \(8, 8, 8\) or \(4, 6, 8\)"),
+        (lambda: rays().to_device(FRAMES[:, 0]), r"values: found shape \(4, 8\); expected \(7, 8, 8\) or \(4, 6, 8\)"),
         (lambda: rays().to_device(FRAMES + 1j), "values: .*complex"),
         (lambda: lsqr(rays().intensity, ONE), "Operator.* not linear in x"),
         (lambda: rays().T(FRAMES[:1]), r"frames: found shape \(1, 6, 8\)"),

@@ -60,6 +60,28 @@ def test_a_right_scan_stays_as_it_is(rt, right) -> None:
     assert found.residual_rms[0] == found.residual_rms[1]
 
 
+def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch, caplog) -> None:
+    """And what explains the frames worse than what is stated corrects nothing."""
+    geometry = replace(right.geometry, detector_shape=(1, 32))
+    row = replace(
+        right,
+        projections=right.projections[:, 16:17],
+        geometry=geometry,
+        trajectory=CircularOrbit(geometry, right.trajectory.kinematics),
+        shutter=replace(right.shutter, readout_s=0.0),
+    )
+    found = by_name(calibrate(moved(row, Change(offset_u_mm=-OFFSET_MM)), rt, "offset-u,roll,tilt-u"))
+    assert abs(found["offset-u"].found) < 0.03 and found["offset-u"].verdict == CORRECTED
+    assert {found[name].verdict for name in ("roll", "tilt-u")} == {CANNOT_TELL}
+    monkeypatch.setattr("phyradgs_cl.calibrate.run._corrections", lambda search: {"offset-u": OFFSET_MM})
+    worse = calibrate(row, rt, "offset-u")
+    assert by_name(worse)["offset-u"].verdict == CANNOT_TELL and worse.scan.geometry is row.geometry
+    assert worse.residual_rms[0] == worse.residual_rms[1] and "beyond the panel" not in caplog.text
+    cut = replace(row, projections=row.projections + np.float32(0.3))
+    calibrate(cut, rt, "offset-u")
+    assert "beyond the panel" in caplog.text
+
+
 def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turned, tmp_path, capsys) -> None:
     """Which one scan does not, and two that turn alike do not."""
     longer = Change(readout_s=0.08, exposure_s=0.15)

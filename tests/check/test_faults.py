@@ -87,6 +87,11 @@ def test_a_drift_of_the_gain(rt, clean, change) -> None:
     drifted = (clean.projections - gain[:, None, None]).astype(np.float32)
     found = check(replace(clean, projections=drifted), rt)
     assert suspected(found) == ["gain drift"]
+    panel = replace(clean.geometry, detector_shape=(32, 14))
+    orbit = CircularOrbit(panel, clean.trajectory.kinematics)
+    narrow = replace(clean, projections=drifted[:, :, 9:23], geometry=panel, trajectory=orbit)
+    cut = next(f for f in check(narrow, rt).findings if f.question == "gain drift")
+    assert cut.verdict == CANNOT_TELL and "or the object does beyond the panel" in cut.text
     value = next(f.value for f in found.findings if f.question == "gain drift")
     assert value == pytest.approx(change, abs=0.01)
 

@@ -35,14 +35,24 @@ def test_what_hypotheses_change(clean) -> None:
     assert exposed(clean, 0.5).shutter.exposure_s == clean.shutter.exposure_s / 2
 
 
-@pytest.mark.parametrize("block", [2, 3])
-def test_blocks_stand_in_the_middle_of_their_pixels(clean, block) -> None:
-    scan = shifted(reversed_rotation(displaced(clean, 0.4)), 1.5)
+def of_rows(scan, rows):
+    """The middle rows of a scan."""
+    geometry = replace(scan.geometry, detector_shape=(rows, scan.geometry.detector_shape[1]))
+    first = (scan.geometry.detector_shape[0] - rows) // 2
+    frames = scan.projections[:, first : first + rows]
+    orbit = CircularOrbit(geometry, scan.trajectory.kinematics)
+    return replace(scan, projections=frames, geometry=geometry, trajectory=orbit)
+
+
+@pytest.mark.parametrize(("rows", "block", "high"), [(32, 2, 2), (32, 3, 3), (2, 3, 2), (1, 4, 1)])
+def test_blocks_stand_in_the_middle_of_their_pixels(clean, rows, block, high) -> None:
+    """A panel of few rows is one block high."""
+    scan = shifted(reversed_rotation(displaced(of_rows(clean, rows), 0.4)), 1.5)
     small = binned(scan, block)
     rows, columns = small.geometry.detector_shape
-    assert (rows, columns) == (32 // block, 32 // block)
-    fine = pixel_centres(poses(scan), scan.geometry.detector_shape)[:, :, : rows * block, : columns * block]
-    middle = fine.reshape(*fine.shape[:2], rows, block, columns, block, 3).mean((3, 5))
+    assert (rows, columns) == (scan.geometry.detector_shape[0] // high, 32 // block)
+    fine = pixel_centres(poses(scan), scan.geometry.detector_shape)[:, :, : rows * high, : columns * block]
+    middle = fine.reshape(*fine.shape[:2], rows, high, columns, block, 3).mean((3, 5))
     at = small.frame_start_s - scan.frame_start_s
     again = np.stack(
         [small.trajectory.pose(f, np.array([s, s + 0.7]) - at[f]) for f, s in enumerate(small.frame_start_s)]
@@ -92,6 +102,7 @@ def test_levels_bound_pixels_and_voxels(clean) -> None:
     assert coarse(clean, FINE).projections.shape == clean.projections.shape
     small = coarse(replace(clean, projections=clean.projections), replace(QUICK, columns=16))
     assert small.geometry.detector_shape == (16, 16)
+    assert coarse(of_rows(clean, 1), replace(QUICK, columns=16)).projections.shape[1:] == (1, 32)
     around = 2 * np.array(small.grid.voxel_size_mm)
     assert max(small.grid.shape) <= 26 and small.grid.size_mm - around == pytest.approx(clean.grid.size_mm)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phyradgs_cl.detector import noise_behind, noise_level
+from phyradgs_cl.detector import noise_behind, noise_level, noise_rms
 
 
 def smooth_frames(noise: float, seed: int = 0) -> np.ndarray:
@@ -18,6 +18,9 @@ def test_white_noise_is_found_behind_the_object() -> None:
     for noise in (0.01, 0.05):
         assert noise_level(smooth_frames(noise)) == pytest.approx(noise, rel=0.05)
     assert 0 < noise_level(smooth_frames(0.0)) < 1e-3
+    some, rows = smooth_frames(0.02), np.s_[:, 20:21]
+    behind = some > 0.2
+    assert noise_rms(some[rows], behind[rows], behind[rows]) == pytest.approx(0.02, rel=0.1)  # a panel of one row
     for shape in [(2, 3, 2), (1, 1, 1), (2, 4, 8)]:
         assert noise_level(np.zeros(shape, np.float32)) == 0
 

@@ -323,8 +323,11 @@ def test_default_grid_is_what_the_cone_covers() -> None:
     grid = default_grid(geometry)
     assert grid.voxel_size_mm == (1.0, 1.0, 1.0)  # a pixel seen at the axis, magnification 2
     half_side_mm = 500 * 60 / np.hypot(60, 1000)  # distance from the axis to the ray of the panel's edge
-    assert grid.shape == (int(np.ceil(2 * half_side_mm)),) * 3
-    assert default_grid(replace(geometry, detector_offset_mm=(0.0, 30.0))).shape > grid.shape
+    wide = int(np.ceil(2 * half_side_mm))
+    assert grid.shape == (round(80 * (500 + half_side_mm) / 1000), wide, wide)  # as high as it sees behind the axis
+    assert default_grid(replace(geometry, detector_offset_mm=(0.0, 30.0))).shape[1:] > grid.shape[1:]
+    assert default_grid(replace(geometry, detector_shape=(90, 60))).shape == (wide,) * 3
+    assert default_grid(replace(geometry, detector_shape=(1, 60))).shape == (1, wide, wide)
 
 
 def test_another_entry_name_and_inner_links_are_followed(path, make_scan) -> None:

@@ -16,6 +16,7 @@ _INVERTED = 0.9  # of the largest value: from here the sides are not air but the
 _BRIGHT = 0.05  # of the pixels: how many may be brighter than the flats
 _FRAMES = 0.1  # of all: how many may touch a border
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units: line integrals mean nothing then
+CUT_OFF = "line integral at the border"
 _QUESTION = "coverage"
 
 
@@ -62,7 +63,7 @@ def check_coverage(scan: Scan) -> Finding:
         "the object reaches beyond the panel (or air is not 0: check the flats). Expect a bright rim, unless the method has "
         "a box as large as the object: --roi-mm of what is wanted and --margin-mm; fdk with --set extrapolate=reprojected"
     )
-    return Finding(_QUESTION, SUSPICIOUS, level, threshold, "line integral", text, advice)
+    return Finding(_QUESTION, SUSPICIOUS, level, threshold, CUT_OFF, text, advice)
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:

@@ -62,8 +62,8 @@ def best_offset(rt: Runtime, scan: Scan, rough: Offset) -> Offset:
 
 
 def block_of(scan: Scan) -> int:
-    """How many pixels per side make one of the coarse ``scan``."""
-    return scan.trajectory.block if isinstance(scan.trajectory, Path) else 1
+    """How many columns make one of the coarse ``scan``."""
+    return scan.trajectory.blocks[1] if isinstance(scan.trajectory, Path) else 1
 
 
 def check_offset(offset: Offset, block: int, pitch_mm: float) -> Finding:

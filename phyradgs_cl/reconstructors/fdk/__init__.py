@@ -107,7 +107,7 @@ def fdk_volume(
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
     arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape)
-    if extrapolate != "none" and fan.is_displaced:
+    if extrapolate != "none" and fan.is_put_aside:
         log.warning("FDK: the rows of a displaced detector are not extrapolated")
     elif extrapolate != "none":
         wide, count = (

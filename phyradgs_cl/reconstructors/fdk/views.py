@@ -14,7 +14,6 @@ log = logging.getLogger(__name__)
 
 _CIRCLE, _NO_CIRCLE = 0.05, 0.5  # of the way from source to panel: from here FDK loses decibels, or the object
 _PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0
-_DISPLACED = 0.1  # of the fan: less may be a misaligned panel that still sees the whole object
 RayWeight = Callable[[int], np.ndarray]
 
 
@@ -113,7 +112,7 @@ def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: 
         )
     if arc.is_full:
         return
-    if abs(fan.low_rad + fan.high_rad) > _DISPLACED * (fan.high_rad - fan.low_rad):
+    if fan.is_put_aside:
         log.warning("FDK: a displaced detector needs a full turn; one side of the volume is not measured")
     _, y_mm, x_mm = grid.axes_mm()
     radius_mm = np.hypot(np.abs(x_mm).max(), np.abs(y_mm).max())

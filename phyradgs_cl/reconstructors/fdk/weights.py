@@ -14,6 +14,7 @@ import numpy as np
 # quarter-pixel offset touches two columns; wider transitions were noisier (up to 15 %) and no freer of artefacts.
 TRANSITION = 1.0
 _SYMMETRIC = 0.01  # pixels of overhang that are no displacement
+_ASIDE = 0.1  # of the fan: a panel that is less off centre was not put there on purpose, and sees the object's both sides
 
 
 def source_angle(pose: np.ndarray) -> np.ndarray:
@@ -71,6 +72,11 @@ class Fan:
     @property
     def is_displaced(self) -> bool:
         return self.missing_columns != (0, 0)
+
+    @property
+    def is_put_aside(self) -> bool:
+        """Whether one side is short on purpose; less may be a misaligned panel that still sees the whole object."""
+        return abs(self.low_rad + self.high_rad) > _ASIDE * (self.high_rad - self.low_rad)
 
     @property
     def sees_axis(self) -> bool:
