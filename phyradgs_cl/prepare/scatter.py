@@ -26,7 +26,7 @@ _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the
 _FITTED_FRAMES = 24
 _USUAL_REACH = 0.18
 _RAISED, _MOST_RAISED = 1.25, 8  # the kernel's height, step by step
-_AS_WELL = 1.05  # times the least unexplained: air says too little far more often than too much
+_BETTER, _AS_WELL = 0.8, 1.05  # times what the kernel of the air, and the best, leave unexplained
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 def raised(kernel: Kernel, frames: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
     """The kernel as high as leaves line integrals (F, v, u), blurred by so many pixels, about as well explained as any
-    height does."""
+    height does; as it is where none does much better."""
     if not kernel:
         return kernel
     coarse = smooth(frames, blur)
@@ -76,12 +76,12 @@ def raised(kernel: Kernel, frames: np.ndarray, model: Model, blur: float = 0.0) 
     def times(height: float) -> Kernel:
         return {width: height * own for width, own in kernel.items()}
 
-    height, least = 1.0, left(1.0)
+    height, least = 1.0, (before := left(1.0))
     for _ in range(_MOST_RAISED):
         if (further := left(_RAISED * height)) > _AS_WELL * least:
             break
         height, least = _RAISED * height, min(least, further)
-    return times(height)
+    return times(height) if least < _BETTER * before else kernel
 
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
