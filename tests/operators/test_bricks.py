@@ -144,7 +144,7 @@ def test_voxels(any_rt, make_cloud, nbytes) -> None:
 def test_what_does_not_fit_at_all_is_said(rt, make_cloud) -> None:
     grid = Grid.cube(32, 2.0)
     operator = RayOperator(rt, grid, SHAPE, tables("static", SHAPE))
-    with room_for(rt, 20_000):
+    with room_for(rt, 5_000):
         with pytest.raises(OutOfMemoryError, match="32×32×32 voxels.*--memory"):
             operator.adjoint(noise(operator.frames_shape, 97))
         with pytest.raises(OutOfMemoryError):

@@ -128,7 +128,7 @@ def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> 
     """Drivers of screens end long ones; a CPU's has no such limit."""
     x, y = noise(GRID.shape, 90), noise((4, *SHAPE), 91)
     launched = note_launches(monkeypatch)
-    for shape, frames_of_launch in (({"lanes": 1, "pixel_items": True}, 3), ({}, 4)):
+    for shape, frames_of_launch in (({"lanes": 1, "pixel_items": True}, 3), ({"pixel_items": False}, 4)):
         operator = RayOperator(Runtime(**shape), GRID, SHAPE, tables("micro-views", frames=4))
         forward, adjoint = operator.project(x, "intensity"), operator.adjoint(y)
         with monkeypatch.context() as patch:
