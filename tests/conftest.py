@@ -17,6 +17,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent / "benchmarks")]
 if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thread of PoCL's, as what it starts has
     os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
 
+from guarded import guard  # noqa: E402
 from quick import is_quick  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
@@ -32,9 +33,12 @@ Cloud = Callable[..., np.ndarray]
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--gpu-shape", action="store_true", help="drive every device of this process as a GPU is driven")
+    parser.addoption("--guarded", action="store_true", help="fail where a kernel writes beside its buffers")
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--guarded"):
+        guard()
     if config.getoption("--gpu-shape"):
         own, shape = Runtime.__init__, {"lanes": 1, "pixel_items": True}
         Runtime.__init__ = lambda *args, **given: own(*args, **(given if "lanes" in given else shape | given))  # type: ignore

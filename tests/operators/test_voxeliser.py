@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from guarded import guard
 from kernel_kit import assert_between, assert_classes, assert_near, by_gaussian
 from tolerances import CUTOFF_EDGE_NEEDLE, CUTOFF_EDGE_SIGMA, GRADIENT, VOXEL, VOXEL_NEEDLE
 
@@ -39,6 +40,15 @@ def test_cutoff_means_the_same_as_in_the_twin(any_rt, make_cloud, grid) -> None:
     low, high = cut_fields(rows, grid, CUTOFF_EDGE_SIGMA)
     assert_between(voxelise(any_rt, rows, grid), low, high, VOXEL * rows[DENSITY].max())
     assert (high > 0).mean() < 1
+
+
+def test_nothing_is_written_beside_a_whole_number_of_vectors(monkeypatch, make_cloud) -> None:
+    """16 Gaussians, which leave no room behind the last one; in a GPU's launch shape PoCL had written there."""
+    guard(monkeypatch.setattr)
+    grid = Grid.cube(8, 2.0)
+    for shape in ({}, {"lanes": 1, "pixel_items": True}):
+        voxeliser = Voxeliser(Runtime(**shape), grid.shape)
+        voxeliser.voxelise_adjoint(make_cloud(16, 49, scale=(0.1, 0.3)), grid, np.ones(grid.shape, np.float32))
 
 
 def test_bricks_parts_of_a_grid_and_no_gaussian(any_rt, make_cloud) -> None:
