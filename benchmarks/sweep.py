@@ -26,13 +26,13 @@ MOTIONS = {"still": Static(), "fly": PerRow()}
 PROTOCOLS = {25: "rapid", 50: "standard"}
 USUAL = {"prior_weight": {"subvoxels": 1, "iterations": 30}, "iterations": {}}
 """What else is set where an option is swept."""
-SCAN = ("kind", "views", "dose", "size")
+SCAN = ("kind", "views", "dose", "size", "pixels")
 
 
-def scan_of(rt: Runtime, path: Path, size: int, kind: str, views: int, dose: float, seed: int) -> Scan:
+def scan_of(rt: Runtime, path: Path, size: int, pixels: int, kind: str, views: int, dose: float, seed: int) -> Scan:
     """A scan of a volume's file: still, or of the protocol with so many views."""
     protocol = "static" if kind == "still" else PROTOCOLS[views]
-    usual = {"size": size, "detector": 2 * size, "noise": "tigre", "dose": dose, "seed": seed, "device": rt}
+    usual = {"size": size, "detector": pixels, "noise": "tigre", "dose": dose, "seed": seed, "device": rt}
     return simulate(path, protocol=protocol, views=views if kind == "still" else None, **usual)  # type: ignore[arg-type]
 
 
@@ -41,9 +41,10 @@ def run(given: argparse.Namespace) -> None:
     there = {_key(line) for line in read_lines(given.lines)}
     for name, path in files_of(given.volumes, given.names, given.size).items():
         for kind, views, dose in ((k, v, d) for k in given.kinds for v in given.views for d in given.doses):
-            facts = {"volume": name, "kind": kind, "views": views, "dose": dose, "size": given.size, "seed": given.seed}
+            facts = {"volume": name, "kind": kind, "views": views, "dose": dose, "size": given.size, "pixels": given.pixels}
+            facts["seed"] = given.seed
             left = [f for f in given.factors if _key({**facts, "factor": f}) not in there]
-            scan = scan_of(rt, path, given.size, kind, views, dose, given.seed) if left else None
+            scan = scan_of(rt, path, given.size, given.pixels, kind, views, dose, given.seed) if left else None
             for factor in left:
                 usual = getattr(FistaOptions(), given.option)
                 chosen = {**USUAL[given.option], given.option: type(usual)(factor * usual), "motion": MOTIONS[kind]}
@@ -64,7 +65,7 @@ def table(given: argparse.Namespace) -> None:
     for line in read_lines(given.lines):
         of = scans.setdefault(tuple(line[name] for name in SCAN), {}).setdefault(str(line["volume"]), {})
         of[float(line["factor"])] = line  # type: ignore[arg-type, assignment]
-    print("| scan | views | photons | voxels | volumes | the default's | one factor's best | each one's best | held-out's |")
+    print("| scan | views | photons | voxels, pixels | volumes | default's | one factor's best | own best | held-out's |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for scan, volumes in sorted(scans.items(), key=str):
         factors = sorted(set.intersection(*(set(of) for of in volumes.values())))
@@ -73,14 +74,14 @@ def table(given: argparse.Namespace) -> None:
         if all("holdout_rms" in of[factor] for of in volumes.values() for factor in factors):
             errors = np.array([[of[factor]["holdout_rms"] for factor in factors] for of in volumes.values()])
             shown = f"{np.take_along_axis(psnr_db, errors.argmin(1)[:, None], 1).mean():.2f}"
-        kind, views, dose, size = scan
-        cells = [kind, views, f"{dose:g}", f"{size}³", len(volumes), f"{means[factors.index(1.0)]:.2f}"]
+        kind, views, dose, size, pixels = scan
+        cells = [kind, views, f"{dose:g}", f"{size}³, {pixels}²", len(volumes), f"{means[factors.index(1.0)]:.2f}"]
         cells += [f"{means[best]:.2f} (×{factors[best]:g})", f"{psnr_db.max(1).mean():.2f}", shown]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 
 def _key(line: dict[str, object]) -> tuple[object, ...]:
-    return tuple(line[name] for name in ("volume", "kind", "views", "dose", "size", "seed", "factor"))
+    return tuple(line[name] for name in ("volume", "kind", "views", "dose", "size", "pixels", "seed", "factor"))
 
 
 def main() -> None:
@@ -89,7 +90,8 @@ def main() -> None:
     running = verbs.add_parser("run")
     running.add_argument("volumes")
     running.add_argument("--names", help="with commas; all")
-    running.add_argument("--size", type=int, default=64)
+    running.add_argument("--size", type=int, default=64, help="voxels per side; up to 48 far fewer than what is projected")
+    running.add_argument("--pixels", type=int, help="per side of the detector; twice --size")
     running.add_argument("--kinds", nargs="+", default=["still"], choices=list(MOTIONS))
     running.add_argument("--views", nargs="+", type=int, default=[25, 50], help="of fly-scans 25 or 50")
     running.add_argument("--doses", nargs="+", type=float, default=[1e3, 1e4, 1e5])
@@ -104,6 +106,7 @@ def main() -> None:
     given = parser.parse_args()
     if "fly" in getattr(given, "kinds", ()) and not set(given.views) <= set(PROTOCOLS):
         parser.error("fly-scans have --views 25 or 50")
+    given.pixels = getattr(given, "pixels", None) or 2 * getattr(given, "size", 0)
     given.function(given)
 
 

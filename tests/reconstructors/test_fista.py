@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.reconstructors import METHODS, Progress, method_options, reconstruct
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
-from phyradgs_cl.reconstructors.voxels.misfit import Misfit, misfit_of
+from phyradgs_cl.reconstructors.voxels.misfit import Misfit, Reach, misfit_of
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -91,7 +91,7 @@ def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
 
 
 def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None:
-    """A blur, which spreads a ray over voxels, averages it."""
+    """A blur, which spreads a ray over voxels, averages noise."""
     prior = prior_of("tv", rt, scan.grid, 5, 12)
 
     def weight(motion: Motion, misfit: Misfit, density: float = 0.0) -> float:
@@ -101,26 +101,29 @@ def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None
         method.start_from(method.system.space.array(volume))
         return method.weight
 
-    assert weight(PerRow(), Misfit(0.03)) == pytest.approx(3 * weight(PerRow(), Misfit(0.01)), rel=1e-6)
-    assert weight(PerRow(), Misfit(0.01)) < 0.95 * weight(Static(), Misfit(0.01))
-    assert weight(PerRow(), Misfit(0.03, 0.1), 0.4) == pytest.approx(weight(PerRow(), Misfit(0.05)), rel=1e-6)
+    noise, edges = weight(PerRow(), Misfit(0.03)), weight(PerRow(), Misfit(0.0, 0.1), 0.4)
+    assert noise == pytest.approx(3 * weight(PerRow(), Misfit(0.01)), rel=1e-6)
+    assert noise < 0.95 * weight(Static(), Misfit(0.03))
+    assert edges == pytest.approx(weight(PerRow(), Misfit(0.0, 0.2), 0.2), rel=1e-6)
+    assert weight(PerRow(), Misfit(0.03, 0.1), 0.4) == pytest.approx(np.hypot(noise, edges), rel=1e-6)
 
 
-def test_edges_count_more_the_larger_the_voxels_and_the_more_the_views(scan) -> None:
-    """Voxels below a pixel change nothing, and a blur averages."""
+def test_rays_that_are_wrong_alike_add_up_and_noise_averages(rt, scan) -> None:
+    """Of half the frames half as much of the first comes back, and √½ of the second."""
     half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
-    whole, fewer = (misfit_of(one, Static()) for one in (scan, half))
-    assert fewer.noise == pytest.approx(0.5**0.2 * whole.noise, rel=0.1)
-    assert fewer.edges_mm == pytest.approx(0.5**0.7 * whole.edges_mm)
-    grids = (replace(scan, grid=Grid.cube(n, 2.0), reference=None) for n in (12, 24, 96))
-    coarse, own, fine = (misfit_of(one, Static()) for one in grids)
-    pixels = 32 * 0.7 / 12  # per voxel of the coarse grid
-    assert coarse.noise == pytest.approx(pixels**0.2 * own.noise)
-    assert coarse.edges_mm == pytest.approx(pixels**1.7 * own.edges_mm) and own == fine
-    smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (4 / 32 * 5 / 7)  # pixels, half-way from the axis to the side
-    blurred = misfit_of(scan, PerRow(5))
-    assert blurred.noise == whole.noise
-    assert blurred.edges_mm == pytest.approx(whole.edges_mm / np.sqrt(1 + smeared), rel=0.01)
+    whole, fewer = (Reach.of(System.of_scan(rt, one, Static())) for one in (scan, half))
+    assert fewer.edges_mm == pytest.approx(whole.edges_mm / 2, rel=0.01)
+    assert fewer.noise_mm == pytest.approx(whole.noise_mm / np.sqrt(2), rel=0.1)
+
+
+def test_voxels_miss_more_the_larger_they_are_and_less_behind_a_blur(scan) -> None:
+    grids = (replace(scan, grid=Grid.cube(n, 2.0), reference=None) for n in (12, 24))
+    coarse, fine = (misfit_of(one, Static()) for one in grids)
+    assert coarse.noise == fine.noise and coarse.edges_mm == pytest.approx(2 * fine.edges_mm)
+    smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (2.0 / 24)  # voxels, half-way from the axis to the side
+    blurred = misfit_of(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
+    assert blurred.noise == fine.noise
+    assert blurred.edges_mm == pytest.approx(fine.edges_mm / (1 + smeared), rel=0.01)
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:

@@ -26,7 +26,7 @@ from phyradgs_cl.reconstructors.result import (
     option_facts,
     state_arrays,
 )
-from phyradgs_cl.reconstructors.voxels.misfit import Misfit, density, gain, misfit_of
+from phyradgs_cl.reconstructors.voxels.misfit import Misfit, Reach, density, misfit_of
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Denoiser, Prior, prior_of, volumes_of
 from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
 from phyradgs_cl.reconstructors.voxels.sart import spread_order
@@ -59,7 +59,7 @@ class FistaOptions(IterativeOptions):
     motion: Motion = PerRow()
     iterations: int = 35
     prior: str | Denoiser = "dct"
-    prior_weight: float = 0.6
+    prior_weight: float = 0.42
     subvoxels: int = 0
     prior_share: float = 0.5
     subsets: int = 5
@@ -178,8 +178,8 @@ def _run(
 class Fista:
     """The residual that is reported is the pass's own: of every subset just before its step.
 
-    The weight of the prior is ``prior_weight`` times the deviation of what the misfit makes of the gradient, back through
-    Aᵀ, which averages it along a blur. It follows the volume's density from pass to pass.
+    The weight of the prior is ``prior_weight`` times what the misfit makes of the gradient, back through Aᵀ, which averages
+    noise along a blur. It follows the volume's density from pass to pass.
     """
 
     def __init__(self, system: System, options: FistaOptions, prior: Prior, misfit: Misfit) -> None:
@@ -192,14 +192,14 @@ class Fista:
         # AᵀA has no negative entry: its largest row sum bounds its norm
         self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
         self._smallest = _FEWEST * space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
-        self._gain = gain(system)
+        self._reach = Reach.of(system)
         self.subsets = self._subsets(min(options.subsets, system.frames))
 
     @property
     def weight(self) -> float:
         """The prior's, in the unit of the gradient."""
-        noise = self.misfit.rms(density(self.system.space, self.volume))
-        return max(self.options.prior_weight * noise * self._gain, self._smallest)
+        gradient_mm = self._reach.gradient_mm(self.misfit, density(self.system.space, self.volume))
+        return max(self.options.prior_weight * gradient_mm, self._smallest)
 
     def _subsets(self, count: int) -> list[System]:
         return [self.system.subset(range(first, self.system.frames, count)) for first in spread_order(count)]
