@@ -15,6 +15,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.method import Method
@@ -73,6 +74,9 @@ class FistaOptions(IterativeOptions):
         checks.within("subvoxels", self.subvoxels, 0, 8)
         checks.within("prior_weight", self.prior_weight, 0, 1e6)
         checks.within("prior_share", self.prior_share, 0, 1)
+        if self.prior != "piccs" and self.prior_share != FistaOptions.prior_share:
+            found = f"{self.prior_share:g} with the prior {self.prior}"
+            raise InputError("prior_share", found, "the prior piccs", "set prior=piccs, or leave prior_share out")
         checks.within("subsets", self.subsets, 1, 1_000_000)
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
