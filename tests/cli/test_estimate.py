@@ -168,7 +168,7 @@ def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
     command += ["--iterations", "5"]
     assert cli.run([*command, "--profile"]) == 0
     text = capsys.readouterr().out
-    assert re.search(r"^splat_forward_rows +5 ", text, re.M) and re.search(r"^splat_backward_rows +5 ", text, re.M)
+    assert all(re.search(rf"^splat_{way}_(rows|pixels|group) +5 ", text, re.M) for way in ("forward", "backward"))
     assert "Gpairs/s" in text and "Gflop/s" in text
     assert cli.run(command) == 0
     assert "Gpairs/s" not in capsys.readouterr().out
