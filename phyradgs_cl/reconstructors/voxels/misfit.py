@@ -29,7 +29,7 @@ class Misfit:
 def misfit_of(scan: Scan, motion: Motion) -> Misfit:
     """Of a scan on its grid. A blur averages what it goes over."""
     voxel_mm = max(scan.grid.voxel_size_mm[1:])
-    edges_mm = _EDGES * voxel_mm / (1 + _blur_mm(scan, motion) / voxel_mm)
+    edges_mm = _EDGES * voxel_mm / math.sqrt(1 + _blur_mm(scan, motion) / voxel_mm)
     return Misfit(noise_behind(np.asarray(scan.projections, np.float32), scan.valid), edges_mm)
 
 
