@@ -68,7 +68,8 @@ def table(given: argparse.Namespace) -> None:
     print("| scan | views | photons | voxels, pixels | volumes | default's | one factor's best | own best | held-out's |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for scan, volumes in sorted(scans.items(), key=str):
-        factors = sorted(set.intersection(*(set(of) for of in volumes.values())))
+        factors = sorted(set.union(*(set(of) for of in volumes.values())))
+        volumes = {name: of for name, of in volumes.items() if len(of) == len(factors)}  # a sweep may be half made
         psnr_db = np.array([[of[factor]["psnr_db"] for factor in factors] for of in volumes.values()])
         means, best, shown = psnr_db.mean(0), int(psnr_db.mean(0).argmax()), ""
         if all("holdout_rms" in of[factor] for of in volumes.values() for factor in factors):

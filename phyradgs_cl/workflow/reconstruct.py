@@ -196,8 +196,9 @@ def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
         log.warning(found, motion.strips, scan.lines, job.scan)
     grid = job.before.with_margin(scan.with_grid(job.before).grid)
     if grid != scan.grid and hasattr(options, "iterations") and cuts(grid, scan.grid, scan.geometry):
-        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it"
-        found += "; --margin-mm has that filled beside the box, and discards it"
+        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; "
+        given = job.before.margin_mm is not None
+        found += "if the object goes on, widen --margin-mm" if given else "--margin-mm has that filled, and discards it"
         log.warning(found, job.scan, job.method)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:

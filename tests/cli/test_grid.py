@@ -49,10 +49,12 @@ def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_pa
     assert cli.run([*command, "--roi", INSIDE]) == 0
     (line,) = [r.getMessage() for r in caplog.records if "field of view" in r.getMessage()]
     assert "--method sirt puts what lies beyond into it" in line
-    caplog.clear()
+    assert "--margin-mm has that filled" in line
     alone = read_volume(tmp_path / "v.h5")
-    assert cli.run([*command, "--roi", INSIDE, "--margin-mm", "0.5"]) == 0
-    assert caplog.records == []
+    for margin_mm, expected in (("0.5,0,0", "widen --margin-mm"), ("0.5", "")):
+        caplog.clear()
+        assert cli.run([*command, "--roi", INSIDE, "--margin-mm", margin_mm]) == 0
+        assert len(caplog.records) == bool(expected) and expected in caplog.text
     found = read_volume(tmp_path / "v.h5")
     assert found.grid == alone.grid and found.metrics["psnr_db"] > alone.metrics["psnr_db"] + 3
     assert found.provenance["input"]["margin_mm"] == [0.5] * 3
