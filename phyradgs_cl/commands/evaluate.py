@@ -18,12 +18,12 @@ def evaluate_command(
     as_json: AsJson = False,
     picture: Annotated[
         Path | None,
-        file_option("PNG of slices: result, truth, difference.", "--picture", default="v.png of v.h5, v.nii.png of v.nii"),
+        file_option("PNG of slices: result, truth, difference.", "--picture", default="v.evaluated.png of v.h5"),
     ] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    is_ours = volume.suffix in ("", ".h5")
-    usual = volume.with_suffix(".png") if is_ours else volume.with_name(f"{volume.name}.png")
+    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may stand beside each other
+    usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the preview of the run
     facts = run_evaluation(volume, reference, picture or usual)
     if as_json:
         say(json.dumps(facts))

@@ -57,4 +57,4 @@ def _line(step: dict[str, Any]) -> str:
 def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
-    return ", ".join(map(_shown, value)) if isinstance(value, list) else str(value)
+    return (", ".join(map(_shown, value)) or "none") if isinstance(value, list) else str(value)

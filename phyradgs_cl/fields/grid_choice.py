@@ -56,7 +56,8 @@ class GridChoice:
             widths_mm = _numbers("--margin-mm", self.margin_mm, (1, 3), "20 or 0,20,20")
             for width_mm in widths_mm:
                 checks.within("--margin-mm", width_mm, 0, _LARGEST_MM)
-            object.__setattr__(self, "margin_mm", widths_mm if len(widths_mm) == 3 else widths_mm * 3)
+            around_mm = widths_mm if len(widths_mm) == 3 else widths_mm * 3
+            object.__setattr__(self, "margin_mm", around_mm if any(around_mm) else None)
         if self.size is not None and self.voxel_mm is not None and self.roi_mm is not None:
             expected = "at most two of --size, --voxel-mm and --roi-mm, which say the third"
             raise InputError("--size", "all three", expected, "leave one out")

@@ -4,7 +4,21 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, triple
+
+_ROUNDING = 1e-6  # of a voxel
+
+
+def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
+    """The block (z, y, x) of the voxels of ``onto`` whose centres lie in the box of ``grid``; None where there is none."""
+    block = []
+    for centres_mm, (low_mm, high_mm), side_mm in zip(onto.axes_mm(), grid.box_mm, onto.voxel_size_mm, strict=True):
+        rounding_mm = _ROUNDING * side_mm
+        inside = np.flatnonzero((centres_mm >= low_mm - rounding_mm) & (centres_mm <= high_mm + rounding_mm))
+        if not inside.size:
+            return None
+        block.append(slice(int(inside[0]), int(inside[-1]) + 1))
+    return triple(block)
 
 
 def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:

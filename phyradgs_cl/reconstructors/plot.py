@@ -9,6 +9,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics.slices import draw_slices
 from phyradgs_cl.reconstructors.frame_pairs import FramePair, frame_pairs
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.result import MARGIN_MM
 from phyradgs_cl.runtime import Runtime
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def plot_result(
     draw_slices(slices, result.volume, truth, result.grid)
     curves, measured, residual = beside.subplots(3, 1)
     _convergence(curves, result.record)
-    _residual(measured, residual, pair, scan)
+    _residual(measured, residual, pair, scan, ", the margin discarded" if MARGIN_MM in result.facts else "")
     return figure
 
 
@@ -64,8 +65,8 @@ def _convergence(axes: "Axes", record: list[dict[str, float]]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _residual(measured: "Axes", residual: "Axes", pair: FramePair | None, scan: Scan | None) -> None:
-    """A measured frame, and measured less computed."""
+def _residual(measured: "Axes", residual: "Axes", pair: FramePair | None, scan: Scan | None, lacks: str) -> None:
+    """A measured frame, and measured less computed from a volume that ``lacks`` something."""
     if pair is None or scan is None:
         measured.set_axis_off()
         residual.set_axis_off()
@@ -73,5 +74,5 @@ def _residual(measured: "Axes", residual: "Axes", pair: FramePair | None, scan: 
     (rows, columns), (dv, du) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
     size_mm, limit = (rows * dv, columns * du), float(abs(pair.residual).max()) or 1.0
     draw_image(measured, pair.measured, f"frame {pair.frame}: line integrals", size_mm=size_mm, cmap="gray")
-    title = f"measured less computed: RMS {100 * pair.relative:.2g} %"
+    title = f"measured less computed{lacks}:\nRMS {100 * pair.relative:.2g} %"
     draw_image(residual, pair.residual, title, size_mm=size_mm, cmap="RdBu_r", vmin=-limit, vmax=limit)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -12,7 +13,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, Motion, Scan
 from phyradgs_cl.acquisition.motion import MODELS, STILL, check_own_motion
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import resampled
 from phyradgs_cl.prepare import TOLD
@@ -22,6 +23,7 @@ from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import (
     HELD_OUT,
+    MARGIN_MM,
     ProgressReport,
     Reconstruction,
     function_name,
@@ -171,15 +173,19 @@ def reconstruct(
     held = held_out(ready, asked.holdout) if asked.holdout else None
     seen = ready if held is None else with_masked(ready, held)
     run = partial(method_of(method).run, rt=rt, seed=seed)
-    if asked.tune:
-        result = tuned(asked.tune, run, seen, chosen, rt, report, **extra)
-    else:
-        result = run(seen, chosen, report=report, **extra)
+    with _naming_margin(asked, ready.grid), naming_host_memory():
+        if asked.tune:
+            result = tuned(asked.tune, run, seen, chosen, rt, report, **extra)
+        else:
+            result = run(seen, chosen, report=report, **extra)
     if held is not None and rt.ranks.rank == 0:
         result.facts[HELD_OUT] = holdout_errors(rt, ready, held, result)
     if TOLD in ready.provenance:
         result.facts[TOLD] = ready.provenance[TOLD]
-    return result if asked.margin_mm is None else result.within(asked.of(scan.grid))
+    if asked.margin_mm is None:
+        return result
+    result.facts[MARGIN_MM] = asked.margin_mm
+    return result.within(asked.of(scan.grid))
 
 
 def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.ndarray:
@@ -202,6 +208,18 @@ def _check_margin(method: object, options: Any) -> None:
         found = f"--method {method_name(method)} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
         raise InputError("--margin-mm", found, "a method that explains frames by what is in the box", remedy)
+
+
+@contextmanager
+def _naming_margin(asked: InputOptions, grid: Grid) -> Iterator[None]:
+    """Where memory does not do, the body's error says what the margin has made of the grid."""
+    try:
+        yield
+    except OutOfMemoryError as error:
+        if asked.margin_mm is not None:
+            voxels = " × ".join(map(str, grid.shape[::-1]))
+            error.remedy += f", as by a narrower --margin-mm (with it the grid has {voxels} voxels)"
+        raise
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:

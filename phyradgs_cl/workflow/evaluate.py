@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.io.volume import interruption
-from phyradgs_cl.metrics import compare, resampled, slices_png
+from phyradgs_cl.metrics import compare, resampled, shared_slices, slices_png
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
@@ -20,8 +20,8 @@ log = logging.getLogger(__name__)
 
 @np.errstate(all="ignore")
 def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
-    """Compares a volume with a scan's reference or another volume, onto whose grid it is resampled, and writes the
-    picture of slices; values without a grid are compared voxel by voxel."""
+    """Compares a volume with a scan's reference or another volume, onto whose voxels within its box it is resampled, and
+    writes the picture of slices; values without a grid are compared voxel by voxel."""
     refuse_overwriting("--picture", picture, volume_path, reference_path)
     if picture.suffix.lower() != ".png":
         raise InputError("--picture", str(picture), "a file name that ends in .png")
@@ -30,12 +30,16 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
     reference, wanted = load_reference(reference_path)
     told: dict[str, object] = {}
     if grid is not None and wanted is not None and not grid.is_close(wanted):
-        volume, share = resampled(volume, grid, wanted)
-        if share == 0:
+        shared = shared_slices(wanted, grid)
+        if shared is None:
             found = f"{_place(grid)}, which has no voxel of the reference, {_place(wanted)}"
             raise InputError(str(volume_path), found, "volumes in one place")
+        whole, reference = reference.size, reference[shared]
+        start = triple(one.start for one in shared)
+        volume, _ = resampled(volume, grid, wanted.part(start, triple(reference.shape)))
+        share = reference.size / whole
         where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
-        rest = "" if share == 1 else f"; {100 * share:.3g} % of those lie in the volume, the rest counts as 0"
+        rest = "" if share == 1 else f"; compared on the {100 * share:.3g} % of those that lie in the volume"
         log.warning("%s: resampled (linear) %s%s", plain_text(str(volume_path)), where, rest)
         told = {"resampled": where, "share_of_reference_covered": share}
     if reference.shape != volume.shape:

@@ -68,7 +68,7 @@ def test_before_the_output_there_is_nothing(cli, scan, tmp_path, capfd, monkeypa
 )
 def test_what_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypatch, command, owner, step):
     volume = tmp_path / "volume.h5"
-    output = volume.with_suffix(".png") if command == "evaluate" else tmp_path / "output.h5"
+    output = volume.with_suffix(".evaluated.png") if command == "evaluate" else tmp_path / "output.h5"
     if command == "evaluate":
         assert cli.run(["reconstruct", str(scan), "--method", "fdk", "-o", str(volume)]) == 0
     monkeypatch.setattr(owner, step, interrupted_before(interrupted_before(getattr(owner, step))))

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl.api import simulate
+from phyradgs_cl.api import compare, load_scan, simulate
 from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan, write_volume
@@ -35,7 +35,7 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
         facts = json.loads(capsys.readouterr().out)
         assert "resampled" not in facts
         answers[path.name] = {key: facts[key] for key in ("psnr_db", "ssim", "method") if key in facts}
-        picture = "v.png" if path == volume else f"{path.name}.png"  # one each, for volumes of one name
+        picture = "v.evaluated.png" if path == volume else f"{path.name}.evaluated.png"  # one each, for volumes of one name
         assert facts["picture"] == str(tmp_path / picture) and (tmp_path / picture).exists()
     assert answers.pop("v.h5") == {**answers["v.mha"], "method": "fdk"}
     assert all(answer == answers["v.mha"] for answer in answers.values())
@@ -59,14 +59,18 @@ def test_another_grid_is_resampled_and_said_in_one_line(cli, files, tmp_path, ca
     half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
     write_volume(tmp_path / "half.h5", volume[:6], half, {})
     assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan)]) == 0
-    assert "50 % of those lie in the volume" in caplog.messages[-1]
+    assert "compared on the 50 % of those that lie in the volume" in caplog.messages[-1]
+    assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert facts["share_of_reference_covered"] == 0.5
+    assert facts["psnr_db"] == pytest.approx(compare(volume[:6], load_scan(scan).reference[:6])["psnr_db"], abs=1e-3)
 
     away = replace(grid, offset_mm=(0.0, 0.0, 1e3))
     write_volume(tmp_path / "away.h5", volume, away, {})
     assert cli.run(["evaluate", str(tmp_path / "away.h5"), "--reference", str(scan)]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and "no voxel of the reference" in told and "(1000, 0, 0)" in told
-    assert not (tmp_path / "away.png").exists()
+    assert not (tmp_path / "away.evaluated.png").exists()
 
 
 def test_an_export_is_scanned_like_the_volume_itself(cli, files, tmp_path, capsys) -> None:

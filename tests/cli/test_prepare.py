@@ -35,6 +35,13 @@ def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys)
     assert [step["step"] for step in direct.provenance["prepared"]] == ["sparks", "dead", "rings"]
 
 
+def test_a_step_that_finds_nothing_says_none(cli, simulated, tmp_path, capsys) -> None:
+    source = simulated(*SPOILT[:-6], "--noise", "none")  # no scatter in it
+    assert cli.run(["prepare", str(source), "-o", str(tmp_path / "clean.h5"), "--steps", "scatter"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("scatter")]
+    assert "reach none, height none, to primary 0" in line
+
+
 def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) -> None:
     config = tmp_path / "steps.toml"
     config.write_text('steps = "rings"\n[rings]\nmethod = "few"\nwindow = 5\n')

@@ -23,7 +23,7 @@ COMMANDS = (
     ("prepare scan.h5 -o clean.h5", "clean.h5"),
     ("estimate scan.h5 --method sirt", ""),
     ("reconstruct scan.h5 --iterations 2 -o volume.h5", "volume.h5"),
-    ("evaluate volume.h5 --reference scan.h5 --json", "volume.png"),
+    ("evaluate volume.h5 --reference scan.h5 --json", "volume.evaluated.png"),
     ("report volume.h5 --scan scan.h5 --views 2 -o page.html", "page.html"),
     ("view volume.h5", ""),
     ("export volume.h5 --to nrrd -o volume.nrrd", "volume.nrrd"),

@@ -5,7 +5,7 @@ import pytest
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import Reconstruction, prepare, reconstruct, simulate
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.fields import Grid, GridChoice
 from phyradgs_cl.reconstructors.result import HELD_OUT
 
@@ -61,3 +61,18 @@ def test_where_a_margin_would_do_nothing_it_is_refused(rt, scan) -> None:
         reconstruct(scan, "fdk", margin_mm=0.3, device=rt)
     with pytest.raises(InputError, match="margin_mm: found .*without a method"):
         prepare(scan, "sparks", margin_mm=0.3, device=rt)
+
+
+def test_no_margin_is_none_and_one_too_wide_for_memory_is_named(rt, scan) -> None:
+    np.testing.assert_array_equal(
+        reconstruct(scan, "fdk", margin_mm=0, device=rt).volume, reconstruct(scan, "fdk", device=rt).volume
+    )
+    with pytest.raises(OutOfMemoryError, match=r"narrower margin_mm \(with it the grid has \d+ × \d+ × \d+ voxels\)"):
+        reconstruct(scan, "sirt", margin_mm=1000 * max(scan.grid.voxel_size_mm), iterations=1, device=rt)
+
+
+def test_a_plot_says_that_the_margin_is_gone(rt, scan) -> None:
+    for more, expected in (({}, False), ({"margin_mm": 0.3}, True)):
+        figure = reconstruct(scan, "sirt", roi_mm=0.9, iterations=2, device=rt, report=False, **more).plot(scan, device=rt)
+        titles = [axes.get_title() for part in figure.subfigs for axes in part.axes]
+        assert any("the margin discarded:" in title for title in titles) == expected

@@ -30,6 +30,16 @@ def test_three_slices_stand_upright_in_their_proportions(any_volume, tmp_path) -
     assert not picture[: 128 - round(1.2 * per_mm), : widths[0]].any()  # above the lower slice
 
 
+def test_a_single_layer_is_shown_from_its_face_only(any_volume) -> None:
+    volume, grid = any_volume
+    middle = grid.shape[0] // 2
+    layer = grid.part((middle, 0, 0), (1, *grid.shape[1:]))
+    picture = preview_image(volume[middle : middle + 1], layer)
+    assert picture.shape[0] / picture.shape[1] == pytest.approx(1.2 / 0.8, rel=0.02)  # one slice, no gap
+    line = grid.part((middle, 0, 0), (1, 1, grid.shape[2]))
+    assert preview_image(volume[middle : middle + 1, :1], line).size > 0
+
+
 def test_black_is_nothing_and_white_is_nearly_the_most(tmp_path) -> None:
     volume = np.zeros((16, 16, 16), np.float32)
     volume[8, 8, 8] = 100.0  # a hot voxel

@@ -78,20 +78,26 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
     low, high = grey_range(volume)
     per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
     slices = []
-    for axis in range(3):
+    for axis in _shown_axes(grid):
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
         shape = [max(1, round(side * per_mm)) for side in size_mm]
         ends = zip(shape, image.shape, strict=True)  # the nearest pixel everywhere: voxels stay visible as such
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
-    height, width = max(s.shape[0] for s in slices), sum(s.shape[1] for s in slices) + 2 * _GAP
+    height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP
     picture = np.zeros((height, width), np.uint8)
     left = 0
     for image in slices:
         picture[height - image.shape[0] :, left : left + image.shape[1]] = image
         left += image.shape[1] + _GAP
     return picture
+
+
+def _shown_axes(grid: Grid) -> list[int]:
+    """The axes along which to look: of a grid of one layer not into the layer's edge, which is a line."""
+    across = [min(n for a, n in enumerate(grid.shape) if a != axis) for axis in range(3)]
+    return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
