@@ -10,9 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl import signals, simulation
+from phyradgs_cl import signals
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.simulation import options as simulation_options
 from phyradgs_cl.workflow import evaluate, reconstruct, simulate
 
 NOTHING = "phyradgs: interrupted, nothing written\n"
@@ -36,7 +37,7 @@ COMMANDS = {
     "evaluate": ["evaluate", "{volume}", "--reference", "{scan}"],
 }
 STAGES = [
-    ("simulate", simulation, "load_scanner"),
+    ("simulate", simulation_options, "load_scanner"),
     ("simulate", simulate, "check_writable"),
     ("simulate", simulate, "simulated_scan"),
     ("reconstruct", reconstruct, "load_scan"),
@@ -178,7 +179,7 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
     assert cli.run(["evaluate", str(partial), "--reference", str(scan), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["interrupted_at"], facts["iterations_asked"]) == (at, int(iterations))
-    (tmp_path / "volume.partial.png").unlink()
+    (tmp_path / "volume.partial.evaluated.png").unlink()
     assert run_process([*command, str(output), "--resume", "--preview", str(tmp_path / "now.png")], "").returncode == 0
     assert {path.name for path in tmp_path.iterdir()} == {"volume.h5", "now.png"}
     assert run_process([*command, str(whole)], "").returncode == 0

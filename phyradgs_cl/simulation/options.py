@@ -1,0 +1,101 @@
+"""How to simulate: the options and their ranges, and what a scanner says where they do not."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Protocol, make_protocol
+from phyradgs_cl.acquisition.scan import LARGEST_LAG
+from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
+from phyradgs_cl.resources import resource
+
+_NOISES = ("none", "tigre", "beer")
+# Far beyond any scanner, and far from where float32 or a sampler would overflow.
+_LARGEST_PEAK, _LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
+_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
+_LARGEST_DETECTOR = 32_000
+_TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """How to simulate. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
+
+    time_samples: midpoint samples per line in its own exposure; 0: the volume's edge moves at most half a voxel of ``grid``
+    between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
+    lag: λ of detector/lag.py. rings, sparks, drift, scatter: of detector/effects.py, 0 without; kvp: of
+    detector/spectrum.py, 0 for a beam of one energy.
+    """
+
+    protocol: Protocol = Protocol()
+    readout_axis: str = "rows"
+    readout_direction: int = 1
+    detector_model: str = "log"
+    peak: float = 0.0
+    noise: str = "none"
+    dose: float = 1e4
+    electronic_noise: float = 10.0
+    jitter_deg: float = 0.0
+    lag: float = 0.0
+    time_samples: int = 0
+    seed: int = 0
+    rings: float = 0.0
+    sparks: float = 0.0
+    drift: float = 0.0
+    scatter: float = 0.0
+    kvp: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.noise not in _NOISES:
+            raise InputError("--noise", repr(self.noise), f"one of {', '.join(_NOISES)}")
+        checks.within("--peak", self.peak, 0, _LARGEST_PEAK)
+        checks.within("--electronic-noise (counts)", self.electronic_noise, 0, _LARGEST_ELECTRONIC_NOISE)
+        checks.within("--dose (photons per pixel)", self.dose, _SMALLEST_DOSE, _LARGEST_DOSE)
+        checks.within("--lag", self.lag, 0, LARGEST_LAG)
+        checks.within("--jitter-deg", self.jitter_deg, 0, 360)
+        checks.within("--time-samples", self.time_samples, 0, 10_000)
+        checks.within("--seed", self.seed, 0, 2**63)
+        checks.fields_within("--", self, {"rings": (0, 0.5), "sparks": (0, 0.1), "drift": (0, 0.5), "scatter": (0, 10)})
+        if self.kvp != 0:
+            checks.within("--kvp (kV)", self.kvp, LOWEST_KVP, HIGHEST_KVP)
+
+
+OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
+"""What ``scanner_options`` takes."""
+
+
+def scanner_for(
+    name: str,
+    detector: int | None = None,
+    detector_offset_mm: tuple[float, float] | None = None,
+    truncation: float = 0.0,
+) -> Scanner:
+    """A scanner by name or TOML file, with another number of columns (rows in proportion) or offset (v, u) of the panel, and
+    without the share ``truncation`` of its columns, half of it at each side."""
+    scanner = load_scanner(name, resource("data"))
+    geometry = scanner.geometry
+    if detector is not None:
+        checks.within("--detector", detector, 1, _LARGEST_DETECTOR)
+        rows, columns = geometry.detector_shape
+        geometry = with_detector_count(geometry, max(1, round(detector * rows / columns)), detector)
+    if detector_offset_mm is not None:
+        geometry = replace(geometry, detector_offset_mm=detector_offset_mm)
+    checks.within("--truncation", truncation, 0, 0.95)
+    rows, columns = geometry.detector_shape
+    kept = max(1, columns - 2 * round(truncation * columns / 2))
+    return replace(scanner, geometry=replace(geometry, detector_shape=(rows, kept)))
+
+
+def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
+    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the
+    default. InputError: no such option; a value out of range."""
+    usual = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse")
+    own = {key: getattr(scanner, key) for key in usual}
+    chosen = {**own, **{key: value for key, value in given.items() if value is not None}}
+    if unknown := sorted(set(chosen) - OPTION_NAMES):
+        expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
+        raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
+    timing = {key: chosen.pop(key) for key in _TIMING if key in chosen}
+    return SimulationOptions(protocol=make_protocol(protocol, **timing), **chosen)
