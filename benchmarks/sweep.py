@@ -41,8 +41,8 @@ def run(given: argparse.Namespace) -> None:
     there = {_key(line) for line in read_lines(given.lines)}
     for name, path in files_of(given.volumes, given.names, given.size).items():
         for kind, views, dose in ((k, v, d) for k in given.kinds for v in given.views for d in given.doses):
-            facts = {"volume": name, "kind": kind, "views": views, "dose": dose, "size": given.size, "pixels": given.pixels}
-            facts["seed"] = given.seed
+            of_scan = dict(zip(SCAN, (kind, views, dose, given.size, given.pixels), strict=True))
+            facts = {"volume": name, **of_scan, "seed": given.seed}
             left = [f for f in given.factors if _key({**facts, "factor": f}) not in there]
             scan = scan_of(rt, path, given.size, given.pixels, kind, views, dose, given.seed) if left else None
             for factor in left:
@@ -82,7 +82,7 @@ def table(given: argparse.Namespace) -> None:
 
 
 def _key(line: dict[str, object]) -> tuple[object, ...]:
-    return tuple(line[name] for name in ("volume", "kind", "views", "dose", "size", "pixels", "seed", "factor"))
+    return tuple(line[name] for name in ("volume", *SCAN, "seed", "factor"))
 
 
 def main() -> None:

@@ -37,8 +37,8 @@ from phyradgs_cl.reconstructors import (
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.checkpoint import parsed
+from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
-from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.reconstructors.tune.trials import TUNED
 from phyradgs_cl.reconstructors.tune.wish import is_told, with_chosen

@@ -33,7 +33,7 @@ from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 from phyradgs_cl.check.variants import reversed_readout
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.phantoms import EllipsoidPhantom
-from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)

@@ -31,7 +31,7 @@ from phyradgs_cl.check.questions.saturation import OVERFLOW, CountReader, check_
 from phyradgs_cl.check.questions.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
 from phyradgs_cl.runtime import Runtime
 
 

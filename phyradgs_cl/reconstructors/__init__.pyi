@@ -1,13 +1,12 @@
+from .frames.preprocess import InputOptions as InputOptions
 from .method import Method as Method
-from .preprocess import InputOptions as InputOptions
+from .options import input_names as input_names
+from .options import input_options as input_options
+from .options import method_options as method_options
 from .registry import DEFAULT_METHOD as DEFAULT_METHOD
 from .registry import METHODS as METHODS
-from .registry import input_names as input_names
-from .registry import input_options as input_options
 from .registry import method_name as method_name
 from .registry import method_of as method_of
-from .registry import method_options as method_options
-from .registry import reconstruct as reconstruct
 from .registry import usual_preset as usual_preset
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
@@ -15,3 +14,4 @@ from .result import Reconstruction as Reconstruction
 from .result import State as State
 from .result import ignore_progress as ignore_progress
 from .result import interrupted as interrupted
+from .run import reconstruct as reconstruct

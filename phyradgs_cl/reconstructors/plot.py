@@ -7,8 +7,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.drawing import CURVE, draw_image, new_figure
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics.slices import draw_slices
-from phyradgs_cl.reconstructors.frame_pairs import FramePair, frame_pairs
-from phyradgs_cl.reconstructors.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.frames.pairs import FramePair, frame_pairs
+from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
 from phyradgs_cl.reconstructors.result import MARGIN_MM
 from phyradgs_cl.runtime import Runtime
 

@@ -10,7 +10,7 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
-from phyradgs_cl.reconstructors.frame_pairs import FramePair
+from phyradgs_cl.reconstructors.frames.pairs import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.facts import label, number
 from phyradgs_cl.report.markup import Markup, element, joined, raw_text

@@ -7,7 +7,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import TOLD
-from phyradgs_cl.reconstructors.frame_pairs import TIMES_PER_LINE, FramePair
+from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report.charts.curve import convergence_charts, histogram, tuning_chart
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words

@@ -81,6 +81,14 @@ def test_rows_go_on_as_a_volume_has_them(rt, axis) -> None:
     assert not found[..., [0, -1]].any()  # all of the grid is seen
 
 
+def test_rows_that_are_not_extrapolated_cost_no_reconstruction(rt, caplog) -> None:
+    aside = simulate("jaw", size=12, detector=16, views=12, detector_offset_mm=(0.0, 0.6), device=rt)
+    told = []
+    found = reconstruct(aside, "fdk", extrapolate="reprojected", device=rt, report=told.append)
+    assert "displaced detector are not extrapolated" in caplog.text and not any("beyond" in p.quantity for p in told)
+    np.testing.assert_array_equal(found.volume, reconstruct(aside, "fdk", device=rt, report=False).volume)
+
+
 def test_a_box_of_an_object_wider_than_the_panel(rt) -> None:
     """Three quarters of what the lost columns cost are regained, and a whole panel's volume stays as it was; Ctrl-C ends
     it before there is a volume."""

@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume
-from phyradgs_cl.reconstructors.registry import method_options
+from phyradgs_cl.reconstructors.options import method_options
 
 VIEWS, PIXELS = 60, 48
 GRID = Grid.cube(36, 2.0)

@@ -112,7 +112,7 @@ def test_rays_that_are_wrong_alike_add_up_and_noise_averages(rt, scan) -> None:
     """Of half the frames half as much of the first comes back, and √½ of the second."""
     half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
     whole, fewer = (Reach.of(System.of_scan(rt, one, Static())) for one in (scan, half))
-    assert fewer.edges_mm == pytest.approx(whole.edges_mm / 2, rel=0.01)
+    assert fewer.alike_mm == pytest.approx(whole.alike_mm / 2, rel=0.01)
     assert fewer.noise_mm == pytest.approx(whole.noise_mm / np.sqrt(2), rel=0.1)
 
 

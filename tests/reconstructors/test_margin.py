@@ -71,6 +71,17 @@ def test_no_margin_is_none_and_one_too_wide_for_memory_is_named(rt, scan) -> Non
         reconstruct(scan, "sirt", margin_mm=1000 * max(scan.grid.voxel_size_mm), iterations=1, device=rt)
 
 
+def test_volumes_on_the_way_are_those_of_the_box(rt, scan) -> None:
+    shown = []
+    for method, more in (("fista", {}), ("phyradgs", {"gaussians": 50})):
+        usual = {"iterations": 4, "device": rt, "roi_mm": PART.roi_mm, "margin_mm": PART.margin_mm, **more}
+        found = reconstruct(scan, method, **usual, report=lambda progress: shown.append(progress.volume and progress.volume()))
+        for volume, grid in filter(None, shown):
+            assert volume.shape == grid.shape
+            np.testing.assert_allclose(grid.box_mm, found.grid.box_mm, atol=max(grid.voxel_size_mm))  # may be coarser
+    assert any(shown)
+
+
 def test_a_plot_says_that_the_margin_is_gone(rt, scan) -> None:
     for more, expected in (({}, False), ({"margin_mm": 0.3}, True)):
         figure = reconstruct(scan, "sirt", roi_mm=0.9, iterations=2, device=rt, report=False, **more).plot(scan, device=rt)

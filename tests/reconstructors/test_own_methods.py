@@ -19,7 +19,7 @@ from phyradgs_cl.api import (
     reconstruct,
 )
 from phyradgs_cl.errors import InputError, NumericalError
-from phyradgs_cl.reconstructors.registry import motions_of
+from phyradgs_cl.reconstructors.options import motions_of
 
 TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
 MODULE = '''

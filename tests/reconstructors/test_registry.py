@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static, TimeCells
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
-from phyradgs_cl.reconstructors.registry import motions_of
+from phyradgs_cl.reconstructors.options import motions_of
 from phyradgs_cl.reconstructors.voxels.sirt import SirtOptions
 
 ABSURD = {

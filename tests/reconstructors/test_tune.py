@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.reconstructors import InputOptions, Progress, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.reconstructors.holdout import held_out
+from phyradgs_cl.reconstructors.frames.holdout import held_out
 from phyradgs_cl.reconstructors.result import HELD_OUT
 from phyradgs_cl.reconstructors.tune import trials
 from phyradgs_cl.reconstructors.tune.trials import TUNED

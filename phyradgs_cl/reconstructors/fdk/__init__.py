@@ -2,7 +2,9 @@
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -72,7 +74,7 @@ def fdk(
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_orbit(pose)
     how = {"window": options.window, "extrapolate": options.extrapolate}
-    whole = whole_object(scan, options.motion, rt, report) if options.extrapolate == "reprojected" else None
+    whole = partial(whole_object, scan, options.motion, rt, report)
     volume = fdk_volume(rt, frames, pose, scan.grid, axis=scan.shutter.axis, whole=whole, **how)
     facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
@@ -90,13 +92,13 @@ def fdk_volume(
     window: str = "ram-lak",
     axis: str = "rows",
     extrapolate: str = "none",
-    whole: np.ndarray | None = None,
+    whole: Callable[[], np.ndarray] | None = None,
 ) -> np.ndarray:
     """FDK of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
     pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns)
-    and short scans are recognised and weighted; a warning is logged where data are missing. ``whole`` (z, y, x) in 1/mm on
-    ``grid``: the object, for ``reprojected``. Raises InputError for a source on the rotation axis.
+    and short scans are recognised and weighted; a warning is logged where data are missing. ``whole`` makes the
+    object (z, y, x) in 1/mm on ``grid``, for ``reprojected``. Raises InputError for a source on the rotation axis.
     """
     shape = (frames.shape[1], frames.shape[2])
     by_pixel = pose_of_pixels(pose, axis)
@@ -110,9 +112,10 @@ def fdk_volume(
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("FDK: the rows of a displaced detector are not extrapolated")
     elif extrapolate != "none":
-        wide, count = (
-            extrapolated(frames, extrapolate) if whole is None else reprojected(rt, frames, pose, axis, whole, grid)
-        )
+        if extrapolate == "reprojected" and whole is not None:
+            wide, count = reprojected(rt, frames, pose, axis, whole(), grid)
+        else:
+            wide, count = extrapolated(frames, extrapolate)
         return fdk_volume(rt, wide, widened(pose, axis, (count, count)), grid, window=window, axis=axis)
     warn_if_incomplete(arc, fan, canonical, grid)
     missing = fan.missing_columns if arc.is_full else (0, 0)

@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.masked import with_masked
 from phyradgs_cl.reconstructors.checkpoint import parsed
-from phyradgs_cl.reconstructors.holdout import held_out, holdout_errors
+from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress
 from phyradgs_cl.reconstructors.tune.wish import Wish, is_told, wish_of, with_chosen, with_value
 from phyradgs_cl.runtime import Runtime

@@ -54,16 +54,16 @@ class Reach:
     rays do not know of each other, and the mean of 1, as of rays that are all wrong alike."""
 
     noise_mm: float
-    edges_mm: float
+    alike_mm: float
 
     @classmethod
     def of(cls, system: System) -> "Reach":
         drawn = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
-        noise = system.adjoint(system.masked(system.weighed(system.space.array(drawn))))
+        backs = system.adjoint(system.masked(system.weighed(system.space.array(drawn)))), system.column_sums()
         middle = tuple(slice(n // 4, n - n // 4) for n in system.volume_shape)
-        noise, ones = (system.space.numpy(back)[middle] for back in (noise, system.column_sums()))
+        noise, ones = (system.space.numpy(back)[middle] for back in backs)
         return cls(float(noise.std(dtype=np.float64)), float(ones.mean(dtype=np.float64)))
 
     def gradient_mm(self, misfit: Misfit, density_per_mm: float) -> float:
         """What the misfit makes of the gradient."""
-        return math.hypot(misfit.noise * self.noise_mm, misfit.edges_mm * density_per_mm * self.edges_mm)
+        return math.hypot(misfit.noise * self.noise_mm, misfit.edges_mm * density_per_mm * self.alike_mm)

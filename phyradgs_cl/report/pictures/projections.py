@@ -1,7 +1,7 @@
 """Which frames a page shows beside those of its volume."""
 
-from phyradgs_cl.reconstructors.frame_pairs import FramePair, frame_pairs
-from phyradgs_cl.reconstructors.preprocess import prepared
+from phyradgs_cl.reconstructors.frames.pairs import FramePair, frame_pairs
+from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
 

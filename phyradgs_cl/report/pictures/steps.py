@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.preprocess import stages
+from phyradgs_cl.reconstructors.frames.preprocess import stages
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
 

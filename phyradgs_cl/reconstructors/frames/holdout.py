@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.frame_pairs import frame_pairs
+from phyradgs_cl.reconstructors.frames.pairs import frame_pairs
 from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.runtime import Runtime
 

@@ -92,7 +92,7 @@ def _begun(scan: Scan, options: InputOptions) -> Scan:
 def _model(rt: Runtime | None, scan: Scan) -> Model:
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
-    from phyradgs_cl.reconstructors.reprojection import reprojection  # methods: slow to import
+    from phyradgs_cl.reconstructors.frames.reprojection import reprojection  # methods: slow to import
 
     return reprojection(rt, scan)
 

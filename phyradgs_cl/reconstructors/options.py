@@ -1,0 +1,178 @@
+"""Options of a method by name, from wherever they come: a preset, with what is asked for checked and put in its place."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Exact, Motion
+from phyradgs_cl.acquisition.motion import MODELS, STILL
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.frames.preprocess import InputOptions
+from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
+from phyradgs_cl.reconstructors.tune.wish import check_wish
+from phyradgs_cl.text import near_miss
+
+_COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
+"""The fields of motion models, by which options name them."""
+_ALL = (*STILL, Exact())  # of methods of one's own
+
+
+def method_options(
+    method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None, tune: str = ""
+) -> Any:
+    """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
+
+    ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
+    may be a model of one's own. ``tune``: which option the scan will choose.
+    Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
+    """
+    name, presets = method_name(method), method_of(method).presets
+    chosen = next(iter(presets)) if preset is None else preset
+    if not isinstance(chosen, str) or chosen not in presets:
+        having = [other for other, one in METHODS.items() if isinstance(chosen, str) and chosen in one.presets]
+        remedy = f"--method {' or '.join(having)} has it" if having else ""
+        raise InputError("--preset", checks.shown(chosen), f"one of {', '.join(presets)} for --method {name}", remedy)
+    changes = dict(changes or {})
+    base = presets[chosen]
+    if hasattr(base, "motion"):
+        motion = changes.pop("motion", None)
+        counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
+        base = replace(base, motion=_motion(name, base, motion, counts))
+    options = _changed(base, changes, f"--method {name}")
+    if tune:
+        check_wish(tune, name, options, changes, method_of(method).ends_anywhere)
+    return options
+
+
+def input_options(changes: Mapping[str, Any]) -> InputOptions:
+    """Input options by name, checked as the methods' own are."""
+    return _changed(InputOptions(), changes, "reconstruct")
+
+
+def input_names(method: object, preset: str | None = None) -> list[str]:
+    """The names of the input options, but those that the method's own options have too, which go before them."""
+    own = {f.name for f in fields(method_options(method, preset))}
+    return [f.name for f in fields(InputOptions) if f.name not in own]
+
+
+def motions_of(method: object) -> tuple[str, ...]:
+    """The names of the motion models that a method takes."""
+    return tuple(_models(next(iter(method_of(method).presets.values()))))
+
+
+def _models(options: Any) -> dict[str, Any]:
+    """The models of ``options`` by name, with what the preset says of its own."""
+    own = [options.motion] if hasattr(options.motion, "name") else []
+    return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
+
+
+def _has(model: Any, count: str) -> bool:
+    return any(f.name == count and f.init for f in fields(model))
+
+
+def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
+    """The model of ``options`` by its name, with the counts that are given, of which it must have each; or one's own."""
+    if callable(getattr(motion, "cells", None)) and not counts:
+        return motion
+    models = _models(options)
+    if motion is None and not hasattr(options.motion, "name"):
+        return options.motion
+    name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
+    if not isinstance(name, str) or name not in models:
+        raise InputError("--motion", checks.shown(name), f"one of {', '.join(models)} for --method {method}")
+    model = models[name]
+    for key, value in counts.items():
+        option = "--" + key.replace("_", "-")
+        if not _has(model, key):
+            having = " or ".join(n for n, other in models.items() if _has(other, key))
+            found = f"--motion {name} for --method {method}"
+            expected = f"--motion {having}" if having else "a method with a motion that has them"
+            raise InputError(option, found, expected, f"leave {option} out")
+        model = replace(model, **{key: _converted(getattr(model, key), value, option)})
+    return model
+
+
+def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
+    """The usual model; where that follows the motion in its own way, the one that has what is given.
+
+    A method that is static by itself stays so until it is told otherwise.
+    """
+    if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
+        return usual
+    having = [name for name, model in models.items() if all(_has(model, key) for key in counts)]
+    return having[0] if len(having) == 1 else usual
+
+
+def _motion_options(options: Any) -> list[str]:
+    """The names by which the motion of ``options`` can be changed."""
+    if not hasattr(options, "motion"):
+        return []
+    return ["motion", *(key for key in _COUNTS if any(_has(m, key) for m in _models(options).values()))]
+
+
+def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
+    """``options`` with ``changes`` by name; ``culprit`` is the method, or the table that they belong to."""
+    known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
+    values: dict[str, Any] = {}
+    for key, value in changes.items():
+        if key not in known:
+            names = [*known, *_motion_options(options)]
+            remedy = near_miss(key, names, _having(key) or "leave it out")
+            raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
+        is_function = callable(value) and key in getattr(options, "FUNCTIONS", ())
+        values[key] = value if is_function else _converted(known[key], value, f"{culprit}: option {key}")
+    try:
+        return replace(options, **values)
+    except (TypeError, ValueError) as error:  # of options of one's own, which check in their own way
+        raise InputError(culprit, str(error), "values that its options take") from error
+
+
+def _having(option: str) -> str:
+    """The methods that have an option, as advice; nothing where none has."""
+    usual = {name: next(iter(one.presets.values())) for name, one in METHODS.items()}
+    having = [name for name, options in usual.items() if hasattr(options, option)]
+    return f"--method {' or '.join(having)} has it" if having else ""
+
+
+def _converted(current: Any, value: Any, culprit: str) -> Any:
+    """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
+    if current is None:  # the options check it themselves
+        return value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if is_dataclass(current):
+        if not isinstance(value, Mapping):
+            raise InputError(culprit, checks.shown(value), "a table")
+        return _changed(current, value, culprit)
+    if isinstance(current, tuple):
+        if not isinstance(value, (list, tuple)) or len(value) != len(current):
+            raise InputError(culprit, checks.shown(value), f"a list of {len(current)} numbers")
+        return tuple(_converted(c, v, culprit) for c, v in zip(current, value, strict=True))
+    if type(current) not in _EXPECTED:  # of options of one's own
+        return value
+    expected, fits = _EXPECTED[type(current)]
+    if not fits(value):
+        raise InputError(culprit, checks.shown(value), expected)
+    return type(current)(value)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether ``value`` is a finite number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # whole numbers have no bounds
+        return False
+
+
+_EXPECTED: dict[type, tuple[str, Callable[[Any], bool]]] = {
+    bool: ("true or false", lambda value: isinstance(value, bool)),
+    str: ("a word", lambda value: isinstance(value, str)),
+    int: ("a whole number", lambda value: _is_number(value) and value == int(value)),
+    float: ("a finite number", _is_number),
+}
