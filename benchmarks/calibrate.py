@@ -12,6 +12,7 @@ wide as the volume; the volume is fista-tv's, every line at its own times. Cases
     rows       the same, rows read: not to be known from such a scan
     turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way
     wobble     0.3° and 1 pixel (RMS) per view
+    slow       the same by six splines of time, and asked for so
     kaist      0.03 rad and 1 voxel (RMS) per view, the noise of Choi et al. (2026), for --views 75
     motion     the object turns by up to 2° and moves by up to 2 voxels while it is scanned, about and along all axes
     beads      a phantom of known shape, which lies anyhow: readout, exposure, offset, roll, tilt and both distances off at
@@ -38,7 +39,14 @@ from phyradgs_cl.calibrate import Calibration, calibrate
 from phyradgs_cl.calibrate.moved import Change, Moved, Sway, Views, moved
 from phyradgs_cl.calibrate.parameters import PARAMETERS, change_of
 from phyradgs_cl.calibrate.views import SPLINES
-from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges, without_sway_gauges
+from phyradgs_cl.calibrate.wobble import (
+    numbers_of_sway,
+    numbers_of_views,
+    views_of,
+    without_gauges,
+    without_smooth_gauges,
+    without_sway_gauges,
+)
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import psnr
@@ -82,6 +90,7 @@ class Case:
     views: Views | None = None
     is_scored: bool = True
     phantom: EllipsoidPhantom | None = None
+    splines: int = 0
 
 
 def panel(make: Maker, seed: int) -> Case:
@@ -120,6 +129,16 @@ def wobble(make: Maker, seed: int) -> Case:
     """But for what an object turned or elsewhere looks like: its volume could not be compared with the truth."""
     scan = make(seed)
     return _shaken(make, scan, seed, np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm]))
+
+
+def slow(make: Maker, seed: int) -> Case:
+    scan = make(seed)
+    numbers = numbers_of_views(scan, 6)
+    drawn = without_smooth_gauges(scan, numbers, np.random.default_rng(seed).normal(size=(6, 3)))
+    size = np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm])
+    views = views_of(numbers.basis @ drawn / np.std(numbers.basis @ drawn, axis=0) * size)
+    shaken = make(seed, views_off=views)
+    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views, splines=6)
 
 
 def kaist(make: Maker, seed: int) -> Case:
@@ -198,7 +217,7 @@ def _without(scan: Scan, planted: dict[str, float]) -> Scan:
     return moved(scan, change_of({name: -value for name, value in planted.items()}))
 
 
-CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, kaist, motion, beads, draw)}
+CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, slow, kaist, motion, beads, draw)}
 
 
 def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
@@ -222,7 +241,7 @@ def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
 
 def run_one(rt: Runtime, case: Case) -> dict[str, object]:
     started, cpu_started = time.perf_counter(), time.process_time()
-    found = calibrate(case.stated, rt, case.what, case.others, phantom=case.phantom)
+    found = calibrate(case.stated, rt, case.what, case.others, phantom=case.phantom, splines=case.splines)
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     scans = {"stated": case.stated, "calibrated": found.scan, "right": case.right}
     if not found.corrected and case.stated is case.right:
@@ -231,7 +250,7 @@ def run_one(rt: Runtime, case: Case) -> dict[str, object]:
     return {
         "parameters": [line(one, case.planted) for one in found.parameters],
         "psnr_db": {"stated": scores["right"], "calibrated": scores["right"], **scores} if scores else {},
-        **{key: value for key, value in found.facts().items() if key != "parameters"},
+        **{key: value for key, value in found.facts().items() if key not in ("parameters", "views")},
         **wobble_left(found, case),
         "seconds": round(seconds, 1),
         "cpu_seconds": round(cpu_seconds, 1),

@@ -1,11 +1,15 @@
 """What a calibration found: a line per parameter, the combinations that nothing tells apart, and the scan set right."""
 
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.moved import Sway, Views
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
 
@@ -57,4 +61,23 @@ class Calibration:
             "alike": self.alike,
             "residual_rms_before": before,
             "residual_rms_after": after,
+            "views": {name: np.round(values, 6).tolist() for name, values in self.per_view().items()},
         }
+
+    def per_view(self) -> dict[str, np.ndarray]:
+        """What was corrected of every view, or of the object in the middle of each, (F,) by name and unit; nothing where
+        nothing was."""
+        if self.views is None:
+            return {}
+        if isinstance(self.views, Views):
+            shift_v_mm, shift_u_mm = self.views.shift_mm.T
+            return {"turn_deg": np.rad2deg(self.views.turn_rad), "shift_v_mm": shift_v_mm, "shift_u_mm": shift_u_mm}
+        six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
+        turns = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
+        return turns | {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
+
+    def plot(self) -> "Figure":
+        """A figure: residuals of four frames before and after, and what was corrected of single views."""
+        from phyradgs_cl.calibrate.picture import calibration_figure
+
+        return calibration_figure(self)

@@ -63,17 +63,20 @@ class Sway:
         return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
 
     def basis(self, time_s: np.ndarray) -> np.ndarray:
-        """The splines (..., n) at times (...); they sum to 1."""
-        count = len(self.coefficients)
-        share = np.clip((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), 0, 1)
-        knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
-        found = BSpline.design_matrix(np.ravel(share), knots, 3).toarray()
-        return found.reshape(*np.shape(share), count)
+        """The splines (..., n) at times (...)."""
+        return splines((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), len(self.coefficients))
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
         """The six numbers (..., 6) at times (...)."""
         six: np.ndarray = self.basis(time_s) @ self.coefficients
         return six
+
+
+def splines(share: np.ndarray, count: int) -> np.ndarray:
+    """Cubic splines (..., count) at shares (...) of a time, from 0 to 1; they sum to 1."""
+    knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
+    found = BSpline.design_matrix(np.clip(np.ravel(share), 0, 1), knots, 3).toarray()
+    return found.reshape(*np.shape(share), count)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__
+from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.beads import BeadLevel
 from phyradgs_cl.calibrate.finding import AGREES, CANNOT_TELL, CORRECTED, Calibration, Found
@@ -46,6 +46,7 @@ LEAST_OF_BEADS = 0.02  # of a parameter's signal, of a known shape: voxels expla
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by beads that lie best, before anything is put right
 _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other order's residual, as ``check`` has them
 _OF_FRAMES = ("lag", "drift")  # what is no matter of poses
+_FEWEST_SPLINES = 4  # cubic ones
 _SETTLED = 0.1  # of a standard deviation
 _OF_WAY = 0.5  # from a stage to one twice as fine: what is left of it, as of an error of first order
 
@@ -96,16 +97,18 @@ def calibrate(
     others: Sequence[Scan] = (),
     report: Report = lambda done, total, text: None,
     phantom: EllipsoidPhantom | None = None,
+    splines: int = 0,
 ) -> Calibration:
     """The scan with its true geometry and timing as far as its frames tell them; ``what``: parameters with commas, None the
     usual ones. ``others``: more scans of the same object, lying as it did, that share what is wrong. ``phantom``: what the
-    object is, wherever it lies.
+    object is, wherever it lies. ``splines``: of time, that a wobble goes by, 0 for every view by itself.
 
     InputError for parameters that there are not, a scan too small, others that do not fit the first, a phantom that is not
     what frames show."""
     parameters, per_view, asks_direction = chosen(what, scan, phantom is not None)
     asks_lag = any(one.name == "lag" for one in parameters)
     ready = [prepared(one, InputOptions(ignore_lag=asks_lag)) for one in (scan, *others)]
+    _check_splines(splines, per_view, scan)
     _check(ready, [one.name for one in parameters], per_view, phantom)
     _warn_of_truncation(ready[0], phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
@@ -128,7 +131,7 @@ def calibrate(
     change, views, table_of_views = change_of(kept), None, []
     if per_view:
         report(len(levels), len(levels), "views")
-        find = find_wobble if per_view == WOBBLE else find_sway
+        find = partial(find_wobble, splines=splines) if per_view == WOBBLE else find_sway
         wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
         views, table_of_views = wobble.views, wobble.table
     report(len(levels), len(levels), "residuals")
@@ -219,6 +222,14 @@ def _check(scans: Sequence[Scan], names: Sequence[str], per_view: str, phantom: 
                 raise InputError(f"--with: {name}", found, f"the first scan's, {getattr(first, name)}")
         if other.shutter.axis != first.shutter.axis:
             raise InputError("--with: readout axis", other.shutter.axis, f"the first scan's, {first.shutter.axis}")
+
+
+def _check_splines(splines: int, per_view: str, scan: Scan) -> None:
+    if splines == 0:
+        return
+    if per_view != WOBBLE:
+        raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")
+    checks.whole("--splines", splines, _FEWEST_SPLINES, scan.frames)
 
 
 def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:

@@ -20,6 +20,7 @@ from phyradgs_cl.calibrate.wobble import (
     numbers_of_views,
     view_step,
     without_gauges,
+    without_smooth_gauges,
     without_sway_gauges,
 )
 from phyradgs_cl.runtime import Runtime
@@ -46,13 +47,15 @@ class Wobble:
     table: list[Found]
 
 
-def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:
-    """Turns and shifts of all views of a scan after ``change``; stages: columns, iterations of a first and next volume.
+def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change, splines: int = 0) -> Wobble:
+    """Turns and shifts of all views of a scan after ``change``, each by itself or by so many ``splines`` of time; stages:
+    columns, iterations of a first and next volume.
 
     Shifts on each level; turns, which need fine detail, on the last one."""
     kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 1) + [KINDS]
-    numbers = numbers_of_views(scan)
-    return _found(rt, scan, stages, change, numbers, kinds, partial(without_gauges, scan), _OF_VIEWS)
+    numbers = numbers_of_views(scan, splines)
+    without = partial(without_smooth_gauges, scan, numbers) if splines else partial(without_gauges, scan)
+    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_VIEWS)
 
 
 def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:

@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.moved import Change, Sway, Views
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, drift_course, splines
 from phyradgs_cl.check.questions.timing import start_azimuths_rad
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.operators.rays.operator import RayOperator
@@ -37,9 +37,10 @@ class Numbers:
         return level.operator(change, self.views(self.values + more))
 
 
-def numbers_of_views(scan: Scan) -> Numbers:
-    """A turn and two shifts of every view."""
-    return Numbers(np.zeros((scan.frames, len(KINDS))), np.eye(scan.frames), units_of(scan), views_of)
+def numbers_of_views(scan: Scan, count: int = 0) -> Numbers:
+    """A turn and two shifts of every view by itself, or by ``count`` splines of time."""
+    basis = splines(drift_course(scan) + 0.5, count) if count else np.eye(scan.frames)
+    return Numbers(np.zeros((basis.shape[1], len(KINDS))), basis, units_of(scan), lambda values: views_of(basis @ values))
 
 
 def numbers_of_sway(scan: Scan, count: int) -> Numbers:
@@ -103,11 +104,26 @@ def without_gauges(scan: Scan, numbers: np.ndarray) -> np.ndarray:
     return found
 
 
+def without_smooth_gauges(scan: Scan, numbers: Numbers, values: np.ndarray) -> np.ndarray:
+    """Values (n, 3) without what ``without_gauges`` takes out, as far as splines follow it."""
+    circle = numbers.basis @ _circle(scan, numbers.basis)
+    found = values.copy()
+    found[:, :2] -= (numbers.basis @ found[:, :2]).mean(0)
+    found[:, 2] -= _circle(scan, numbers.basis) @ np.linalg.lstsq(circle, numbers.basis @ found[:, 2], rcond=None)[0]
+    return found
+
+
+def _circle(scan: Scan, basis: np.ndarray) -> np.ndarray:
+    """Values (n, 2) that go as the cosine and sine of the angle, as far as a ``basis`` (F, n) does."""
+    azimuth = start_azimuths_rad(scan)
+    found: np.ndarray = np.linalg.lstsq(basis, np.stack([np.cos(azimuth), np.sin(azimuth)], -1), rcond=None)[0]
+    return found
+
+
 def without_sway_gauges(scan: Scan, numbers: Numbers, values: np.ndarray) -> np.ndarray:
     """Values (n, 6) without what another object looks like: one that lies elsewhere, the mean of each; one that is larger or
     smaller, shifts along x and y that keep to the source's side."""
-    azimuth = start_azimuths_rad(scan)
-    beside = np.linalg.lstsq(numbers.basis, np.stack([np.cos(azimuth), np.sin(azimuth)], -1), rcond=None)[0]
+    beside = _circle(scan, numbers.basis)
     found = values - (numbers.basis @ values).mean(0)
     beside -= (numbers.basis @ beside).mean(0)
     there, pattern = numbers.basis @ found[:, 3:5], numbers.basis @ beside

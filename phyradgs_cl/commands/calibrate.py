@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, Found, calibrate
 from phyradgs_cl.calibrate.parameters import DIRECTION, GROUPS, MOTION, PARAMETERS, WOBBLE
-from phyradgs_cl.calibrate.picture import residual_picture
+from phyradgs_cl.calibrate.picture import calibration_figure
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Device, Scan
@@ -30,6 +30,7 @@ _WHAT = f"What to look for, with commas: {', '.join(_NAMES)}."
 _USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
 _OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."
 _PHANTOM = "What was scanned: a TOML file of beads and wires (docs/formats.md), wherever they lie."
+_SPLINES = "A wobble that changes slowly: views go by N cubic splines of time, at least 4."
 _WITH = "Another scan of the same object, which lies as it did: turned the other way, it tells readout and exposure."
 
 
@@ -39,8 +40,9 @@ def calibrate_command(
     what: Annotated[str | None, option(_WHAT, _USUAL)] = None,
     other: Annotated[Path | None, file_option(_WITH, "--with", default=False)] = None,
     phantom: Annotated[Path | None, file_option(_PHANTOM, "--phantom", default=False)] = None,
+    splines: Annotated[int, option(_SPLINES, "0: every view by itself", metavar="N")] = 0,
     picture: Annotated[
-        Path | None, file_option("PNG of residuals before and after.", "--picture", default="OUTPUT with .png")
+        Path | None, file_option("PNG of residuals before and after, and of views.", "--picture", default="OUTPUT with .png")
     ] = None,
     as_json: AsJson = False,
     device: Device = None,
@@ -60,13 +62,13 @@ def calibrate_command(
         if output is not None:
             _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
         report = lambda done, total, at: ticker.show(done, total, f"  {at}")  # noqa: E731
-        found = calibrate(loaded, Runtime(wish), what, others, report, shape)
+        found = calibrate(loaded, Runtime(wish), what, others, report, shape, splines)
     if output is not None:
         with only_run(output), finish_despite_interrupt():
             copy_with_motion(scan, output, found.scan)
     if picture is not None:
         with finish_despite_interrupt(), written_beside(picture) as temporary:
-            temporary.write_bytes(residual_picture(found))
+            calibration_figure(found).savefig(temporary, format="png", dpi=110)
     say(json.dumps({"scan": str(scan), **found.facts()}) if as_json else _as_text(found))
     if output is not None and not as_json:
         said = ", ".join(one.name for one in found.corrected) or "nothing"

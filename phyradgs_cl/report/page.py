@@ -55,6 +55,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),
+        "calibration": sections.calibration_section(run.scan),
         "scan": sections.scan_section(run),
         "geometry": sections.geometry_section(run.scan),
         "shutter": sections.shutter_section(run, run.scan),

@@ -8,7 +8,7 @@ from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerR
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
-from phyradgs_cl.report.charts.curve import convergence_charts, histogram, tuning_chart
+from phyradgs_cl.report.charts.curve import convergence_charts, histogram, tuning_chart, views_chart
 from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
 from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
@@ -131,6 +131,33 @@ def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
     words += "of grey values each; difference, after less before."
     note = element("p", words, class_="note") if changes else None
     return _section("preparation", "Preparation", note, *earlier, *(_change(change) for change in changes))
+
+
+def calibration_section(scan: Scan) -> Markup | None:
+    """What `calibrate` found before the scan was reconstructed: its table, and what was corrected of single views."""
+    told = scan.provenance.get("calibration")
+    lines = _tables(told.get("parameters")) if isinstance(told, Mapping) else []
+    if not lines or not isinstance(told, Mapping):
+        return None
+    heads = element("tr", *(element("th", name, scope="col") for name in ("parameter", "stated", "found", "verdict")))
+    rows = [element("tr", *(element("td", cell) for cell in _calibrated(line))) for line in lines]
+    before, after = (shown(told.get(f"residual_rms_{when}")) for when in ("before", "after"))
+    words = f"What the scan says of itself was found from its frames: residual {before} before, {after} after (RMS)."
+    views = told.get("views")
+    charts = [views_chart(key, values) for key, values in views.items()] if isinstance(views, Mapping) else []
+    table = element("table", element("thead", heads), element("tbody", *rows))
+    drawn = _charts(chart for chart in charts if chart is not None)
+    return _section("calibration", "Calibration", element("p", words, class_="note"), table, drawn)
+
+
+def _calibrated(line: Mapping[str, object]) -> list[str]:
+    """The cells of a parameter: found with its deviation, or nothing."""
+    name, scale, stated, found, deviation, verdict = (
+        line.get(key) for key in ("name", "unit", "stated", "found", "deviation", "verdict")
+    )
+    of = str(scale or "")
+    value = "–" if found is None else f"{shown(found)} ± {shown(deviation, of)}"
+    return [str(name), shown(stated, of), value, str(verdict)]
 
 
 def _tables(told: object) -> list[Mapping[str, object]]:

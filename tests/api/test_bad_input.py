@@ -268,6 +268,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "calibrate": [
         (lambda: api.calibrate("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
         (lambda: api.calibrate(GOOD, "rol"), "what: found .rol"),
+        (lambda: api.calibrate(GOOD, "roll", splines=6), "splines: found 6; expected with what wobble"),
         (lambda: api.calibrate(BACKWARDS), "pose table: found the grid behind the panel"),
         (lambda: api.calibrate(GOOD), "4 frames|12 columns|8 frames|columns"),
     ],

@@ -7,11 +7,19 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit
-from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
-from phyradgs_cl.calibrate.moved import Change, Views, evenly_lit, moved
+from phyradgs_cl.api import simulate
+from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, Calibration, calibrate
+from phyradgs_cl.calibrate.moved import Change, Sway, Views, evenly_lit, moved
 from phyradgs_cl.calibrate.parameters import in_words
 from phyradgs_cl.calibrate.views import SPLINES, find_sway, find_wobble
-from phyradgs_cl.calibrate.wobble import numbers_of_sway, views_of, without_gauges, without_sway_gauges
+from phyradgs_cl.calibrate.wobble import (
+    numbers_of_sway,
+    numbers_of_views,
+    views_of,
+    without_gauges,
+    without_smooth_gauges,
+    without_sway_gauges,
+)
 from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
@@ -114,6 +122,47 @@ def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt,
     assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
 
 
+def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
+    """Better than view by view, with what was corrected in the answer, the picture and the report of a volume."""
+    how = {"size": 24, "detector": 36, "views": 40, "exposure_deg": 3.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
+    scan = simulate("foot", **how, device=rt)
+    numbers = numbers_of_views(scan, 6)
+    drawn = np.array([np.deg2rad(3.0), 0.1, 0.1]) * np.random.default_rng(1).normal(size=(6, 3))
+    values = without_smooth_gauges(scan, numbers, drawn)
+    np.testing.assert_allclose(without_smooth_gauges(scan, numbers, values), values, atol=1e-12)
+    planted = numbers.basis @ values
+    off = moved(scan, Change(), views_of(-planted))
+    left = []
+    for splines in (0, 6):
+        found = find_wobble(rt, off, [(18, 40, 15), (36, 40, 12)], Change(), splines)
+        left.append(np.sqrt(np.mean((np.c_[found.views.turn_rad, found.views.shift_mm] - planted) ** 2, axis=0)))
+    assert [one.verdict for one in found.table] == [CORRECTED] * 3
+    most = np.array([0.4, 0.05, 0.05]) * np.sqrt(np.mean(planted**2, axis=0))
+    assert np.all(left[1] < most) and np.all(left[1] < 0.8 * left[0]), left
+    path, out, volume, page = (tmp_path / name for name in ("scan.h5", "out.h5", "volume.h5", "page.html"))
+    write_scan(path, off)
+    assert cli.run(["calibrate", str(path), "--what", "wobble", "--splines", "6", "-o", str(out), "--json"]) == 0
+    views = json.loads(capsys.readouterr().out)["views"]
+    assert list(views) == ["turn_deg", "shift_v_mm", "shift_u_mm"] and len(views["turn_deg"]) == 40
+    np.testing.assert_allclose(views["shift_u_mm"], planted[:, 2], atol=0.2 * np.abs(planted[:, 2]).max())
+    assert load_scan(out).provenance["calibration"]["views"] == views
+    assert cli.run(["reconstruct", str(out), "--method", "fdk", "-o", str(volume)]) == 0
+    assert cli.run(["report", str(volume), "-o", str(page)]) == 0
+    section = page.read_text(encoding="utf-8").split('id="calibration"')[1].split("</section>")[0]
+    assert section.count("corrected</td>") == 3 and section.count("<svg") == 3
+
+
+def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
+    images = np.zeros((15, 4, 5), np.float32)
+    alone = Calibration(right, [], [], (1.0, 0.5), images, images)
+    moving = replace(alone, views=Sway.none(right, 7))
+    count = [len(found.plot().axes) for found in (alone, replace(alone, views=Views.none(15)), moving)]
+    assert alone.per_view() == {} and alone.facts()["views"] == {}
+    assert count[1] == count[2] == count[0] + 2  # turns, and shifts
+    last = moving.plot().axes[-1]
+    assert [line.get_label() for line in last.get_lines()] == ["shift x", "shift y", "shift z"]
+
+
 def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
     """Frames that overlap in time are no hindrance: a motion is of time alone."""
     numbers = numbers_of_sway(right, SPLINES)
@@ -189,6 +238,12 @@ def test_what_cannot_be_asked_is_refused(rt, right, what, change, others, said) 
     with pytest.raises(InputError) as refused:
         calibrate(change(right), rt, what, [other(right) for other in others])
     assert said in str(refused.value)
+
+
+def test_splines_are_of_a_wobble(rt, right) -> None:
+    for what, splines, said in (("roll", 6, "with --what wobble"), ("wobble", 3, "from 4"), ("wobble", 16, "to 15")):
+        with pytest.raises(InputError, match=f"--splines: found {splines}; expected .*{said}"):
+            calibrate(right, rt, what, splines=splines)
 
 
 def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tmp_path) -> None:

@@ -75,7 +75,7 @@ def test_volumes_on_the_way_are_those_of_the_box(rt, scan) -> None:
     shown = []
     for method, more in (("fista", {}), ("phyradgs", {"gaussians": 50})):
         usual = {"iterations": 4, "device": rt, "roi_mm": PART.roi_mm, "margin_mm": PART.margin_mm, **more}
-        found = reconstruct(scan, method, **usual, report=lambda progress: shown.append(progress.volume and progress.volume()))
+        found = reconstruct(scan, method, **usual, report=lambda at: shown.append(at.volume and at.volume()))
         for volume, grid in filter(None, shown):
             assert volume.shape == grid.shape
             np.testing.assert_allclose(grid.box_mm, found.grid.box_mm, atol=max(grid.voxel_size_mm))  # may be coarser

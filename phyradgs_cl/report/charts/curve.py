@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.report.charts.axes import Axes, svg
-from phyradgs_cl.report.facts import label, number
+from phyradgs_cl.report.facts import label, number, unit
 from phyradgs_cl.report.markup import Markup, joined
 
 MOST_CHARTS = 3
@@ -44,6 +45,19 @@ def tuning_chart(tuned: Mapping[str, Any]) -> tuple[str, Markup]:
     )
     caption = f"{name}: {number(chosen)}, chosen by line integrals that the trials of the method did not see."
     return caption, svg(drawn, f"Error over {name}", caption)
+
+
+def views_chart(key: str, values: object) -> tuple[str, Markup] | None:
+    """(caption, drawing) of what was corrected of every view, from a file that anybody may have edited: None for anything
+    but numbers."""
+    if not isinstance(values, list) or len(values) < 2 or not all(map(NUMBER.fits, values)):
+        return None
+    low, high = min(0.0, *values), max(0.0, *values)
+    axes = Axes((0.0, len(values) - 1.0), (low, high if high > low else low + 1.0))
+    points = list(enumerate(values))
+    drawn = joined(axes.frame("view", f"{label(key)}, {unit(key)}"), axes.polyline(points, "curve"))
+    caption = f"{label(key).capitalize()} of every view, corrected."
+    return caption, svg(drawn, f"{label(key).capitalize()} by view", caption)
 
 
 def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
