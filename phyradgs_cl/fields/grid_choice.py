@@ -12,6 +12,7 @@ from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
 _LARGEST_MM = 1e9
 _ROUNDING = 1e-6  # of a voxel: a box that ends at a voxel's face ends there, whatever its decimals
+_TYPED = 0.01  # likewise, of a box beside the scan's own voxels, whose sides are rarely round numbers
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ class GridChoice:
     def of(self, grid: Grid) -> Grid:
         """The grid that is chosen in place of ``grid``; ``grid`` itself where nothing is.
 
-        A box alone takes the voxels of ``grid`` that it meets, continued where it goes beyond, so that the volume is a part
-        of the one on ``grid``. A size alone keeps the box; so does a voxel, with its sides rounded up to whole voxels.
+        A box alone takes the voxels of ``grid`` that it meets, by more than a hundredth, continued where it goes beyond, so
+        that the volume is a part of the one on ``grid``. A size alone keeps the box; so does a voxel, with its sides rounded up to whole voxels.
 
         Raises InputError for more voxels than anybody means.
         """
@@ -111,8 +112,8 @@ class GridChoice:
     def _cut(self, grid: Grid, box_mm: np.ndarray) -> Grid:
         """The voxels of ``grid``, continued beyond it, that a box (3, 2) meets."""
         low, high = (box_mm.T - grid.box_mm[:, 0]) / grid.voxel_size_mm
-        start = np.floor(low + _ROUNDING)
-        shape = self._whole(np.maximum(np.ceil(high - _ROUNDING) - start, 1))
+        start = np.floor(low + _TYPED)
+        shape = self._whole(np.maximum(np.ceil(high - _TYPED) - start, 1))
         return grid.part(triple(int(n) for n in start), shape)
 
     def _whole(self, shape: np.ndarray, culprit: str = "") -> tuple[int, int, int]:
