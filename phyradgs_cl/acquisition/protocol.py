@@ -27,7 +27,8 @@ class Protocol:
     pulse: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        checks.within("--views", self.views, 1, 100_000)
+        checks.whole("--views", self.views, 1, 100_000)
+        object.__setattr__(self, "views", int(self.views))
         checks.within("start angle (degrees)", self.start_deg, -1e6, 1e6)
         checks.within("exposure arc (degrees)", self.exposure_deg, 0, 3600)
         checks.within("readout ratio", self.readout_ratio, 0, 1000)

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
-from phyradgs_cl.errors import naming_arguments
+from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.importers import load_beads
 
 
@@ -40,5 +41,7 @@ def calibrate(
     """
     check_scan(scan)
     scan.check_timing()
+    if not (what is None or isinstance(what, str)):
+        raise InputError("what", checks.shown(what), "names in one text, with commas", "write for example 'offset,roll'")
     shape = None if phantom is None else load_beads(Path(phantom))
     return run_calibration(scan, runtime_of(device), what, others, phantom=shape, splines=splines)

@@ -42,7 +42,8 @@ from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.reconstructors.tune.trials import TUNED
 from phyradgs_cl.reconstructors.tune.wish import is_told, with_chosen
-from phyradgs_cl.simulation import scanner_for, scanner_options, simulated_scan
+from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan
+from phyradgs_cl.text import near_miss
 
 _IDENTITY = "run"
 """Where a state has what its run was of."""
@@ -145,9 +146,18 @@ def simulate(
     """
     if not isinstance(phantom, str | Path):
         raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
+    own = ("scanner", "protocol", "size", "detector", "detector_offset_mm", "truncation", "pixel_samples", "device")
+    if unknown := sorted(set(options) - OPTION_NAMES):
+        known = [*own, *sorted(OPTION_NAMES)]
+        remedy = near_miss(unknown[0], known, "")
+        expected = "" if remedy else f"one of {', '.join(known)}"
+        raise InputError(f"simulate: option {unknown[0]}", "no such option", expected, remedy)
     described = scanner_for(scanner, detector, detector_offset_mm, truncation)
     chosen = scanner_options(described, protocol, **options)
     is_toml = str(phantom).endswith(".toml")
+    if isinstance(phantom, str) and phantom not in PHANTOMS and not Path(phantom).exists():
+        expected = f"one of {', '.join(PHANTOMS)}, or a volume's file"
+        raise InputError("phantom", f"{phantom}, which is no file", expected, near_miss(phantom, PHANTOMS, "check the path"))
     of = str(phantom) if phantom in PHANTOMS else (load_beads(Path(phantom)) if is_toml else load_attenuation(phantom))
     name = f"volume {phantom}"
     rt = runtime_of(device)

@@ -32,7 +32,7 @@ class Found:
         return asdict(self)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """``scan``: with what was corrected, all else as it was. parameters: a line each. alike: combinations that leave no
     trace of their own, in words. residual_rms: of the frames before and after, dimensionless, at the finest level, whose
@@ -47,6 +47,10 @@ class Calibration:
     before: np.ndarray
     after: np.ndarray
     views: "Views | Sway | None" = None
+
+    def __repr__(self) -> str:
+        said = ", ".join(f"{one.name} {one.verdict}" for one in self.parameters)
+        return f"Calibration({said}; residual {self.residual_rms[0]:.4g}, then {self.residual_rms[1]:.4g})"
 
     @property
     def corrected(self) -> list[Found]:
@@ -65,16 +69,21 @@ class Calibration:
         }
 
     def per_view(self) -> dict[str, np.ndarray]:
-        """What was corrected of every view, or of the object in the middle of each, (F,) by name and unit; nothing where
-        nothing was."""
+        """What was corrected of every view, (F,) by name and unit; nothing where nothing was.
+
+        Of a wobble what was added to the stated poses: source and panel turn counterclockwise as seen from above, the panel
+        moves along its own v and u. Of a motion how the object lies in the middle of each view: turned about x, y and z, and
+        moved along them."""
         if self.views is None:
             return {}
         if isinstance(self.views, Views):
             shift_v_mm, shift_u_mm = self.views.shift_mm.T
-            return {"turn_deg": np.rad2deg(self.views.turn_rad), "shift_v_mm": shift_v_mm, "shift_u_mm": shift_u_mm}
-        six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
-        turns = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
-        return turns | {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
+            found = {"turn_deg": np.rad2deg(self.views.turn_rad), "shift_v_mm": shift_v_mm, "shift_u_mm": shift_u_mm}
+        else:
+            six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
+            found = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
+            found |= {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
+        return {name: values for name, values in found.items() if values.any()}  # a kind that was left alone is 0
 
     def plot(self) -> "Figure":
         """A figure: residuals of four frames before and after, and what was corrected of single views."""

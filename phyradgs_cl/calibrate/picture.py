@@ -30,8 +30,10 @@ def calibration_figure(calibration: Calibration) -> "Figure":
             rms = float(np.sqrt(np.mean(np.square(images[frame], dtype=np.float64))))
             title = f"residual {frame + 1} of {len(before)} {words}: RMS {rms:.3g}"
             draw_image(figure.add_subplot(rows[row, column]), images[frame], title, cmap="RdBu_r", vmin=-limit, vmax=limit)
-    for column, unit in enumerate(("deg", "mm") if curves else ()):
+    for column, unit in enumerate(("deg", "mm")):
         own = {name: values for name, values in curves.items() if name.endswith(unit)}
+        if not own:
+            continue
         _draw_curves(figure.add_subplot(rows[len(frames), column]), own, unit)
     return figure
 

@@ -25,7 +25,7 @@ from phyradgs_cl.calibrate.parameters import (
 )
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
-from phyradgs_cl.calibrate.views import find_sway, find_wobble
+from phyradgs_cl.calibrate.views import Wobble, find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
@@ -39,6 +39,7 @@ from phyradgs_cl.runtime import Runtime
 log = logging.getLogger(__name__)
 Maker = Callable[..., Level | BeadLevel]
 Report = Callable[[int, int, str], None]
+Finder = Callable[[Runtime, Scan, Sequence[tuple[int, int, int]], Change], Wobble]
 DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
@@ -108,8 +109,11 @@ def calibrate(
     parameters, per_view, asks_direction = chosen(what, scan, phantom is not None)
     asks_lag = any(one.name == "lag" for one in parameters)
     ready = [prepared(one, InputOptions(ignore_lag=asks_lag)) for one in (scan, *others)]
-    _check_splines(splines, per_view, scan)
+    if splines and per_view != WOBBLE:
+        raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")
     _check(ready, [one.name for one in parameters], per_view, phantom)
+    if splines:
+        checks.whole("--splines", splines, _FEWEST_SPLINES, scan.frames)
     _warn_of_truncation(ready[0], phantom)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     stages = STAGES if phantom is None else BEAD_STAGES
@@ -121,9 +125,15 @@ def calibrate(
     order = _order(make, ready, levels[min(1, len(levels) - 1)], search) if asks_direction else None
     if order is not None and order.verdict == CORRECTED:
         scan, ready = reversed_readout(scan), [reversed_readout(one) for one in ready]
+    find: Finder = partial(find_wobble, splines=int(splines)) if per_view == WOBBLE else find_sway
+    of_views = [(stage.columns, stage.first, stage.again) for stage in levels]
+    steady = ready
+    if per_view and parameters:
+        report(0, len(levels), "views, before the rest")
+        steady = [_steady(ready[0], find(rt, ready[0], of_views, change_of(search.at)).views, search)]
     for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
-        level = make(ready, stage.columns)
+        level = make(steady, stage.columns)
         _descend(level, stage, parameters, search)
         if not search.known:
             break
@@ -131,8 +141,7 @@ def calibrate(
     change, views, table_of_views = change_of(kept), None, []
     if per_view:
         report(len(levels), len(levels), "views")
-        find = partial(find_wobble, splines=splines) if per_view == WOBBLE else find_sway
-        wobble = find(rt, ready[0], [(stage.columns, stage.first, stage.again) for stage in levels], change)
+        wobble = find(rt, ready[0], of_views, change)
         views, table_of_views = wobble.views, wobble.table
     report(len(levels), len(levels), "residuals")
     level = make(ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
@@ -144,8 +153,19 @@ def calibrate(
     corrected = moved(scan, change, views) if kept or views is not None else scan
     corrected = evenly_lit(corrected, change.drift) if change.drift else corrected
     calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
-    told = {**scan.provenance, "calibration": {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}}
-    return replace(calibration, scan=replace(corrected, provenance=told))
+    return replace(calibration, scan=replace(corrected, provenance=_told(scan, calibration)))
+
+
+def _told(scan: Scan, calibration: Calibration) -> dict[str, Any]:
+    """The scan's provenance with what was found now, and what had been found before."""
+    now = {**calibration.facts(), "program": f"phyradgs-cl {__version__}"}
+    former = [one for one in (scan.provenance.get("calibration"),) if one is not None]
+    earlier = scan.provenance.get("calibrated_before", [])
+    return {
+        **scan.provenance,
+        "calibration": now,
+        **({"calibrated_before": [*(earlier if isinstance(earlier, list) else []), *former]} if former else {}),
+    }
 
 
 def _warn_of_truncation(scan: Scan, phantom: EllipsoidPhantom | None) -> None:
@@ -161,6 +181,16 @@ def _start(rt: Runtime, scan: Scan) -> dict[str, float]:
     offset = best_offset(rt, quick, rough_offset(rt, quick))
     pitch_mm = scan.geometry.pixel_size_mm[1]
     return {"offset-u": offset.pixels * pitch_mm} if np.isfinite(offset.pixels) else {}
+
+
+def _steady(scan: Scan, views: Views | Sway | None, search: _Search) -> Scan:
+    """The scan without what its views are off by, which would pass for a roll; but for a shift along u that all views share,
+    which is the panel's offset where that is asked for."""
+    if isinstance(views, Views) and "offset-u" in search.at:
+        shared_mm = float(views.shift_mm[:, 1].mean())
+        search.at["offset-u"] += shared_mm
+        views = replace(views, shift_mm=views.shift_mm - [0.0, shared_mm])
+    return scan if views is None else moved(scan, Change(), views)
 
 
 def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, search: _Search) -> np.ndarray:
@@ -222,14 +252,6 @@ def _check(scans: Sequence[Scan], names: Sequence[str], per_view: str, phantom: 
                 raise InputError(f"--with: {name}", found, f"the first scan's, {getattr(first, name)}")
         if other.shutter.axis != first.shutter.axis:
             raise InputError("--with: readout axis", other.shutter.axis, f"the first scan's, {first.shutter.axis}")
-
-
-def _check_splines(splines: int, per_view: str, scan: Scan) -> None:
-    if splines == 0:
-        return
-    if per_view != WOBBLE:
-        raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")
-    checks.whole("--splines", splines, _FEWEST_SPLINES, scan.frames)
 
 
 def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:

@@ -169,12 +169,14 @@ def view_step(
 def certainty(
     level: Level, change: Change, numbers: Numbers, signals: np.ndarray, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(deviations (K,) of a value of each kind, what an object leaves (K,) of their ``signals`` (F, K, rows, columns))."""
+    """(deviations (K,) of a view's number of each kind, what an object leaves (K,) of their ``signals``, (F, K, rows,
+    columns)). A view's number is a mean of a few values, whose errors are taken to be their own."""
     operator = numbers.operator(level, change)
     norms = np.sqrt(numbers.basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
     noise = noise_level(level.measured, level.valid)
     shares = np.array([_share(level, operator, numbers.basis, signals[:, k], iterations) for k in range(signals.shape[1])])
-    return _MISMATCH * noise / (shares * np.median(norms, 0) + 1e-30) * numbers.units, shares
+    mean = np.sqrt(np.mean(np.sum(numbers.basis**2, 1)))
+    return _MISMATCH * mean * noise / (shares * np.median(norms, 0) + 1e-30) * numbers.units, shares
 
 
 def _strength(operator: RayOperator) -> float:

@@ -22,13 +22,13 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
-from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
+from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
 _NAMES = [*GROUPS, *(name for name in PARAMETERS if name not in GROUPS), WOBBLE, MOTION, DIRECTION]
 _WHAT = f"What to look for, with commas: {', '.join(_NAMES)}."
 _USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
-_OUTPUT = "The scan to write, with what was corrected; all else in it stays as it is."
+_OUTPUT = "The scan to write, with what was corrected; all else stays as it is. An existing file is replaced whole."
 _PHANTOM = "What was scanned: a TOML file of beads and wires (docs/formats.md), wherever they lie."
 _SPLINES = "A wobble that changes slowly: views go by N cubic splines of time, at least 4."
 _WITH = "Another scan of the same object, which lies as it did: turned the other way, it tells readout and exposure."
@@ -51,6 +51,10 @@ def calibrate_command(
     cannot tell."""
     wish = device_wish(device)
     picture = picture or (output and output.with_suffix(".png"))
+    if output is not None:
+        refuse_foreign_suffix(output)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise InputError("--picture", str(picture), "a file name that ends in .png")
     for flag, target in (("-o", output), ("--picture", picture)):
         if target is not None:
             refuse_overwriting(flag, target, scan, *(path for path in (other, phantom) if path is not None))
@@ -69,10 +73,13 @@ def calibrate_command(
     if picture is not None:
         with finish_despite_interrupt(), written_beside(picture) as temporary:
             calibration_figure(found).savefig(temporary, format="png", dpi=110)
-    say(json.dumps({"scan": str(scan), **found.facts()}) if as_json else _as_text(found))
+    written = {name: str(path) for name, path in (("output", output), ("picture", picture)) if path is not None}
+    say(json.dumps({"scan": str(scan), **found.facts(), **written}) if as_json else _as_text(found))
     if output is not None and not as_json:
         said = ", ".join(one.name for one in found.corrected) or "nothing"
         say(f"{output}: {said} corrected")
+    if picture is not None and not as_json:
+        say(f"{picture}: residuals before and after")
 
 
 def _check_storable(scan: Loaded, asked: list[str]) -> None:

@@ -16,7 +16,7 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
-from phyradgs_cl.workflow.files import expecting, refuse_overwriting
+from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs check scan.h5"
 SUSPICIOUS_STATUS = 10
@@ -58,6 +58,7 @@ def _checked_output(scan: Path, fix_offset: bool, output: Path | None) -> Path |
         raise InputError("check", found, "both or neither", "write for example --fix-offset -o fixed.h5")
     if output is not None:
         refuse_overwriting("-o", output, scan)
+        refuse_foreign_suffix(output)
         check_writable(output)
     return output
 

@@ -1,6 +1,7 @@
 """evaluate: a volume against the truth."""
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,7 @@ def evaluate_command(
     usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the preview of the run
     facts = run_evaluation(volume, reference, picture or usual)
     if as_json:
-        say(json.dumps(facts))
+        numbers = {key: None if value == math.inf else value for key, value in facts.items()}  # JSON has no infinity
+        say(json.dumps(numbers))
     else:
         say(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   picture {facts['picture']}")

@@ -16,6 +16,7 @@ from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.options import WORDS
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.workflow.files import refuse_foreign_suffix
 
 EXAMPLE = (
     "Example: phyradgs import chest_50.pickle -o scan.h5\n\n"
@@ -86,6 +87,7 @@ def import_command(
     options = ImportOptions(**given)
     grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
+    refuse_foreign_suffix(output)
     check_writable(output)
     chosen = form or recognise(source)
     with only_run(output):

@@ -67,7 +67,8 @@ class GridChoice:
         """The grid that is chosen in place of ``grid``; ``grid`` itself where nothing is.
 
         A box alone takes the voxels of ``grid`` that it meets, by more than a hundredth, continued where it goes beyond, so
-        that the volume is a part of the one on ``grid``. A size alone keeps the box; so does a voxel, with its sides rounded up to whole voxels.
+        that the volume is a part of the one on ``grid``. A size alone keeps the box; so does a voxel, with its sides rounded
+        up to whole voxels.
 
         Raises InputError for more voxels than anybody means.
         """
@@ -92,7 +93,7 @@ class GridChoice:
         """``grid`` with as many of its voxels around it as make ``margin_mm``. Raises InputError for too many."""
         if self.margin_mm is None:
             return grid
-        around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _ROUNDING)
+        around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _TYPED)
         shape = self._whole(grid.shape + 2 * around, "--margin-mm")
         return grid.part(triple(int(-n) for n in around), shape)
 

@@ -21,6 +21,7 @@ from phyradgs_cl.report.pictures.viewer import stills, viewer
 from phyradgs_cl.report.run import Run
 
 _MOST_ROWS = 400  # of provenance
+_MOST_CHARTS, _MOST_ALIKE = 6, 20  # of a calibration
 _DISAGREEMENT = (
     "Half the RMS of their difference over 3³ voxels, in the middle slices: where the volume leans on its method. It is no "
     "confidence interval: both are estimates from the same frames, errors that they share are not in it, and the volume's "
@@ -134,30 +135,46 @@ def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
 
 
 def calibration_section(scan: Scan) -> Markup | None:
-    """What `calibrate` found before the scan was reconstructed: its table, and what was corrected of single views."""
-    told = scan.provenance.get("calibration")
-    lines = _tables(told.get("parameters")) if isinstance(told, Mapping) else []
-    if not lines or not isinstance(told, Mapping):
+    """What `calibrate` found before the scan was reconstructed, the first time first: tables, and what was corrected of
+    single views."""
+    known = [*_tables(scan.provenance.get("calibrated_before")), *_tables([scan.provenance.get("calibration")])]
+    parts = [part for told in known if (lines := _tables(told.get("parameters"))) for part in _calibrated(told, lines, scan)]
+    if not parts:
         return None
+    words = "What the scan says of itself was found from its frames"
+    words += f", {len(known)} times over, each from what was left before." if len(known) > 1 else "."
+    return _section("calibration", "Calibration", element("p", words, class_="note"), *parts)
+
+
+def _calibrated(told: Mapping[str, object], lines: Sequence[Mapping[str, object]], scan: Scan) -> list[Markup]:
+    """A table of a line per parameter, what cannot be told apart, and a chart of every number of views."""
     heads = element("tr", *(element("th", name, scope="col") for name in ("parameter", "stated", "found", "verdict")))
-    rows = [element("tr", *(element("td", cell) for cell in _calibrated(line))) for line in lines]
-    before, after = (shown(told.get(f"residual_rms_{when}")) for when in ("before", "after"))
-    words = f"What the scan says of itself was found from its frames: residual {before} before, {after} after (RMS)."
-    views = told.get("views")
-    charts = [views_chart(key, values) for key, values in views.items()] if isinstance(views, Mapping) else []
-    table = element("table", element("thead", heads), element("tbody", *rows))
-    drawn = _charts(chart for chart in charts if chart is not None)
-    return _section("calibration", "Calibration", element("p", words, class_="note"), table, drawn)
+    rows = [element("tr", *(element("td", cell) for cell in _found(line))) for line in lines[:_MOST_ROWS]]
+    before, after = (_or_dash(told.get(f"residual_rms_{when}")) for when in ("before", "after"))
+    notes = [f"Residual of the frames: {before} before, {after} after (RMS)."]
+    alike, views = told.get("alike"), told.get("views")
+    notes += [f"Cannot be told apart: {shown(words)}." for words in alike[:_MOST_ALIKE]] if isinstance(alike, list) else []
+    known = list(views.items())[:_MOST_CHARTS] if isinstance(views, Mapping) else []
+    charts = [views_chart(key, values) for key, values in known if isinstance(values, list) and len(values) == scan.frames]
+    return [
+        element("table", element("thead", heads), element("tbody", *rows)),
+        *(element("p", words, class_="note") for words in notes),
+        _charts(chart for chart in charts if chart is not None),
+    ]
 
 
-def _calibrated(line: Mapping[str, object]) -> list[str]:
+def _found(line: Mapping[str, object]) -> list[str]:
     """The cells of a parameter: found with its deviation, or nothing."""
     name, scale, stated, found, deviation, verdict = (
         line.get(key) for key in ("name", "unit", "stated", "found", "deviation", "verdict")
     )
-    of = str(scale or "")
-    value = "–" if found is None else f"{shown(found)} ± {shown(deviation, of)}"
-    return [str(name), shown(stated, of), value, str(verdict)]
+    of = scale if isinstance(scale, str) else ""
+    value = "–" if found is None else f"{shown(found)} ± {_or_dash(deviation, of)}"
+    return [_or_dash(name), _or_dash(stated, of), value, _or_dash(verdict)]
+
+
+def _or_dash(value: object, unit_name: str = "") -> str:
+    return "–" if value is None else shown(value, unit_name)
 
 
 def _tables(told: object) -> list[Mapping[str, object]]:

@@ -30,18 +30,7 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
     reference, wanted = load_reference(reference_path)
     told: dict[str, object] = {}
     if grid is not None and wanted is not None and not grid.is_close(wanted):
-        shared = shared_slices(wanted, grid)
-        if shared is None:
-            found = f"{_place(grid)}, which has no voxel of the reference, {_place(wanted)}"
-            raise InputError(str(volume_path), found, "volumes in one place")
-        whole, reference = reference.size, reference[shared]
-        start = triple(one.start for one in shared)
-        volume, _ = resampled(volume, grid, wanted.part(start, triple(reference.shape)))
-        share = reference.size / whole
-        where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
-        rest = "" if share == 1 else f"; compared on the {100 * share:.3g} % of those that lie in the volume"
-        log.warning("%s: resampled (linear) %s%s", plain_text(str(volume_path)), where, rest)
-        told = {"resampled": where, "share_of_reference_covered": share}
+        volume, reference, told = _on_shared_voxels(volume_path, reference_path, (volume, grid), (reference, wanted))
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
     metrics = compare(volume, reference)
@@ -56,9 +45,35 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
     return {**metrics, **known, **interruption(provenance), **told, **files}
 
 
+def _on_shared_voxels(
+    volume_path: Path, reference_path: Path, result: tuple[np.ndarray, Grid], truth: tuple[np.ndarray, Grid]
+) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
+    """The result and the truth on those voxels of the truth's that lie in the result's box, and what to say of that."""
+    (volume, grid), (reference, wanted) = result, truth
+    shared = shared_slices(wanted, grid)
+    if shared is None:
+        found = f"{_place(grid)}, which has no voxel of the reference, {_place(wanted)}"
+        raise InputError(str(volume_path), found, "volumes in one place")
+    part = reference[shared]
+    share = part.size / reference.size
+    if not part.max() > 0:
+        found = f"nothing in the {100 * share:.3g} % of it that lie in {volume_path}"
+        raise InputError(str(reference_path), found, "an object in the part that is compared")
+    told: dict[str, object] = {"share_of_reference_covered": share}
+    if grid.slices_in(wanted) == shared:
+        found = "%s: compared with its part of the reference, %.3g %% of the voxels"
+        log.warning(found, plain_text(str(volume_path)), 100 * share)
+        return volume, part, told
+    volume, _ = resampled(volume, grid, wanted.part(triple(one.start for one in shared), triple(part.shape)))
+    where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
+    rest = "" if share == 1 else f"; compared on the {100 * share:.3g} % of those that lie in the volume"
+    log.warning("%s: resampled (linear) %s%s", plain_text(str(volume_path)), where, rest)
+    return volume, part, {"resampled": where, **told}
+
+
 def _place(grid: Grid) -> str:
-    """A grid in a few words, x y z as everywhere where people read."""
+    """A grid in a few words, x y z as everywhere where people read of sizes."""
     counts, sizes, offsets = (v[::-1] for v in (grid.shape, grid.voxel_size_mm, grid.offset_mm))
     digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
-    words = f"{'×'.join(map(str, counts))} voxels of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
+    words = f"{'×'.join(map(str, counts))} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
     return f"{words} about ({', '.join(f'{round(o, digits) + 0.0:g}' for o in offsets)}) mm"

@@ -10,6 +10,7 @@ import numpy as np
 from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters import foreign_suffix
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.held_warnings import held_warnings
@@ -66,6 +67,12 @@ def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
     for path in inputs:
         if Path(output).resolve() == Path(path).resolve():
             raise InputError(option, f"the input file {path} itself", "another file to write")
+
+
+def refuse_foreign_suffix(output: Path, remedy: str = "write scan.h5") -> None:
+    """What is written is HDF5: under another format's suffix other programs would take it for that."""
+    if (ending := foreign_suffix(output)) is not None:
+        raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as NAME.h5", remedy)
 
 
 def load_result(path: Path) -> tuple[np.ndarray, Grid | None, dict[str, object]]:

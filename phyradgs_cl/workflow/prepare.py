@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors import InputOptions
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
+from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
 
 @np.errstate(all="ignore")
@@ -28,6 +28,7 @@ def run_preparation(
     if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     options.check_written()
+    refuse_foreign_suffix(output)
     refuse_overwriting("-o", output, source, *([config] if config else []))
     check_writable(output)
     with only_run(output):

@@ -17,7 +17,6 @@ from phyradgs_cl import __version__, checks, importers, signals
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
-from phyradgs_cl.exporters import foreign_suffix
 from phyradgs_cl.io import (
     check_writable,
     checkpoint_path,
@@ -48,7 +47,7 @@ from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_
 from phyradgs_cl.reconstructors.result import HELD_OUT, option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.files import load_scan, refuse_overwriting
+from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +128,8 @@ def run_reconstruction(
     leads = ranks is None or ranks.rank == 0
     options = method_options(job.method, job.preset, job.changes, job.before.tune)
     if leads:
-        _refuse_foreign_suffix(job.output)
+        export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(job.output.name)}'"
+        refuse_foreign_suffix(job.output, export)
         check_writable(job.output)
     for path in (job.output, partial_path(job.output)):
         refuse_overwriting("-o", path, job.scan, *(other for other in (job.config, job.initial) if other))
@@ -221,13 +221,6 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
     """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
     pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
     return profile_text(rt.kernel_uses(), float(result.facts["seconds"]), rt.best_rates(), pairs)
-
-
-def _refuse_foreign_suffix(output: Path) -> None:
-    """What is written is HDF5: under another format's suffix other programs would take it for that."""
-    if (ending := foreign_suffix(output)) is not None:
-        remedy = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
-        raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as volume.h5", remedy)
 
 
 def _provenance(

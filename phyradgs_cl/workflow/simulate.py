@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
 from phyradgs_cl.text import near_miss
-from phyradgs_cl.workflow.files import expecting, refuse_overwriting
+from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
 
 _TOML = ".toml"
 
@@ -73,6 +73,7 @@ def run_simulation(
     for described in (job.scanner, job.phantom or ""):
         if described.endswith(_TOML):
             refuse_overwriting("-o", job.output, Path(described))
+    refuse_foreign_suffix(job.output)
     check_writable(job.output)
     with only_run(job.output):
         of: str | LoadedVolume | EllipsoidPhantom = phantom_of(job.phantom or "foot")

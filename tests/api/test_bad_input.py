@@ -269,6 +269,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: api.calibrate("scan.h5"), "scan: found 'scan.h5'; expected a Scan"),
         (lambda: api.calibrate(GOOD, "rol"), "what: found .rol"),
         (lambda: api.calibrate(GOOD, "roll", splines=6), "splines: found 6; expected with what wobble"),
+        (lambda: api.calibrate(GOOD, ["roll"]), "what: found .*expected names in one text"),
         (lambda: api.calibrate(BACKWARDS), "pose table: found the grid behind the panel"),
         (lambda: api.calibrate(GOOD), "4 frames|12 columns|8 frames|columns"),
     ],
@@ -319,6 +320,9 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     ],
     "simulate": [
         (lambda: api.simulate("elbow"), "elbow"),
+        (lambda: api.simulate("jaws"), "phantom: found jaws, which is no file; .* did you mean 'jaw'"),
+        (lambda: api.simulate("foot", detector_offset=(0, 1)), "no such option; did you mean 'detector_offset_mm'"),
+        (lambda: api.simulate("foot", size=8, views=7.5), "^views: found 7.5; expected a whole number"),
         (lambda: api.simulate(np.ones((2, 2, 2))), "phantom: found"),
         (lambda: api.simulate("foot", scanner="none"), "none"),
         (lambda: api.simulate("foot", size=8, detector=8, jitter_deg=-1), "^jitter_deg: found -1"),

@@ -152,13 +152,37 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     assert section.count("corrected</td>") == 3 and section.count("<svg") == 3
 
 
+def test_a_wobble_does_not_pass_for_a_roll(rt) -> None:
+    """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
+    been found before."""
+    how = {"size": 24, "detector": 36, "views": 30, "exposure_deg": 6.0, "noise": "tigre", "dose": 1e5}
+    scan = simulate("jaw", **how, device=rt)
+    course = np.cos(np.pi * np.linspace(0, 1, 30))
+    planted = without_gauges(scan, np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
+    offset_mm = 0.2
+    off = moved(scan, Change(offset_u_mm=-offset_mm), views_of(-planted))
+    found = calibrate(off, rt, "offset-u,roll,wobble", splines=6)
+    lines = by_name(found)
+    assert lines["roll"].verdict == AGREES and lines["offset-u"].verdict == CORRECTED
+    assert abs(lines["offset-u"].found) < 0.02
+    np.testing.assert_allclose(found.per_view()["shift_v_mm"], planted[:, 1], atol=0.01)
+    again = calibrate(found.scan, rt, "roll").scan.provenance
+    assert again["calibrated_before"] == [found.scan.provenance["calibration"]]
+    assert [one["name"] for one in again["calibration"]["parameters"]] == ["roll"]
+
+
 def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
     images = np.zeros((15, 4, 5), np.float32)
     alone = Calibration(right, [], [], (1.0, 0.5), images, images)
-    moving = replace(alone, views=Sway.none(right, 7))
-    count = [len(found.plot().axes) for found in (alone, replace(alone, views=Views.none(15)), moving)]
+    sway = Sway.none(right, 7)
+    moving = replace(alone, views=replace(sway, coefficients=np.ones((7, 6))))
+    shifted = replace(alone, views=Views(np.zeros(15), np.ones((15, 2))))
+    left = replace(alone, views=Views.none(15))
+    count = [len(found.plot().axes) for found in (alone, shifted, moving, left)]
     assert alone.per_view() == {} and alone.facts()["views"] == {}
-    assert count[1] == count[2] == count[0] + 2  # turns, and shifts
+    assert repr(alone) == "Calibration(; residual 1, then 0.5)"
+    assert count[1] == count[0] + 1 and count[2] == count[0] + 2 and count[3] == count[0]  # a kind that is 0 was left alone
+    assert list(shifted.per_view()) == ["shift_v_mm", "shift_u_mm"]
     last = moving.plot().axes[-1]
     assert [line.get_label() for line in last.get_lines()] == ["shift x", "shift y", "shift z"]
 
@@ -252,6 +276,9 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
     refused(["calibrate", path, "--what", "wobble", "-o", tmp_path / "out.h5"], "do not overlap in time")
     refused(["calibrate", path, "--what", "offset, drift", "-o", tmp_path / "out.h5"], "prepare --steps air")
     refused(["calibrate", path, "-o", path], "the input file")
+    refused(["calibrate", path, "-o", tmp_path / "out.png"], "the suffix .png of another format")
+    for picture in ("out.h5", "out.jpg", "out"):
+        refused(["calibrate", path, "-o", tmp_path / "out.h5", "--picture", tmp_path / picture], "ends in .png")
     assert not (tmp_path / "out.h5").exists()
 
 

@@ -59,11 +59,22 @@ def test_another_grid_is_resampled_and_said_in_one_line(cli, files, tmp_path, ca
     half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
     write_volume(tmp_path / "half.h5", volume[:6], half, {})
     assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan)]) == 0
-    assert "compared on the 50 % of those that lie in the volume" in caplog.messages[-1]
+    assert "compared with its part of the reference, 50 % of the voxels" in caplog.messages[-1]
     assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert facts["share_of_reference_covered"] == 0.5
-    assert facts["psnr_db"] == pytest.approx(compare(volume[:6], load_scan(scan).reference[:6])["psnr_db"], abs=1e-3)
+    truth = load_scan(scan).reference
+    assert facts["psnr_db"] == pytest.approx(compare(volume[:6], truth[:6])["psnr_db"]) and "resampled" not in facts
+    coarse = Grid((3, 6, 6), (2 * dz, 2 * dy, 2 * dx), half.offset_mm)
+    write_volume(tmp_path / "coarse.h5", volume[:6:2, ::2, ::2], coarse, {})
+    assert cli.run(["evaluate", str(tmp_path / "coarse.h5"), "--reference", str(scan)]) == 0
+    assert "compared on the 50 % of those that lie in the volume" in caplog.messages[-1]
+    write_volume(tmp_path / "air.h5", volume[:1, :1, :1], grid.part((0, 0, 0), (1, 1, 1)), {})
+    assert truth[0, 0, 0] == 0 and cli.run(["evaluate", str(tmp_path / "air.h5"), "--reference", str(scan)]) == 2
+    assert "nothing in the 0.0579 % of it that lie in" in capsys.readouterr().err
+    write_volume(tmp_path / "true.h5", truth, grid, {})
+    assert cli.run(["evaluate", str(tmp_path / "true.h5"), "--reference", str(scan), "--json"]) == 0
+    assert '"psnr_db": null' in capsys.readouterr().out
 
     away = replace(grid, offset_mm=(0.0, 0.0, 1e3))
     write_volume(tmp_path / "away.h5", volume, away, {})

@@ -265,3 +265,24 @@ def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> N
     assert section.count("sparks: sinogram of row 5") == 1 and section.count("middle slice by fdk</h3>") == 2
     assert section.count("<img") == 18 and section.count("Histogram of line integrals") == 2
     assert not parse(text).open
+
+
+def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_path, parse) -> None:
+    """Shown where it is what it should be, in full; the page is written whatever it is, and nothing of it is markup."""
+    line = {"name": "roll", "unit": "deg", "stated": 0.0, "found": 0.5, "deviation": 0.1, "verdict": "corrected"}
+    views = {"shift_u_mm": [0.1] * small_scan.frames, "turn_deg": [1.0], "<b>": ["x"] * small_scan.frames, "none": "text"}
+    good = {"parameters": [line, {"name": "<i>x</i>"}, 3], "alike": ["a against b"], "views": views, "residual_rms_after": 2}
+    for told, rows, charts in (
+        ({"calibration": good}, 2, 1),
+        ({"calibration": good, "calibrated_before": [good, 4]}, 4, 2),
+        ({"calibration": 7}, 0, 0), ({"calibration": [good]}, 0, 0), ({"calibration": {"parameters": {}}}, 0, 0),
+    ):  # fmt: skip
+        write_scan(tmp_path / "scan.h5", replace(small_scan, provenance=told))
+        job = ReconstructionJob(tmp_path / "scan.h5", tmp_path / "volume.h5", method="fdk")
+        run_reconstruction(job, lambda: rt, lambda progress: None)
+        write_report(tmp_path / "volume.h5", tmp_path / "page.html", lambda: rt, views=0)
+        text = (tmp_path / "page.html").read_text(encoding="utf-8")
+        section = text.split('id="calibration"')[1].split("</section>")[0] if rows else ""
+        assert (section.count("<tr>") - section.count("<thead>"), section.count("<svg")) == (rows, charts)
+        assert ("0.5 ± 0.1" in section) == ("a against b" in section) == bool(rows) and "<i>" not in section + text
+        assert not parse(text).open
