@@ -28,6 +28,7 @@ from phyradgs_cl.runtime import Runtime
 SPLINES = 7  # of a motion: one for every seventh of the scan, about
 _STEPS = 3
 _ITERATIONS = 20
+_OF_WAY = 0.5  # from a level to one twice as fine: what is left of it, as of an error of first order
 _DEVIATIONS = 3.0  # of one value, that all of them have to be off by (root mean square)
 _DEG = float(np.rad2deg(1.0))
 _OF_VIEWS = (("turn per view", "deg", _DEG), ("shift-v per view", "mm", 1.0), ("shift-u per view", "mm", 1.0))
@@ -76,14 +77,18 @@ def _found(
     without: Callable[[np.ndarray], np.ndarray],
     names: Sequence[tuple[str, str, float]],
 ) -> Wobble:
+    former = numbers.values
     for (columns, first, again), asked in zip(stages, kinds, strict=True):
-        level, volume = Level.of(rt, False, [scan], columns, scan.frames), None
+        level, volume, former = Level.of(rt, False, [scan], columns, scan.frames), None, numbers.values
         for _ in range(_STEPS):
             operator = numbers.operator(level, change)
             volume = level.reconstruct(operator, volume, first if volume is None else again)
             step = view_step(level, change, numbers, volume, asked, _ITERATIONS)
             numbers = replace(numbers, values=without(numbers.values + step.values))
     deviations, shares = certainty(level, change, numbers, step.signals, _ITERATIONS)
+    way = np.sqrt(np.mean(np.square(numbers.basis @ (numbers.values - former)), 0))
+    told_twice = np.isin(np.arange(len(names)), kinds[-2] if len(stages) > 1 else [])
+    deviations = np.hypot(deviations, _OF_WAY * way * told_twice)
     sizes = np.sqrt(np.mean(np.square(numbers.basis @ numbers.values), 0))
     is_off = sizes > _DEVIATIONS * deviations
     table = []

@@ -20,18 +20,21 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 TURN, SHIFT_V, SHIFT_U = KINDS = 0, 1, 2
 _STEP_PX = 0.25
-_MISMATCH = 4.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
+# Errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object.
+_OF_VIEWS, _OF_OBJECT = 4.0, 7.0
 
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
     """What is looked for: ``values`` (n, K), of which view f has ``basis`` (F, n) @ values (K,). ``units`` (K,): what of
-    each moves a frame by a pixel at its edge. ``views``: what values move, when they are put into a scan."""
+    each moves a frame by a pixel at its edge. ``views``: what values move, when they are put into a scan. ``mismatch``: of
+    their errors, over what noise alone would do."""
 
     values: np.ndarray
     basis: np.ndarray
     units: np.ndarray
     views: Callable[[np.ndarray], Views | Sway]
+    mismatch: float = _OF_VIEWS
 
     def operator(self, level: Level, change: Change, more: np.ndarray | float = 0.0) -> RayOperator:
         return level.operator(change, self.views(self.values + more))
@@ -49,7 +52,8 @@ def numbers_of_sway(scan: Scan, count: int) -> Numbers:
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
     turn, _, shift_mm = units_of(scan)
     units = np.array([turn] * 3 + [shift_mm / scan.geometry.magnification] * 3)
-    return Numbers(none.coefficients, none.basis(middle_s), units, lambda values: replace(none, coefficients=values))
+    basis, moving = none.basis(middle_s), lambda values: replace(none, coefficients=values)
+    return Numbers(none.coefficients, basis, units, moving, _OF_OBJECT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +180,7 @@ def certainty(
     noise = noise_level(level.measured, level.valid)
     shares = np.array([_share(level, operator, numbers.basis, signals[:, k], iterations) for k in range(signals.shape[1])])
     mean = np.sqrt(np.mean(np.sum(numbers.basis**2, 1)))
-    return _MISMATCH * mean * noise / (shares * np.median(norms, 0) + 1e-30) * numbers.units, shares
+    return numbers.mismatch * mean * noise / (shares * np.median(norms, 0) + 1e-30) * numbers.units, shares
 
 
 def _strength(operator: RayOperator) -> float:
