@@ -21,7 +21,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 TURN, SHIFT_V, SHIFT_U = KINDS = 0, 1, 2
 _STEP_PX = 0.25
 # Errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object.
-_OF_VIEWS, _OF_OBJECT = 4.0, 7.0
+_MISMATCH_OF_VIEWS, _MISMATCH_OF_OBJECT = 4.0, 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Numbers:
     basis: np.ndarray
     units: np.ndarray
     views: Callable[[np.ndarray], Views | Sway]
-    mismatch: float = _OF_VIEWS
+    mismatch: float = _MISMATCH_OF_VIEWS
 
     def operator(self, level: Level, change: Change, more: np.ndarray | float = 0.0) -> RayOperator:
         return level.operator(change, self.views(self.values + more))
@@ -53,7 +53,7 @@ def numbers_of_sway(scan: Scan, count: int) -> Numbers:
     turn, _, shift_mm = units_of(scan)
     units = np.array([turn] * 3 + [shift_mm / scan.geometry.magnification] * 3)
     basis, moving = none.basis(middle_s), lambda values: replace(none, coefficients=values)
-    return Numbers(none.coefficients, basis, units, moving, _OF_OBJECT)
+    return Numbers(none.coefficients, basis, units, moving, _MISMATCH_OF_OBJECT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +110,10 @@ def without_gauges(scan: Scan, numbers: np.ndarray) -> np.ndarray:
 
 def without_smooth_gauges(scan: Scan, numbers: Numbers, values: np.ndarray) -> np.ndarray:
     """Values (n, 3) without what ``without_gauges`` takes out, as far as splines follow it."""
-    circle = numbers.basis @ _circle(scan, numbers.basis)
+    circle = _circle(scan, numbers.basis)
     found = values.copy()
     found[:, :2] -= (numbers.basis @ found[:, :2]).mean(0)
-    found[:, 2] -= _circle(scan, numbers.basis) @ np.linalg.lstsq(circle, numbers.basis @ found[:, 2], rcond=None)[0]
+    found[:, 2] -= circle @ np.linalg.lstsq(numbers.basis @ circle, numbers.basis @ found[:, 2], rcond=None)[0]
     return found
 
 
