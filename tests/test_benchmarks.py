@@ -113,6 +113,11 @@ def test_estimates_are_checked(tmp_path) -> None:
     assert line["happened"]["host_bytes"] > 10_000_000
 
 
+def test_margins_of_coarser_voxels() -> None:
+    *_, line = run("coarse_margin.py", "--phantoms", "jaw", "--size", "16", "--iterations", "2").splitlines()
+    assert line.startswith("| jaw |") and line.count("|") == 5
+
+
 def test_startup(tmp_path) -> None:
     told = run("startup.py", "--repeat", "1", "--json", str(tmp_path / "facts.json"))
     rows = json.loads((tmp_path / "facts.json").read_text())["rows"]
