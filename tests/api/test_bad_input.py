@@ -310,6 +310,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: reconstruct(GOOD, "fista", detector_model=abs), "option detector_model: found <built-in function abs>"),
         (lambda: reconstruct(GOOD, "sirt", grid=ELSEWHERE.grid), "grid: found a box in .* that no ray meets"),
         (lambda: reconstruct(GOOD, prior_share=0.7), "^prior_share: found 0.7 with the prior dct.*prior=piccs"),
+        (lambda: reconstruct(GOOD, "asd-pocs", prior_share=0.5), "^prior_share: found 0.5 without.*say initial"),
         (lambda: reconstruct(GOOD, prior="dtc"), "prior: found 'dtc'; expected one of .*'package.module:function'"),
         (lambda: reconstruct(GOOD, "sirt", grid=(8, 8, 8)), r"grid: found \(8, 8, 8\)"),
         (lambda: reconstruct(GOOD, "sirt", report=3), "report: found 3"),

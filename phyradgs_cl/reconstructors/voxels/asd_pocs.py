@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.result import State, state_arrays
@@ -22,7 +24,8 @@ class AsdPocsOptions(SartOptions):
     """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the first SART pass's change.
 
     tv_reduction: factor of that length when TV moves more than ``tv_ratio`` (r_max) of what the data moved while the
-    residual is above ε. residual_share: ε over the residual of FDK's volume.
+    residual is above ε. residual_share: ε over the residual of FDK's volume. prior_share: of the total variation, that of
+    the difference to the volume that the run starts from (PICCS).
     """
 
     iterations: int = 10
@@ -32,6 +35,7 @@ class AsdPocsOptions(SartOptions):
     tv_reduction: float = 0.95
     tv_ratio: float = 0.94
     residual_share: float = 0.15
+    prior_share: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,17 +44,25 @@ class AsdPocsOptions(SartOptions):
         checks.within("tv_reduction", self.tv_reduction, 1e-6, 1)
         checks.within("tv_ratio", self.tv_ratio, 0, 1e6)
         checks.within("residual_share", self.residual_share, 0, 1e6)
+        checks.within("prior_share", self.prior_share, 0, 1)
 
 
 def _started(system: System, options: AsdPocsOptions, setting: Setting) -> "AsdPocs":
+    if options.prior_share > 0 and setting.initial is None:
+        found, remedy = f"{options.prior_share:g} without a prior image", "say --initial, or leave prior_share out"
+        raise InputError("prior_share", found, "a volume to start from", remedy)
     start = system.space.array(static_fdk(setting.rt, setting.scan))
     epsilon = options.residual_share * system.space.norm(system.residual(start))
-    return AsdPocs(system, options, setting.seed, TvDescent(setting.rt, setting.scan.grid.shape), epsilon)
+    descend = TvDescent(setting.rt, setting.scan.grid.shape, setting.initial, options.prior_share)
+    return AsdPocs(system, options, setting.seed, descend, epsilon)
 
 
-METHOD = voxel_method(
-    "asd-pocs", AsdPocsOptions(), _started, volumes=lambda scan, options: 8 + kept_columns(scan, options), frames=2
-)
+def _volumes(scan: Scan, options: AsdPocsOptions) -> int:
+    """The prior image and what the volume differs from it by are two more."""
+    return 8 + kept_columns(scan, options) + 2 * (options.prior_share > 0)
+
+
+METHOD = voxel_method("asd-pocs", AsdPocsOptions(), _started, volumes=_volumes, frames=2)
 
 
 class AsdPocs:

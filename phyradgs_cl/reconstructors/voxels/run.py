@@ -142,6 +142,7 @@ class Setting(NamedTuple):
     scan: Scan
     rt: Runtime
     seed: int
+    initial: np.ndarray | None
 
 
 def voxel_method(
@@ -165,7 +166,8 @@ def voxel_method(
         resume: State | None = None,
         initial: np.ndarray | None = None,
     ) -> Reconstruction:
-        setting, held = Setting(scan, rt, seed), volumes(scan, options) if callable(volumes) else volumes
+        setting = Setting(scan, rt, seed, initial)
+        held = volumes(scan, options) if callable(volumes) else volumes
         return run_iterations(
             name, lambda system: make(system, options, setting), scan, options, rt, report, resume, initial,
             volumes=held, frames=frames,
