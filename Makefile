@@ -5,7 +5,7 @@
 # make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
 # make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
 # make mutants    small defects put into three rooms, one after the other: which do their tests not notice?
-# make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB)
+# make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB; SHAPE=--gpu-shape: as GPUs run)
 # make test-neural    the tests of naf and sax-nerf, with PyTorch in an environment of its own
 # make test-browser   the page of a run in this machine's Chromium or Chrome; pictures in .venv-browser/pictures
 # make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
@@ -134,7 +134,7 @@ test-intel: export OCL_ICD_VENDORS = $(abspath $(VENV)-intel/vendors)
 test-intel: export LD_LIBRARY_PATH = $(abspath $(VENV)-intel/lib)
 test-intel: export PHYRADGS_DEVICE = Intel(R) OpenCL
 test-intel: $(VENV)-intel/vendors/intel.icd
-	$(call tested,$(VENV)-intel)
+	$(call tested,$(VENV)-intel,$(SHAPE))
 
 # Compilers for GPUs and their libraries, unpacked beside the environment: nothing is installed, no driver is registered.
 DEBIAN_gpu := clang-15 libclang-cpp15 libclang1-15 libllvm15 libclang-common-15-dev libclc-15 libclc-15-dev \
@@ -150,6 +150,7 @@ test-gpu-build: export GPU_COMPILERS = $(abspath $(VENV)-gpu/debian)
 test-gpu-build: $(VENV)-gpu/debian/.unpacked
 	$(VENV)-gpu/bin/python tests/gpu_build/every_program.py --table $(VENV)-gpu/table.md
 
+SHAPE  ?=
 DEVICE ?= gpu
 QUICK  ?=
 
