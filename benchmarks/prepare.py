@@ -70,6 +70,7 @@ EFFECTS = {
     "sparks 0.01 %": Effect({"sparks": 1e-4}, "sparks"),
     "sparks 0.1 %": Effect({"sparks": 1e-3}, "sparks"),
     "rings 1 %": Effect({"rings": 0.01}, "rings"),
+    "rings 1 %, fitted": Effect({"rings": 0.01}, "rings", {"rings": {"method": "fitted"}}),
     "rings 5 %": Effect({"rings": 0.05}, "rings"),
     "rings 5 %, fitted": Effect({"rings": 0.05}, "rings", {"rings": {"method": "fitted"}}),
     "drift 2 %": Effect({"drift": 0.02}, "air"),

@@ -26,6 +26,8 @@ def regular_file(path: Path, culprit: str, expected: str = "a regular file") -> 
     if not stat.S_ISREG(found.st_mode):
         what = "a folder" if stat.S_ISDIR(found.st_mode) else "something that is not a regular file"
         raise InputError(culprit, f"{what}{where}", expected, "check the path")
+    if not os.access(path, os.R_OK):
+        raise InputError(culprit, f"no permission to read it{where}", expected, "ask whoever owns the file")
     return found
 
 

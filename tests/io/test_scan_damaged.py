@@ -284,6 +284,12 @@ def test_whole_files_that_are_wrong(tmp_path, good) -> None:
         assert "\n" not in str(caught.value)
 
 
+def test_a_file_that_may_not_be_read(good, monkeypatch) -> None:
+    """The superuser may read any: the system's answer is put in its place."""
+    monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.R_OK and Path(path) == good))
+    refuses(good, "", ("no permission to read it", "whoever owns"))
+
+
 def test_a_spoilt_chunk_is_named(tmp_path, good) -> None:
     with h5py.File(good, "r+") as file:
         created(data=file[DATA][...], compression="gzip", fletcher32=True)(file, DATA)
