@@ -127,10 +127,12 @@ def calibrate(
         scan, ready = reversed_readout(scan), [reversed_readout(one) for one in ready]
     find: Finder = partial(find_wobble, splines=int(splines)) if per_view == WOBBLE else find_sway
     of_views = [(stage.columns, stage.first, stage.again) for stage in levels]
-    steady = ready
+    steady, wobbles = ready, {}
     if per_view and parameters:
         report(0, len(levels), "views, before the rest")
-        steady = [_steady(ready[0], find(rt, ready[0], of_views, change_of(search.at)).views, search)]
+        first = change_of(search.at)
+        wobbles[first] = find(rt, ready[0], of_views, first)
+        steady = [_steady(ready[0], wobbles[first].views, search)]
     for number, stage in enumerate(levels if parameters else ()):
         report(number, len(levels), f"at most {stage.columns} columns")
         level = make(steady, stage.columns)
@@ -141,7 +143,7 @@ def calibrate(
     change, views, table_of_views = change_of(kept), None, []
     if per_view:
         report(len(levels), len(levels), "views")
-        wobble = find(rt, ready[0], of_views, change)
+        wobble = wobbles[change] if change in wobbles else find(rt, ready[0], of_views, change)
         views, table_of_views = wobble.views, wobble.table
     report(len(levels), len(levels), "residuals")
     level = make(ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)

@@ -152,7 +152,7 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     assert section.count("corrected</td>") == 3 and section.count("<svg") == 3
 
 
-def test_a_wobble_does_not_pass_for_a_roll(rt) -> None:
+def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
     been found before."""
     how = {"size": 24, "detector": 36, "views": 30, "exposure_deg": 6.0, "noise": "tigre", "dose": 1e5}
@@ -169,6 +169,11 @@ def test_a_wobble_does_not_pass_for_a_roll(rt) -> None:
     again = calibrate(found.scan, rt, "roll").scan.provenance
     assert again["calibrated_before"] == [found.scan.provenance["calibration"]]
     assert [one["name"] for one in again["calibration"]["parameters"]] == ["roll"]
+    asked: list[Change] = []
+    counted = "phyradgs_cl.calibrate.run.find_wobble"
+    monkeypatch.setattr(counted, lambda *args, **given: asked.append(args[3]) or find_wobble(*args, **given))
+    assert by_name(calibrate(found.scan, rt, "roll,wobble", splines=6))["roll"].verdict == AGREES
+    assert asked == [Change()]  # nothing that all views share was off: they are not solved for again
 
 
 def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
