@@ -58,12 +58,17 @@ def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy
     return air
 
 
+def with_air_at_0(frames: np.ndarray, air: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Line integrals (F, v, u) with the median of each frame's pixels ``air`` taken to 0, and these medians (F,)."""
+    value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
+    return frames - value[:, None, None].astype(np.float32), value
+
+
 def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """The scan with the median of each frame's air taken to 0."""
     frames = unmasked_frames(scan)
     air = enough_air(frames, options.below, options.least, "air", "leave the step out, or lower air.least")
-    value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
-    clean = frames - value[:, None, None].astype(np.float32)
+    clean, value = with_air_at_0(frames, air)
     light = np.exp(-value)
     facts = {"light": [float(light.min()), float(light.max())], "air_share": float(air.mean())}
     return replace(scan, projections=clean), facts

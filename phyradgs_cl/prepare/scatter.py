@@ -1,11 +1,14 @@
-"""Scatter by a kernel: what a ray loses, P · (−ln P), comes back as wide Gaussians around it.
+"""Scatter by a kernel: what a ray loses, P · (−ln P) and P · (−ln P)², comes back as wide Gaussians around it.
 
-Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; one kernel for all thicknesses, where Sun and Star-Lack
-(Phys. Med. Biol. 55 (2010) 6695) take several. Its height and width are stated, or it is the sum of Gaussians, none of them
-negative, that explains best the light that the panel sees beside the object beyond that of the flats. It may say too little
-of what is behind the object: the kernel is made higher as long as the frames that it leaves explain themselves as well.
+Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; with the square, thick rays may scatter otherwise than thin
+ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The scatter over the primary light
+and the width are stated, or it is the sum of Gaussians, none of them negative, that explains best the light that the panel
+sees beside the object beyond that of the flats, in frames that may be lighter and darker. It may say too little of what is
+behind the object: the kernel is made higher as long as the frames that it leaves explain themselves as well.
 """
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,13 +16,15 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.prepare.air import enough_air
+from phyradgs_cl.prepare.air import enough_air, with_air_at_0
 from phyradgs_cl.prepare.consistency import coarse_model, object_in, smooth, unexplained
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
-Kernel = dict[float, float]
-_REACHES = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)  # of the panel's longer side
+Kernel = Mapping[tuple[float, int], float]
+"""{(standard deviation as a share of the panel's longer side, power of the line integral): height}"""
+_POWERS = (1, 2)  # of a ray's line integral
+_REACHES = (0.12, 0.18, 0.27, 0.4)  # of the panel's longer side; narrower ones answer to the gains of columns
 _PASSES = 6  # of scatter from primary from scatter
 _LEAST_PRIMARY = 0.05  # of what was measured
 _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the object
@@ -42,39 +47,44 @@ class ScatterOptions:
 
 
 def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
-    """Line integrals (F, v, u) without the scatter of a kernel {standard deviation as a share of the panel's longer side:
-    height}, float32."""
+    """Line integrals (F, v, u) without the scatter of a kernel {(standard deviation as a share of the panel's longer side,
+    power of a ray's line integral): height}, float32."""
     return -np.log(_primary(np.exp(-frames.astype(np.float64)), kernel)).astype(np.float32)
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
     """The kernel, of the one width ``reach`` if that is not 0, that explains best the light of the pixels ``air`` of line
-    integrals (F, v, u) beyond 1."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _FITTED_FRAMES).round().astype(int))
+    integrals (F, v, u) beyond 1. Frames may be lighter and darker, but not on the mean."""
+    chosen = _some(len(frames))
     recorded, where = np.exp(-frames[chosen].astype(np.float64)), air[chosen]
-    reaches = (reach,) if reach > 0 else _REACHES
-    kernel: Kernel = {}
+    terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
+    kernel: dict[tuple[float, int], float] = {}
+    light = recorded
     for _ in range(_PASSES):
-        primary = _primary(recorded, kernel)
-        shapes = np.stack([_scattered(primary, width)[where] for width in reaches], axis=1)
-        kernel = dict(zip(reaches, map(float, scipy.optimize.nnls(shapes, recorded[where] - 1)[0]), strict=True))
-    return {width: height for width, height in kernel.items() if height > 0}
+        primary = _primary(light, kernel)
+        shapes = np.stack([_scattered(primary, *term) for term in terms], axis=-1)
+        heights = scipy.optimize.nnls(shapes[where], light[where] - 1)[0]
+        kernel = dict(zip(terms, map(float, heights), strict=True))
+        over = recorded / (1 + shapes @ heights)
+        gain = np.array([np.median(frame[beside]) for frame, beside in zip(over, where, strict=True)])
+        light = recorded / (gain / gain.mean())[:, None, None]
+    return {term: height for term, height in kernel.items() if height > 0}
 
 
-def raised(kernel: Kernel, frames: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
+def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
     """The kernel as high as leaves line integrals (F, v, u), blurred by so many pixels, about as well explained as any
-    height does; as it is where none does much better."""
+    height does, with each frame's ``air`` at 0; as it is where none does much better."""
     if not kernel:
         return kernel
     coarse = smooth(frames, blur)
     inside = object_in(model.volume(coarse))
 
     def left(height: float) -> float:
-        clean = remove_scatter(coarse, times(height))
+        clean = with_air_at_0(remove_scatter(coarse, times(height)), air)[0]
         return unexplained(clean, model.volume(clean), inside, model)
 
     def times(height: float) -> Kernel:
-        return {width: height * own for width, own in kernel.items()}
+        return {term: height * own for term, own in kernel.items()}
 
     height, least = 1.0, (before := left(1.0))
     for _ in range(_MOST_RAISED):
@@ -89,22 +99,23 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
     frames = unmasked_frames(scan)
     if options.to_primary > 0:
         reach = options.reach or _USUAL_REACH
-        kernel = {reach: _height_for(frames, options.to_primary, reach)}
+        kernel: Kernel = {(reach, 1): _height_for(frames, options.to_primary, reach)}
     else:
         air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
-        kernel = raised(fit_scatter(frames, air, options.reach), frames, *coarse_model(scan, make_model))
+        kernel = raised(fit_scatter(frames, air, options.reach), frames, air, *coarse_model(scan, make_model))
     clean = remove_scatter(frames, kernel)
-    facts = {"reach": list(kernel), "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
+    terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
+    facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
     return replace(scan, projections=clean), facts
 
 
 def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
     """The height that leaves this ratio, by bisection: the ratio grows with it."""
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, _FITTED_FRAMES).round().astype(int))]
+    chosen = frames[_some(len(frames))]
     low, high = 0.0, 20.0
     for _ in range(20):
         middle = (low + high) / 2
-        below = _ratio(chosen, remove_scatter(chosen, {reach: middle})) < to_primary
+        below = _ratio(chosen, remove_scatter(chosen, {(reach, 1): middle})) < to_primary
         low, high = (middle, high) if below else (low, middle)
     return (low + high) / 2
 
@@ -119,12 +130,17 @@ def _ratio(before: np.ndarray, after: np.ndarray) -> float:
 def _primary(recorded: np.ndarray, kernel: Kernel) -> np.ndarray:
     primary = recorded
     for _ in range(_PASSES if kernel else 0):
-        scatter = sum(height * _scattered(primary, reach) for reach, height in kernel.items())
+        scatter = sum(height * _scattered(primary, *term) for term, height in kernel.items())
         primary = np.maximum(recorded - scatter, _LEAST_PRIMARY * recorded)
     return primary
 
 
-def _scattered(primary: np.ndarray, reach: float) -> np.ndarray:
-    source = primary * np.maximum(-np.log(np.maximum(primary, 1e-12)), 0)
+def _scattered(primary: np.ndarray, reach: float, power: int) -> np.ndarray:
+    source = primary * np.maximum(-np.log(np.maximum(primary, 1e-12)), 0) ** power
     sigma = reach * max(primary.shape[1:])
     return scipy.ndimage.gaussian_filter(source, (0, sigma, sigma), mode="constant")
+
+
+def _some(frames: int) -> np.ndarray:
+    """Which frames heights are fitted to."""
+    return np.unique(np.linspace(0, frames - 1, _FITTED_FRAMES).round().astype(int))
