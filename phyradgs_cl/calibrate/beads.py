@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.calibrate.level import MOST_FRAMES, as_wide
+from phyradgs_cl.calibrate.level import MOST_FRAMES
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.check.coarse import binned, fewer_frames
 from phyradgs_cl.check.questions.timing import exposure_arc_rad
@@ -183,7 +183,7 @@ class BeadLevel:
             small = binned(moved(scan, change, views), self.block)
             edge_px = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification / min(small.geometry.pixel_size_mm)
             times = int(np.clip(math.ceil(exposure_arc_rad(scan) * edge_px), _LEAST_SAMPLES, _MOST_SAMPLES))
-            spread = as_wide(small, times)
+            spread = _as_wide(small, times)
             tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
         radius_mm = float(np.median([body.reach_mm for body in self.phantom.ellipsoids])) * small.geometry.magnification
         per_pixel = math.ceil(_PIXEL_SAMPLES * min(small.geometry.pixel_size_mm) / radius_mm)
@@ -278,6 +278,17 @@ def _cut_noise(scans: Sequence[Scan]) -> float:
         return 0.0
     means = uniform_filter(np.where(valid, values, 0), (0, _BLOCK, _BLOCK)) * math.sqrt(2 * math.pi)
     return float(np.median(means[valid]))
+
+
+def _as_wide(scan: Scan, times: int) -> Scan:
+    """The scan with lines open so much longer, about the same middle, that ``times`` moments of that are spread (standard
+    deviation) as all of the exposure is: else few would pass for a shorter one. A pulse is left as it is."""
+    if scan.shutter.pulse_s is not None:
+        return scan
+    exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
+    early_s = (exposure_s - scan.shutter.exposure_s) / 2
+    shutter = replace(scan.shutter, exposure_s=exposure_s)
+    return replace(scan, shutter=shutter, frame_start_s=np.asarray(scan.frame_start_s) - early_s)
 
 
 def _further(placement: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -89,9 +89,8 @@ class Level:
         for scan in self.scans:
             small = binned(moved(scan, change, views), self.block)
             voxels = exposure_arc_rad(scan) * max(self.grid.shape[1:]) / 2
-            times = int(np.clip(math.ceil(voxels / _VOXELS_PER_SAMPLE), 1, _MOST_SAMPLES))
-            spread = as_wide(small, times)
-            tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
+            motion = PerRow(sub_intervals=int(np.clip(math.ceil(voxels / _VOXELS_PER_SAMPLE), 1, _MOST_SAMPLES)))
+            tables += [motion.cells(small, frame) for frame in range(small.frames)]
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables)
 
     def masked(self, frames: np.ndarray) -> np.ndarray:
@@ -149,14 +148,3 @@ def _through_before(scan: Scan, made_small: Callable[[Scan], Scan]) -> np.ndarra
     through: np.ndarray = np.exp(-np.asarray(small.projections, np.float32))
     through[0] = 0
     return through
-
-
-def as_wide(scan: Scan, times: int) -> Scan:
-    """The scan with lines open so much longer, about the same middle, that ``times`` moments of that are spread (standard
-    deviation) as all of the exposure is: else few would pass for a shorter one. A pulse, or one moment, stays as it is."""
-    if scan.shutter.pulse_s is not None or times == 1:
-        return scan
-    exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
-    early_s = (exposure_s - scan.shutter.exposure_s) / 2
-    shutter = replace(scan.shutter, exposure_s=exposure_s)
-    return replace(scan, shutter=shutter, frame_start_s=np.asarray(scan.frame_start_s) - early_s)
