@@ -31,7 +31,7 @@ _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the
 _FITTED_FRAMES = 24
 _USUAL_REACH = 0.18
 _RAISED, _MOST_RAISED = 1.25, 8  # the kernel's height, step by step
-_BETTER, _AS_WELL = 0.8, 1.05  # times what the kernel of the air, and the best, leave unexplained
+_BETTER, _AS_WELL = 0.7, 1.05  # times what the kernel of the air, and the best, leave unexplained
 
 
 @dataclass(frozen=True)

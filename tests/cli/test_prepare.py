@@ -39,7 +39,7 @@ def test_a_step_that_finds_nothing_says_none(cli, simulated, tmp_path, capsys) -
     source = simulated(*SPOILT[:-6], "--noise", "none")  # no scatter in it
     assert cli.run(["prepare", str(source), "-o", str(tmp_path / "clean.h5"), "--steps", "scatter"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("scatter")]
-    assert "reach none, height none, to primary 0" in line
+    assert "reach none, power none, height none, to primary 0" in line
 
 
 def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) -> None:
