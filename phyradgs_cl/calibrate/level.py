@@ -56,7 +56,7 @@ class Level:
         block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
 
         def made_small(scan: Scan) -> Scan:
-            return binned(smooth(fewer_frames(scan, most_frames), _SMOOTH * block if block > 1 else 0.0), block)
+            return binned(_along_lines(fewer_frames(scan, most_frames), block), block)
 
         fewer = [fewer_frames(scan, most_frames) for scan in scans]
         small = [made_small(scan) for scan in scans]
@@ -139,6 +139,16 @@ class Level:
                 break
             method.step()
         return method.residual
+
+
+def _along_lines(scan: Scan, block: int) -> Scan:
+    """Smoothed for blocks of so many pixels, where the shutter rolls only along its lines: what is seen at another time
+    would not be sheared as the object is there, and a readout would be found too short."""
+    if block == 1:
+        return scan
+    width = _SMOOTH * block
+    across = 0.0 if scan.shutter.readout_s > 0 else width
+    return smooth(scan, (across, width) if scan.shutter.axis == "rows" else (width, across))
 
 
 def _through_before(scan: Scan, made_small: Callable[[Scan], Scan]) -> np.ndarray:

@@ -42,11 +42,13 @@ def coarse(scan: Scan, level: Level) -> Scan:
     return replace(small, grid=coarse_grid(scan.grid, small.geometry, level.voxels))
 
 
-def smooth(scan: Scan, pixels: float) -> Scan:
-    """Frames smoothed by a Gaussian of ``pixels``, from valid pixels only: blocks then miss nothing that is finer."""
-    if pixels <= 0.5:
+def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
+    """Frames smoothed by a Gaussian of ``pixels``, or as many across rows and columns, from valid pixels only: blocks then
+    miss nothing that is finer."""
+    v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
+    if max(v_px, u_px) <= 0.5:
         return scan
-    sigma = (0, pixels, pixels)
+    sigma = (0, v_px, u_px)
     p = np.asarray(scan.projections, np.float32)
     if scan.pixel_mask is None:
         return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
