@@ -47,8 +47,8 @@ __kernel void backproject(
 }
 
 #ifdef COLUMN_ROWS
-/* Along z the detector column and the depth stay and v is linear: two columns are blended once for all voxels.
-   Images are transposed: (columns, pitch) with v along a row. The host sees to it that a block of voxels along z
+/* Along z the detector column and the depth stay and v is linear: two columns are blended once for LANES voxels, or, where
+   those meet more rows than two vectors hold, for all. Images are transposed: (columns, pitch) with v along a row. The host sees to it that a block of voxels along z
    meets at most COLUMN_ROWS rows. */
 __kernel void backproject_upright(
     __global const float *projections, __global const float *matrices, __global const float *weights,
@@ -74,6 +74,28 @@ __kernel void backproject_upright(
         if (!(u >= 0.0f && u <= (float)(width - 1) && depth > 0.0f))
             continue;
         const float step = m[6] * inv, start = (m[4] * x + (m[5] * y + m[6] * first + m[7])) * inv;
+        const int column = min((int)u, max(width - 2, 0));
+        const float weight = weights[f] * inv * inv, high = weight * (u - column), low = weight - high;
+        __global const float *a = projections + f * image_step + IMAGE_GUARD + (size_t)column * image_pitch;
+        __global const float *b = a + (width > 1 ? image_pitch : 0);
+#ifdef V_LOOKUP
+        if (fabs(step) * (LANES - 1) < (float)(2 * LANES - 3)) { /* LANES voxels meet rows that two vectors hold */
+            for (int z = 0; z < count; z += LANES) {
+                const vf v = start + step * (V_IOTA + (float)z);
+                const vi inside = (v >= 0.0f) & (v <= (float)(rows - 1));
+                if (!V_ANY(inside))
+                    continue;
+                const vi row = V_INT(V_PICK(0.0f, v, inside));
+                const int least = clamp((int)fmin(V_FIRST(v), V_LAST(v)), 0, max(rows + 1 - 2 * LANES, 0));
+                const vf lower = low * V_LOAD(a + least) + high * V_LOAD(b + least);
+                const vf upper = low * V_LOAD(a + least + LANES) + high * V_LOAD(b + least + LANES);
+                const vf here = V_LOOKUP(lower, upper, row - least), next = V_LOOKUP(lower, upper, row - least + 1);
+                const vf value = here + (v - V_FLOAT(row)) * (next - here);
+                V_STORE(V_LOAD(sum + z) + V_PICK(0.0f, value, inside), sum + z);
+            }
+            continue;
+        }
+#endif
         const float at_low = -start / step, at_high = ((float)(rows - 1) - start) / step; /* z at both edges */
         const int z_start = (int)clamp(ceil(fmin(at_low, at_high)), 0.0f, (float)count);
         const int z_stop = (int)clamp(floor(fmax(at_low, at_high)), -1.0f, (float)(count - 1)) + 1;
@@ -82,11 +104,6 @@ __kernel void backproject_upright(
         const float v_start = start + step * z_start, v_last = start + step * (z_stop - 1);
         const int base = clamp((int)fmin(v_start, v_last), 0, max(rows - 2, 0));
         const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is the guard's zeros */
-        const int column = min((int)u, max(width - 2, 0));
-        const float wu = u - column, weight = weights[f] * inv * inv;
-        const float high = weight * wu, low = weight - high;
-        __global const float *a = projections + f * image_step + IMAGE_GUARD + (size_t)column * image_pitch;
-        __global const float *b = a + (width > 1 ? image_pitch : 0);
         for (int v = base; v < stop; v += LANES)
             V_STORE(low * V_LOAD(a + v) + high * V_LOAD(b + v), blended + (v - base));
         const float shift = start - base;

@@ -109,14 +109,30 @@ __kernel void rays_upright(
             const float at = clamp(fma(r.gb, ahead, r.sb), (float)(r.b_first - 1), (float)(r.b_first + r.nb));
             const int j = min((int)(at + 1.0f) - 1, r.b_first + r.nb - 1);
             const float wb = at - (float)j;
+            const size_t column = IMAGE_GUARD + (j - r.b_first + BORDER) * r.stride_b + (i - r.a_first + BORDER) * r.stride_a;
+#ifdef V_LOOKUP
+            if (fabs(cell[RAY_EV + 2] * r.inv * ahead) * (LANES - 1) < (float)(2 * LANES - 3)) {
+                /* LANES lines meet voxels that two vectors hold */
+                for (int k = 0; k < count; k += LANES) {
+                    vf wc;
+                    const vi z = sample_at(V_LOAD(g + k), sc, ahead, c_first, c_last, &wc) - c_first;
+                    const int base = min(min(V_FIRST(z), V_LAST(z)), max(shape.z + 1 - 2 * LANES, -1));
+                    __global const float *near = columns + column + base, *far = near + r.stride_b;
+                    const vf low = V_LOAD(near), high = V_LOAD(near + LANES);
+                    const vf lower = fma((vf)(wb), V_LOAD(far) - low, low);
+                    const vf upper = fma((vf)(wb), V_LOAD(far + LANES) - high, high);
+                    const vf a = V_LOOKUP(lower, upper, z - base), b = V_LOOKUP(lower, upper, z - base + 1);
+                    V_STORE(V_LOAD(p + k) + fma(wc, b - a, a), p + k);
+                }
+                continue;
+            }
+#endif
             /* voxels that the lines' samples need: from the one below the lowest to the one above the highest */
             const float z0 = fma(g[0], ahead, sc), z1 = fma(g[count - 1], ahead, sc);
             const float lowest = clamp(fmin(z0, z1), (float)(c_first - 1), (float)(c_last + 1));
             const float highest = clamp(fmax(z0, z1), (float)(c_first - 1), (float)(c_last + 1));
             const int base = min((int)(lowest + 1.0f) - 1, c_last), stop = min((int)(highest + 1.0f) - 1, c_last) + 2;
-            __global const float *near = columns + IMAGE_GUARD + (j - r.b_first + BORDER) * r.stride_b
-                                         + (i - r.a_first + BORDER) * r.stride_a + (base - c_first);
-            __global const float *far = near + r.stride_b;
+            __global const float *near = columns + column + (base - c_first), *far = near + r.stride_b;
             for (int k = 0; k < stop - base; k += LANES) {
                 const vf a = V_LOAD(near + k);
                 V_STORE(fma((vf)(wb), V_LOAD(far + k) - a, a), blended + k);

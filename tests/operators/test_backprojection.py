@@ -11,6 +11,7 @@ from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.operators.twins.backproject import backprojection, lines_backprojection
+from phyradgs_cl.runtime import Runtime
 
 backprojection, lines_backprojection = remembered(backprojection), remembered(lines_backprojection)
 GRID = Grid((5, 9, 19), (0.3, 0.2, 0.1), (0.1, -0.1, 0.2))
@@ -57,6 +58,21 @@ def test_rows_that_run_downwards_and_tall_detectors(any_rt, make_geometry: Geome
     smooth = np.cumsum(frames, axis=1, dtype=np.float64).astype(np.float32) / 40  # 1e-5 pixels matter less
     expected = backprojection(smooth, pose, weight, grid)
     assert_same(backproject(any_rt, smooth, pose, weight, grid), expected, 5)
+
+
+@pytest.mark.parametrize("lanes", [1, 4, 8, 16])
+@pytest.mark.parametrize("voxel_mm", [0.02, 0.05, 0.09, 0.15])
+@pytest.mark.parametrize("rows", [9, 97])
+def test_columns_of_many_voxels_at_any_pitch(lanes, voxel_mm, rows, make_geometry: Geometries) -> None:
+    """Where a vector of voxels meets few rows, and where it meets more than two vectors hold."""
+    grid, (frames, weight) = Grid((43, 3, 5), (voxel_mm, 0.2, 0.2)), random_frames((rows, 7))
+    pose = make_geometry(rows, 7).pose(ANGLES)
+    for down in (False, True):
+        if down:
+            pose[:, 3:6] += (rows - 1) * pose[:, 9:12]
+            pose[:, 9:12] *= -1
+        expected = backprojection(frames, pose, weight, grid)
+        assert_same(backproject(Runtime(lanes=lanes, pixel_items=False), frames, pose, weight, grid), expected, 4)
 
 
 def test_voxels_behind_the_source_receive_nothing(any_rt, make_geometry: Geometries) -> None:
