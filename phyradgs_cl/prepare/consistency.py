@@ -16,9 +16,10 @@ _INSIDE = 0.1  # of the densest: the object
 _SMOOTH = 1 / 24  # of the panel's longer side: such effects are smoother than what a grid cannot hold
 
 
-def coarse_model(scan: Scan, make_model: MakeModel) -> tuple[Model, float]:
-    """The scan's model on few voxels, and the standard deviation in pixels of the blur that frames for it need."""
-    finer = max(1.0, max(scan.grid.shape) / _VOXELS)
+def coarse_model(scan: Scan, make_model: MakeModel, most: int = _VOXELS) -> tuple[Model, float]:
+    """The scan's model on at most so many voxels along the longest side, and the standard deviation in pixels of the blur
+    that frames for it need."""
+    finer = max(1.0, max(scan.grid.shape) / most)
     return make_model(scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / finer)))), (finer - 1) / 2
 
 

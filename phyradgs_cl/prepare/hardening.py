@@ -1,11 +1,11 @@
 """Beam hardening undone: line integrals as they are in the thinnest layer.
 
-By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume is
-reprojected, and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100),
-again as the volume gets better. Where bone begins is stated, or it is tried: the frames that their own reprojection explains
-best win, those as they are and those of water alone among them. Or, of an object of one material, by the scan's consistency
-with its own reprojection: how line integrals grow with the path through the segmented volume says the polynomial (Krumm,
-Kasperl and Franz, NDT & E Int. 41 (2008) 242).
+By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume, one with
+little total variation, is reprojected, and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist.
+Tomogr. 2 (1978) 100), again as the volume gets better. Where bone begins is stated, or it is tried: the frames that their own
+reprojection explains best win, those as they are and those of water alone among them. Or, of an object of one material, by the
+scan's consistency with its own reprojection: how line integrals grow with the path through the segmented volume says the
+polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
 """
 
 import logging
@@ -30,9 +30,11 @@ Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """From a volume (z, y, x), the attenuation in each voxel that is bone's."""
 _LARGEST = 1e3
-_PASSES = 4  # of bone from volume from bone
-_TRIED = (0.85, 0.7, 0.55, 0.45, 0.35, 0.2, 0.1)  # of the densest: what is soft ends here
-_TRIED_PASSES = 2  # each beginning with the frames of the one before
+_PASSES = 2  # of bone from volume from bone
+_BONE_VOXELS = 128  # along the longest side, at most: what bone hardens is smooth
+_SOFT_TO, _BONE_FROM = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.4, 0.7, 1.0)  # of the densest: what is tried
+_AS_WELL = 0.1  # of what bone explains: with less bone, which does less harm where something else is left
+_NEARLY = 1.02  # times what is left without bone: whoever states a voltage has a scan that is hardened
 _NEWTON = 3  # leave 1e-12
 _UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
 _SHADOW = 0.1  # of the longest path
@@ -104,18 +106,19 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
             return scan, {**facts, "left_alone": True}
         bone_in = partial(_between, *mixed)
         facts |= dict(zip(("soft_to_per_mm", "bone_from_per_mm"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
-    clean, facts["bone_share"] = _straighten_two(frames, spectrum, make_model(scan), water, bone_in)
+    fine = coarse_model(scan, make_model, _BONE_VOXELS)
+    clean, facts["bone_share"] = _straighten_two(frames, spectrum, *fine, water, bone_in)
     return replace(scan, projections=clean), facts
 
 
 def _straighten_two(
-    frames: np.ndarray, spectrum: Spectrum, model: Model, water: Polynomial, bone_in: BoneIn
+    frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the volume's attenuation; those of
-    water where no bone is found."""
+    water where no bone is found. blur: pixels, of frames for the model."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
-        volume = model.volume(clean)
+        volume = model.regularised(smooth(clean, blur))
         bone = bone_in(volume)
         if not bone.any():
             break
@@ -130,23 +133,23 @@ def find_bone(
     """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u)
     explain themselves best: infinity without bone, None where they do best as they are; and the share that either, and the
     best with bone, leaves unexplained."""
+    def left_by(clean: np.ndarray) -> float:
+        return unexplained(clean, model.volume(clean), inside, model)
+
     clean = straighten(frames, water)
-    volume = model.volume(clean)
-    inside = object_in(volume)
-    none = unexplained(frames, model.volume(frames), inside, model)
-    alone = unexplained(clean, volume, inside, model)
-    left: dict[tuple[float, float], float] = {}
-    for share in _TRIED:
-        for _ in range(_TRIED_PASSES):
-            mixed = share * densest(volume), densest(volume)
-            clean = _with_bone(_between(*mixed, volume), frames, spectrum, model)
-            volume = model.volume(clean)
-        left[mixed] = unexplained(clean, volume, inside, model)
-    best = min(left, key=left.__getitem__)
+    inside = object_in(model.volume(clean))
+    none, alone = left_by(frames), left_by(clean)
+    volume = model.regularised(clean)
+    pairs = [(soft * densest(volume), bone * densest(volume)) for soft in _SOFT_TO for bone in _BONE_FROM if soft < bone]
+    bones = {pair: _between(*pair, volume) for pair in pairs}
+    left = {pair: left_by(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
+    least = min(left.values())
+    enough = [pair for pair in pairs if left[pair] <= least + _AS_WELL * max(alone - least, 0.0)]
+    best = min(enough, key=lambda pair: float(bones[pair].sum()))
     told = {"as_they_are": none, "water": alone, "bone": left[best]}
-    if none <= min(alone, left[best]):
-        return None, told
-    return (best if left[best] < alone else (np.inf, np.inf)), told
+    if left[best] <= _NEARLY * min(none, alone):
+        return best, told
+    return ((np.inf, np.inf) if alone < none else None), told
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:

@@ -31,7 +31,8 @@ _SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the
 _FITTED_FRAMES = 24
 _USUAL_REACH = 0.18
 _RAISED, _MOST_RAISED = 1.25, 8  # the kernel's height, step by step
-_BETTER, _AS_WELL = 0.7, 1.05  # times what the kernel of the air, and the best, leave unexplained
+_TRIALS = 6  # of heights between the best one's neighbours
+_BETTER, _AS_WELL = 0.65, 1.05  # times what the kernel of the air, and the best, leave unexplained
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """The kernel as high as leaves line integrals (F, v, u), blurred by so many pixels, about as well explained as any
-    height does, with each frame's ``air`` at 0; as it is where none does much better."""
+    """The kernel as high as leaves line integrals (F, v, u), blurred by so many pixels, best explained, with each frame's
+    ``air`` at 0; as it is where none does much better."""
     if not kernel:
         return kernel
     coarse = smooth(frames, blur)
@@ -91,7 +92,11 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
         if (further := left(_RAISED * height)) > _AS_WELL * least:
             break
         height, least = _RAISED * height, min(least, further)
-    return times(height) if least < _BETTER * before else kernel
+    if least >= _BETTER * before:
+        return kernel
+    beside = height / _RAISED, height * _RAISED
+    found = scipy.optimize.minimize_scalar(left, bounds=beside, method="bounded", options={"maxiter": _TRIALS})
+    return times(float(found.x))
 
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
