@@ -3,8 +3,9 @@
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
     python benchmarks/calibrate.py --table RESULTS.jsonl
 
-FOLDER holds volumes as benchmarks/tables takes them. Scans are R2-Gaussian's scanner with TIGRE's noise, detectors twice as
-wide as the volume; the volume is fista-tv's, every line at its own times. Cases:
+FOLDER holds volumes as benchmarks/tables takes them; --only spheres is the sphere phantom, in closed form. Scans are
+R2-Gaussian's scanner with TIGRE's noise, detectors twice as wide as the volume; the volume is fista-tv's, every line at its
+own times. Cases:
 
     panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once
     right      nothing wrong; everything that may be asked for by itself is
@@ -50,12 +51,13 @@ from phyradgs_cl.calibrate.wobble import (
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import psnr
-from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
+from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom, sphere_phantom
 from phyradgs_cl.reconstructors import method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate, volume_scene
 
 ITERATIONS = 60
+SPHERES = "spheres"
 Maker = Callable[..., Scan]
 
 
@@ -220,13 +222,17 @@ def _without(scan: Scan, planted: dict[str, float]) -> Scan:
 CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, slow, kaist, motion, beads, draw)}
 
 
-def maker(rt: Runtime, path: Path, size: int, views: int) -> Maker:
+def maker(rt: Runtime, path: Path | None, size: int, views: int) -> Maker:
+    """Of a volume file, or of the sphere phantom."""
     detector = 2 * size
     geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
 
     def make(seed: int, axis: str = "rows", phantom: EllipsoidPhantom | None = None, **plan: object) -> Scan:
         where = geometry, Grid.cube(size, 2.0), size, axis
-        if phantom is None:
+        if phantom is None and path is None:
+            scene = phantom_scene(rt, sphere_phantom(1.0), *where, seed)
+        elif phantom is None:
+            assert path is not None
             scene = volume_scene(rt, load_attenuation(path), f"volume {path}", *where)
         else:
             scene = phantom_scene(rt, phantom, *where, seed, pixel_samples=2)
@@ -336,6 +342,14 @@ def table(path: Path) -> str:
     return "\n".join(text)
 
 
+def volumes_of(folder: Path, names: str | None, size: int) -> dict[str, Path | None]:
+    """Files of volumes; none for the sphere phantom."""
+    given = names.split(",") if names else []
+    of_files = ",".join(name for name in given if name != SPHERES)
+    files: dict[str, Path | None] = dict(files_of(folder, of_files or None, size)) if of_files or not given else {}
+    return files | ({SPHERES: None} if SPHERES in given else {})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of volumes")
@@ -354,13 +368,13 @@ def main() -> None:
         return
     if arguments.results is None:
         parser.error("the results file is missing")
-    cases, volumes = chosen("--cases", arguments.cases, CASES), files_of(arguments.folder, arguments.only, arguments.size)
+    cases, volumes = chosen("--cases", arguments.cases, CASES), volumes_of(arguments.folder, arguments.only, arguments.size)
     rt = Runtime(arguments.device)
     key = ("case", "volume", "size", "views", "seed")
     done = {tuple(run[k] for k in key) for run in read_lines(arguments.results)}
     for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
         for case in cases:
-            for name, path in ({case: Path()} if case == "beads" else volumes).items():
+            for name, path in ({case: None} if case == "beads" else volumes).items():
                 what = (case, name, arguments.size, arguments.views, seed)
                 if what not in done:
                     result = run_one(rt, CASES[case](maker(rt, path, arguments.size, arguments.views), seed))

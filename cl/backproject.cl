@@ -48,8 +48,8 @@ __kernel void backproject(
 
 #ifdef COLUMN_ROWS
 /* Along z the detector column and the depth stay and v is linear: two columns are blended once for LANES voxels, or, where
-   those meet more rows than two vectors hold, for all. Images are transposed: (columns, pitch) with v along a row. The host sees to it that a block of voxels along z
-   meets at most COLUMN_ROWS rows. */
+   those meet more rows than two vectors hold, for all. Images are transposed: (columns, pitch) with v along a row. The host
+   sees to it that a block of voxels along z meets at most COLUMN_ROWS rows. */
 __kernel void backproject_upright(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,

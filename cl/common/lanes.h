@@ -21,6 +21,8 @@ typedef int vi;
 #define V_PICK(no, yes, condition) ((condition) ? (yes) : (no))
 #define VI_PICK(no, yes, condition) ((condition) ? (yes) : (no))
 #define V_ANY(condition) (condition)
+#define V_FIRST(v) (v)
+#define V_LAST(v) (v)
 #define V_INT(v) convert_int(v)
 #define V_FLOAT(v) convert_float(v)
 static inline float v_sum(vf v) { return v; }
@@ -36,16 +38,20 @@ typedef LANE_TYPE(int, LANES) vi;
 #define V_PICK(no, yes, condition) select((vf)(no), (vf)(yes), (condition))
 #define VI_PICK(no, yes, condition) select((vi)(no), (vi)(yes), (condition))
 #define V_ANY(condition) any(condition)
+#define V_FIRST(v) ((v).s0)
 #define V_INT(v) LANE_TYPE(convert_int, LANES)(v)
 #define V_FLOAT(v) LANE_TYPE(convert_float, LANES)(v)
 #if LANES == 4
 #define V_IOTA ((vf)(0, 1, 2, 3))
+#define V_LAST(v) ((v).s3)
 static inline float v_sum(vf v) { float2 b = v.lo + v.hi; return b.x + b.y; }
 #elif LANES == 8
 #define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7))
+#define V_LAST(v) ((v).s7)
 static inline float v_sum(vf v) { float4 a = v.lo + v.hi; float2 b = a.lo + a.hi; return b.x + b.y; }
 #else
 #define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#define V_LAST(v) ((v).sf)
 static inline float v_sum(vf v)
 {
     float8 c = v.lo + v.hi;
@@ -79,15 +85,11 @@ typedef float v_table __attribute__((vector_size(64)));
 typedef int v_places __attribute__((vector_size(64)));
 #define V_LOOKUP(low, high, i) __builtin_astype(__builtin_ia32_vpermi2varps512( \
     __builtin_astype((low), v_table), __builtin_astype((i), v_places), __builtin_astype((high), v_table)), vf)
-#define V_FIRST(v) (v).s0
-#define V_LAST(v) (v).sf
 #elif LANES == 8 && defined(__AVX2__) && __has_builtin(__builtin_ia32_permvarsf256)
 typedef float v_table __attribute__((vector_size(32)));
 typedef int v_places __attribute__((vector_size(32)));
 #define V_PERMUTED(v, i) __builtin_astype( \
     __builtin_ia32_permvarsf256(__builtin_astype((v), v_table), __builtin_astype((i), v_places)), vf)
 #define V_LOOKUP(low, high, i) V_PICK(V_PERMUTED(low, i), V_PERMUTED(high, i), (i) >= LANES)
-#define V_FIRST(v) (v).s0
-#define V_LAST(v) (v).s7
 #endif
 #endif

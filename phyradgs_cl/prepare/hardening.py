@@ -2,10 +2,10 @@
 
 By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume, one with
 little total variation, is reprojected, and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist.
-Tomogr. 2 (1978) 100), again as the volume gets better. Where bone begins is stated, or it is tried: the frames that their own
-reprojection explains best win, those as they are and those of water alone among them. Or, of an object of one material, by the
-scan's consistency with its own reprojection: how line integrals grow with the path through the segmented volume says the
-polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
+Tomogr. 2 (1978) 100), again as the volume gets better. Where bone begins is stated, or it is tried: the frames that their
+own reprojection explains best win, those as they are and those of water alone among them. Or, of an object of one material,
+by the scan's consistency with its own reprojection: how line integrals grow with the path through the segmented volume says
+the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
 """
 
 import logging
@@ -133,6 +133,7 @@ def find_bone(
     """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u)
     explain themselves best: infinity without bone, None where they do best as they are; and the share that either, and the
     best with bone, leaves unexplained."""
+
     def left_by(clean: np.ndarray) -> float:
         return unexplained(clean, model.volume(clean), inside, model)
 

@@ -1,4 +1,4 @@
-"""Detector columns parallel to z, and poses that serve many lines: another kernel, the same bits."""
+"""Detector columns parallel to z, and poses that serve many lines: other kernels; of frames the same bits."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,18 +9,18 @@ from kernel_kit import note_launches
 from memory_limits import room_for
 from ray_tables import noise, tables
 from remembered import remembered
-from tolerances import RAYS
+from tolerances import RAYS, RAYS_BACK
 
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.rays.upright import columns_floats, upright_block
-from phyradgs_cl.operators.twins.rays import ray_frame
+from phyradgs_cl.operators.rays.upright import columns_floats, serve_one_line_each, upright_block
+from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
 from phyradgs_cl.runtime import Runtime
 
-ray_frame = remembered(ray_frame)
+ray_frame, ray_volume = remembered(ray_frame), remembered(ray_volume)
 GRID = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.1, -0.05, 0.2))
 TALL_PANEL = (85, 7)
 PLANNED = 0.9  # share of free memory that is planned with
@@ -110,6 +110,59 @@ def test_intensities_take_the_general_kernel(rt) -> None:
     gap = operator.forward(x) - operator.project(x, "intensity")
     np.testing.assert_allclose(operator.intensity_gap(x), gap, atol=1e-5)
     assert gap.max() > 1e-3
+
+
+def adjoint_of_twins(cells: list[TimeCells], grid: Grid, y: np.ndarray) -> np.ndarray:
+    return sum(ray_volume(frame, grid, table) for frame, table in zip(y, cells, strict=True))
+
+
+ADJOINTS = {
+    "static": (GRID, TALL_PANEL, {}), "a wide panel": (GRID, (131, 18), {}), "a column": (GRID, (96, 1), {}),
+    "few lines per voxel": (Grid((38, 20, 22), (0.05, 0.06, 0.06)), (24, 9), {}),
+    "many lines per voxel": (Grid((6, 9, 11), (0.3, 0.2, 0.15)), (150, 9), {}),
+    "more voxels than a work-item's": (Grid((150, 20, 21), (0.013,) * 3, (0.0, 0.1, 0.0)), (85, 40), {}),
+    "a voxel": (Grid((1, 1, 1), (1.9, 0.2, 0.3)), TALL_PANEL, {}),
+    "a source close by": (Grid((9, 30, 30), (2 / 30,) * 3), TALL_PANEL, {"source_mm": 1.3}),
+}
+
+
+@pytest.mark.parametrize("case", ADJOINTS)
+def test_the_adjoint_is_the_twins(cpu_rt, monkeypatch, case) -> None:
+    grid, shape, source = ADJOINTS[case]
+    cells = tables("static", shape, **source)
+    y = noise((3, *shape), 108)
+    with monkeypatch.context() as patch:
+        launched = note_launches(patch)
+        found = RayOperator(cpu_rt, grid, shape, cells).adjoint(y)
+    assert set(launched) == {"weigh_columns", "rays_upright_adjoint"}
+    expected = adjoint_of_twins(cells, grid, y)
+    assert np.abs(found - expected).max() <= RAYS_BACK * expected.max() and expected.max() > 0
+
+
+def test_strips_and_lines_without_cells_go_back_too(cpu_rt) -> None:
+    """A cell per line; several cells take the general kernel."""
+    (cells,), y = tables("micro-views", TALL_PANEL, frames=1), noise((1, *TALL_PANEL), 109)
+    first_of_each = np.unique(cells.line_start, return_index=True)[1][[0, 2, 4]]
+    parts = {n: getattr(cells, n)[first_of_each] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
+    strips = replace(cells, **parts)
+    assert serve_one_line_each([strips]) and not serve_one_line_each([cells])
+    expected = ray_volume(y[0], GRID, strips)
+    found = RayOperator(cpu_rt, GRID, TALL_PANEL, [strips]).adjoint(y)
+    assert np.abs(found - expected).max() <= RAYS_BACK * expected.max()
+
+
+def test_the_adjoints_bits_do_not_tell_of_bricks_batches_or_where_frames_are(banded_rt) -> None:
+    rt = banded_rt
+    cells, y = tables("static", TALL_PANEL, frames=5), noise((5, *TALL_PANEL), 110)
+    grid = Grid((40, 37, 13), (0.05, 0.05, 0.1))
+    expected = RayOperator(rt, grid, TALL_PANEL, cells).adjoint(y)
+    operator, layout = RayOperator(rt, grid, TALL_PANEL, cells), RayLayout.of_scan(grid, TALL_PANEL, "rows")
+    np.testing.assert_array_equal(rt.download(operator.adjoint(rt.upload(y))), expected)
+    with room_for(rt, int(4 * (layout.volume_floats * 0.7 + layout.frames_floats(2)) / PLANNED)):
+        small = RayOperator(rt, grid, TALL_PANEL, cells)
+        assert len(small.memory.plan()) > 1 and len(list(small.memory.batches(5))) > 1
+        np.testing.assert_array_equal(small.adjoint(y), expected)
+        np.testing.assert_array_equal(small.subset([4, 1]).adjoint(y[[4, 1]]), operator.subset([4, 1]).adjoint(y[[4, 1]]))
 
 
 def changed(change: Callable[[np.ndarray], None]) -> list[TimeCells]:

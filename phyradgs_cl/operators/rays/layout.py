@@ -48,6 +48,10 @@ class RayLayout:
     def frames_floats(self, count: int) -> int:
         return 2 * GUARD + count * self.lines * pitch_of(self.width)
 
+    def turned_floats(self, count: int) -> int:
+        """Of frames with the readout's lines as columns."""
+        return 2 * GUARD + count * self.width * pitch_of(self.lines)
+
     def frames_shape(self, count: int) -> tuple[int, int, int]:
         return count, self.lines, self.width
 
@@ -63,6 +67,12 @@ class RayLayout:
         """Where the pixels of padded frames lie."""
         row = pitch_of(self.width)
         return Strides(GUARD, self.lines * row, row)
+
+    @property
+    def turned_strides(self) -> Strides:
+        """Where the pixels of padded frames lie whose lines are columns."""
+        row = pitch_of(self.lines)
+        return Strides(GUARD, self.width * row, row)
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
         """The volume (z, y, x) as a view of its padded floats."""

@@ -25,6 +25,7 @@ class RayMemory:
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, upright: bool = False) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
+        self._is_upright = upright
         self._columns_bytes = 4 * columns_floats(layout.grid) if upright else 0
         self._columns: DeviceArray | None = None
         self._bricks: list[Brick] = []
@@ -44,7 +45,7 @@ class RayMemory:
 
     def _planned(self, share: float) -> tuple[list[Brick], int]:
         layout, room = self.layout, self.rt.room()
-        each_bytes = 4 * (layout.frames_floats(1) - layout.frames_floats(0))
+        each_bytes = 4 * (self._frames_floats(1) - layout.frames_floats(0))
 
         def batch(free_bytes: int) -> int:
             fitting = (min(free_bytes, room.largest_bytes) - 4 * layout.frames_floats(0)) // each_bytes
@@ -52,8 +53,8 @@ class RayMemory:
 
         everything = whole(layout.grid.shape)
         volume_bytes = 4 * layout.of(everything).volume_floats
-        if share == 1 and room.holds(volume_bytes, 4 * layout.frames_floats(1)):
-            if not room.holds(volume_bytes, 4 * layout.frames_floats(1), self._columns_bytes):
+        if share == 1 and room.holds(volume_bytes, 4 * self._frames_floats(1)):
+            if not room.holds(volume_bytes, 4 * self._frames_floats(1), self._columns_bytes):
                 self._columns_bytes = 0
             return [everything], batch(room.free_bytes - volume_bytes - self._columns_bytes)
         self._columns_bytes = 0
@@ -65,7 +66,7 @@ class RayMemory:
         frames = batch(min(int(_FRAMES_SHARE * share * room.free_bytes), beside))
 
         def needs(shape: tuple[int, int, int]) -> tuple[int, int]:
-            return 4 * layout.of(whole(shape)).volume_floats, 4 * layout.frames_floats(frames)
+            return 4 * layout.of(whole(shape)).volume_floats, 4 * self._frames_floats(frames)
 
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
@@ -137,10 +138,17 @@ class RayMemory:
 
     def frames(self, count: int) -> DeviceArray:
         """Memory for ``count`` frames of one batch, whatever was in it."""
+        return self._some_frames(self.layout.frames_floats(count))
+
+    def _some_frames(self, floats: int) -> DeviceArray:
         if self._frames is None:
-            self._frames = self.rt.zeros(self.layout.frames_floats(self._batch))
-        floats = self.layout.frames_floats(count)
+            self._frames = self.rt.zeros(self._frames_floats(self._batch))
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
+
+    def _frames_floats(self, count: int) -> int:
+        """Of frames that lie either way, where both are wanted."""
+        turned = self.layout.turned_floats(count) if self._is_upright else 0
+        return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str) -> DeviceArray:
         """Some of the frames (F, rows, columns), lines first and padded; ``axis`` is the readout's."""
@@ -153,6 +161,18 @@ class RayMemory:
             move(self.rt, (frames, plain), padded, shape, turned=axis == "columns")
         else:
             self.rt.write(on_device, pad_rows(Readout(axis).frames(frames[part])))
+        return on_device
+
+    def write_turned(self, frames: Array, part: slice, axis: str) -> DeviceArray:
+        """As ``write_frames``, with lines as columns."""
+        count = part.stop - part.start
+        on_device = self._some_frames(self.layout.turned_floats(count))
+        if isinstance(frames, DeviceArray):
+            plain = Strides.plain(frames.shape, (part.start, 0, 0))
+            shape = count, *frames.shape[1:]
+            move(self.rt, (frames, plain), (on_device, self.layout.turned_strides), shape, turned=axis == "rows")
+        else:
+            self.rt.write(on_device, pad_rows(Readout(axis).frames(frames[part]).swapaxes(1, 2)))
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:

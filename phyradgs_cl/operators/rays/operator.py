@@ -14,7 +14,13 @@ from phyradgs_cl.operators.rays.cell_layers import averaged, layered
 from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.rays.upright import launch_upright, upright_block
+from phyradgs_cl.operators.rays.upright import (
+    launch_upright,
+    launch_upright_adjoint,
+    serve_one_line_each,
+    upright_block,
+    weigh_columns,
+)
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
 
 
@@ -69,6 +75,7 @@ class RayOperator:
         layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
         # a GPU's work-items are pixels, whose loads the general kernel has side by side
         self._upright = 0 if rt.pixel_items else upright_block(grid, tables, layout.width, rt.lanes)
+        self._is_turned = self._upright > 0 and serve_one_line_each(tables)
         self.memory = memory or RayMemory(rt, layout, len(tables), upright=self._upright > 0)
         self._tables = list(tables)
         self._cells = RayCells.upload(rt, grid, self._tables)
@@ -152,9 +159,15 @@ class RayOperator:
             layout, on_device = self.memory.volume(brick)
             for part in parts:
                 listed = self._listed(part)
+                add = part.start > 0
+                if self._is_turned:
+                    if k == 0 or len(parts) > 1:
+                        turned = self.memory.write_turned(frames, part, self._readout.axis)
+                        weigh_columns(self.rt, layout, self._cells, listed, turned)
+                    launch_upright_adjoint(self.rt, layout, self._cells, listed, turned, on_device, add=add)
+                    continue
                 if k == 0 or len(parts) > 1:
                     by_line = self.memory.write_frames(frames, part, self._readout.axis)
-                add = part.start > 0
                 launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
             self.memory.read_volume(layout, on_device, result)
 

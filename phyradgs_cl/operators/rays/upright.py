@@ -15,6 +15,7 @@ from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _LINES = 128  # of a detector column for a work-item
 _VOXELS = 512  # of a column of the volume that they may meet in one slice
+_OWNED = (8, 4, 128)  # voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share what rays bring
 _UPRIGHT = 1e-6  # voxels: how far a ray may lean over the whole detector
 _TURN = 16  # voxels along x and z that are turned at a time; as in cl/rays_upright.cl
 
@@ -38,6 +39,11 @@ def upright_block(grid: Grid, tables: Sequence[TimeCells], width: int, lanes: in
         return 0
     block = int(min(_LINES, lines, (_VOXELS - 4) // max(np.abs(ev[:, 2]).max(), 1e-3)))
     return block if block >= lanes else 0
+
+
+def serve_one_line_each(tables: Sequence[TimeCells]) -> bool:
+    """Whether no line has more than one cell: frames can then be weighed before they go back."""
+    return all(int((table.line_stop - table.line_start).sum()) <= table.lines for table in tables)
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
@@ -82,6 +88,62 @@ def launch_upright(
     )
 
 
+def launch_upright_adjoint(
+    rt: Runtime,
+    layout: RayLayout,
+    cells: RayCells,
+    frame_list: DeviceArray,
+    turned: DeviceArray,
+    volume: DeviceArray,
+    *,
+    add: bool = False,
+) -> None:
+    """Sums the listed frames, turned and weighed, onto a padded volume; as ``rays.launch_adjoint``."""
+    nz, ny, nx = layout.brick.shape
+    shape, origin, pitch, *_ = layout.constants()
+    rt.launch(
+        rt.kernel("rays_upright_adjoint", "rays_upright_adjoint", **_adjoint_defines()),
+        tuple(-(-n // own) for n, own in zip((nx, ny, nz), _OWNED, strict=True)),
+        turned,
+        cells.cells,
+        cells.cell_lines,
+        cells.matrices,
+        np.int32(cells.matrix_stride),
+        cells.frame_cells,
+        frame_list,
+        np.int32(frame_list.size),
+        shape,
+        origin,
+        pitch,
+        np.int32(layout.width),
+        np.int32(pitch_of(layout.lines)),
+        np.int32(add),
+        volume,
+        group=1,
+    )
+
+
+def weigh_columns(
+    rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, turned: DeviceArray
+) -> None:
+    """Turned frames, each pixel times its ray's length per sample and its cell's weight."""
+    _, _, _, pitch_mm, lines, width, _ = layout.constants()
+    rt.launch(
+        rt.kernel("rays_upright_adjoint", "weigh_columns", **_adjoint_defines()),
+        (layout.width, frame_list.size),
+        cells.cells,
+        cells.cell_lines,
+        cells.frame_cells,
+        frame_list,
+        pitch_mm,
+        lines,
+        width,
+        np.int32(pitch_of(layout.lines)),
+        turned,
+        group=1,
+    )
+
+
 def turn_volume(rt: Runtime, layout: RayLayout, volume: DeviceArray, columns: DeviceArray) -> None:
     """A padded volume (z, y, x) to ``columns`` (y, x, z), whose padding is zero already and stays so."""
     nz, ny, nx = layout.grid.shape
@@ -93,3 +155,8 @@ def turn_volume(rt: Runtime, layout: RayLayout, volume: DeviceArray, columns: De
 
 def _defines() -> dict[str, int]:
     return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "UPRIGHT_LINES": _LINES, "UPRIGHT_VOXELS": _VOXELS}
+
+
+def _adjoint_defines() -> dict[str, int]:
+    x, y, z = _OWNED
+    return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "ADJOINT_X": x, "ADJOINT_Y": y, "ADJOINT_Z": z}
