@@ -56,7 +56,7 @@ class Level:
         block = math.ceil(max(scans[0].geometry.detector_shape) / columns)
 
         def made_small(scan: Scan) -> Scan:
-            return binned(_along_lines(fewer_frames(scan, most_frames), block), block)
+            return binned(_smoothed(fewer_frames(scan, most_frames), block), block)
 
         fewer = [fewer_frames(scan, most_frames) for scan in scans]
         small = [made_small(scan) for scan in scans]
@@ -141,14 +141,14 @@ class Level:
         return method.residual
 
 
-def _along_lines(scan: Scan, block: int) -> Scan:
-    """Smoothed for blocks of so many pixels, where the shutter rolls only along its lines: what is seen at another time
-    would not be sheared as the object is there, and a readout would be found too short."""
+def _smoothed(scan: Scan, block: int) -> Scan:
+    """Smoothed for blocks of so many pixels; not across rows that are read one after the other: they see the object turned,
+    which mixed would look like a readout that is too short. Columns are: a readout shears what they see, and that stays."""
     if block == 1:
         return scan
     width = _SMOOTH * block
-    across = 0.0 if scan.shutter.readout_s > 0 else width
-    return smooth(scan, (across, width) if scan.shutter.axis == "rows" else (width, across))
+    is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"
+    return smooth(scan, (0.0 if is_rolling else width, width))
 
 
 def _through_before(scan: Scan, made_small: Callable[[Scan], Scan]) -> np.ndarray:
