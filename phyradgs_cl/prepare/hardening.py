@@ -105,7 +105,7 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
             log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
             return scan, {**facts, "left_alone": True}
         bone_in = partial(_between, *mixed)
-        facts |= dict(zip(("soft_to_per_mm", "bone_from_per_mm"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
+        facts |= dict(zip(("soft_to", "bone_from"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
     fine = coarse_model(scan, make_model, _BONE_VOXELS)
     clean, facts["bone_share"] = _straighten_two(frames, spectrum, *fine, water, bone_in)
     return replace(scan, projections=clean), facts
@@ -130,9 +130,9 @@ def _straighten_two(
 def find_bone(
     frames: np.ndarray, spectrum: Spectrum, water: Polynomial, model: Model
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
-    """The attenuations, 1/mm, up to which all is soft and from which all is bone, with which line integrals (F, v, u)
-    explain themselves best: infinity without bone, None where they do best as they are; and the share that either, and the
-    best with bone, leaves unexplained."""
+    """The shares of the densest up to which all is soft and from which all is bone, with which line integrals (F, v, u)
+    explain themselves best: infinity without bone, None where they do best as they are; and what either, and the best with
+    bone, leaves unexplained of them."""
 
     def left_by(clean: np.ndarray) -> float:
         return unexplained(clean, model.volume(clean), inside, model)
@@ -141,7 +141,7 @@ def find_bone(
     inside = object_in(model.volume(clean))
     none, alone = left_by(frames), left_by(clean)
     volume = model.regularised(clean)
-    pairs = [(soft * densest(volume), bone * densest(volume)) for soft in _SOFT_TO for bone in _BONE_FROM if soft < bone]
+    pairs = [(soft, bone) for soft in _SOFT_TO for bone in _BONE_FROM if soft < bone]
     bones = {pair: _between(*pair, volume) for pair in pairs}
     left = {pair: left_by(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
     least = min(left.values())
@@ -204,9 +204,10 @@ def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
     return np.where(volume >= bone_per_mm, volume, 0)
 
 
-def _between(soft_to_per_mm: float, bone_from_per_mm: float, volume: np.ndarray) -> np.ndarray:
-    """What is bone where voxels (z, y, x) mix: none of one that attenuates as soft tissue at most, all of one as bone."""
-    if soft_to_per_mm >= bone_from_per_mm:
+def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
+    """What is bone where voxels (z, y, x) mix: none of one that attenuates as soft tissue at most, all of one as bone; both
+    as shares of the densest, which the correction makes denser."""
+    if soft_to >= bone_from:
         return np.zeros_like(volume)
-    mixed = (volume - soft_to_per_mm) * (bone_from_per_mm / (bone_from_per_mm - soft_to_per_mm))
-    return np.clip(mixed, 0, np.maximum(volume, 0))
+    soft, bone = soft_to * densest(volume), bone_from * densest(volume)
+    return np.clip((volume - soft) * (bone / (bone - soft)), 0, np.maximum(volume, 0))

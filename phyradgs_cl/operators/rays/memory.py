@@ -20,12 +20,13 @@ class RayMemory:
     """Buffers for frames of ``layout`` and its volume, planned when they are first needed.
 
     A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. ``upright``: it
-    is wanted turned as well, where both fit. Operators may share one, in turns: each call writes what it reads.
+    is wanted turned as well, where both fit, and so are frames. Operators may share one, in turns: each call writes what it
+    reads.
     """
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, upright: bool = False) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
-        self._is_upright = upright
+        self.is_upright = upright
         self._columns_bytes = 4 * columns_floats(layout.grid) if upright else 0
         self._columns: DeviceArray | None = None
         self._bricks: list[Brick] = []
@@ -147,7 +148,7 @@ class RayMemory:
 
     def _frames_floats(self, count: int) -> int:
         """Of frames that lie either way, where both are wanted."""
-        turned = self.layout.turned_floats(count) if self._is_upright else 0
+        turned = self.layout.turned_floats(count) if self.is_upright else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str) -> DeviceArray:

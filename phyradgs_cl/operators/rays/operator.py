@@ -75,8 +75,8 @@ class RayOperator:
         layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
         # a GPU's work-items are pixels, whose loads the general kernel has side by side
         self._upright = 0 if rt.pixel_items else upright_block(grid, tables, layout.width, rt.lanes)
-        self._is_turned = self._upright > 0 and serve_one_line_each(tables)
         self.memory = memory or RayMemory(rt, layout, len(tables), upright=self._upright > 0)
+        self._is_turned = self._upright > 0 and self.memory.is_upright and serve_one_line_each(tables)
         self._tables = list(tables)
         self._cells = RayCells.upload(rt, grid, self._tables)
         self._choose(np.arange(len(tables)))
