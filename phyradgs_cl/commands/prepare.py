@@ -57,4 +57,6 @@ def _line(step: dict[str, Any]) -> str:
 def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{_shown(own)} {key.replace('_', ' ')}" for key, own in value.items())
     return (", ".join(map(_shown, value)) or "none") if isinstance(value, list) else str(value)
