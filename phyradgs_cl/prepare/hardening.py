@@ -32,7 +32,9 @@ BoneIn = Callable[[np.ndarray], np.ndarray]
 _LARGEST = 1e3
 _PASSES = 2  # of bone from volume from bone
 _BONE_VOXELS = 128  # along the longest side, at most: what bone hardens is smooth
-_SOFT_TO, _BONE_FROM = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.4, 0.7, 1.0)  # of the densest: what is tried
+# Of the densest, what is tried: where soft tissue ends and bone is whole; above 1 where bone is thinner than a voxel.
+_BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
+_BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
 _AS_WELL = 0.1  # of what bone explains: with less bone, which does less harm where something else is left
 _NEARLY = 1.02  # times what is left without bone: whoever states a voltage has a scan that is hardened
 _NEWTON = 3  # leave 1e-12
@@ -141,11 +143,10 @@ def find_bone(
     inside = object_in(model.volume(clean))
     none, alone = left_by(frames), left_by(clean)
     volume = model.regularised(clean)
-    pairs = [(soft, bone) for soft in _SOFT_TO for bone in _BONE_FROM if soft < bone]
-    bones = {pair: _between(*pair, volume) for pair in pairs}
+    bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
     left = {pair: left_by(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
     least = min(left.values())
-    enough = [pair for pair in pairs if left[pair] <= least + _AS_WELL * max(alone - least, 0.0)]
+    enough = [pair for pair in bones if left[pair] <= least + _AS_WELL * max(alone - least, 0.0)]
     best = min(enough, key=lambda pair: float(bones[pair].sum()))
     told = {"as_they_are": none, "water": alone, "bone": left[best]}
     if left[best] <= _NEARLY * min(none, alone):

@@ -15,7 +15,8 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, FrameSource, PixelAreaSource, VolumeSource
 
-_DENSE = 0.5  # of the largest attenuation: from here a voxel is bone, in a beam of many energies
+_DENSE = 0.5  # of the largest attenuation: from here on a voxel may be bone, in a beam of many energies
+_RARE = 0.2  # of the most common attenuation's voxels: more are one material, which no threshold may divide
 log = logging.getLogger(__name__)
 
 
@@ -100,7 +101,16 @@ def _voxel_sources(
     def of(values: np.ndarray) -> FrameSource:
         return _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, values, grid, panel, axis))
 
-    return of(volume), lambda: of(np.where(volume >= _DENSE * volume.max(), volume, 0).astype(np.float32))
+    return of(volume), lambda: of(np.where(volume >= bone_from(volume), volume, 0).astype(np.float32))
+
+
+def bone_from(volume: np.ndarray) -> float:
+    """The attenuation from which voxels (z, y, x) are bone: half the largest, or where the material that half would divide
+    ends; infinity for an object of one material."""
+    largest = float(volume.max())
+    counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
+    is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
+    return max(_DENSE * largest, float(edges[np.argmax(is_rare)])) if is_rare.any() else np.inf
 
 
 def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:

@@ -22,6 +22,7 @@ from phyradgs_cl.simulation import (
     phantom_scene,
     simulate,
 )
+from phyradgs_cl.simulation.scenes import bone_from
 
 SHAPE = (14, 18)
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 14, 3.9 / 18))
@@ -102,6 +103,16 @@ def test_voxels_and_closed_form_meet(rt) -> None:
     voxels = simulate(source, GEOMETRY, grid, options).projections
     exact = run(options).projections
     assert np.linalg.norm(voxels - exact) <= VOXEL_SOURCE * np.linalg.norm(exact)
+
+
+def test_no_material_is_half_bone() -> None:
+    """Half the largest attenuation, but above what it would divide; an object of one material has none."""
+    volume = np.random.default_rng(2).normal(0.3, 0.02, (20, 20, 20))
+    volume[:5], volume[5:8] = 0.0, 1.0
+    assert bone_from(volume) == 0.5
+    volume[10:] += 0.22
+    assert 0.58 < bone_from(volume) < 0.7
+    assert bone_from(np.full((4, 4, 4), 0.2)) == np.inf
 
 
 def test_peak_scales_frames_and_reference_alike() -> None:
