@@ -111,7 +111,7 @@ def test_no_material_is_half_bone() -> None:
     volume[:5], volume[5:8] = 0.0, 1.0
     assert bone_from(volume) == 0.5
     volume[10:] += 0.22
-    assert 0.58 < bone_from(volume) < 0.7
+    assert np.mean(volume[10:] >= bone_from(volume)) < 0.1
     assert bone_from(np.full((4, 4, 4), 0.2)) == np.inf
 
 
