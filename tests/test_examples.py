@@ -20,6 +20,7 @@ MOST_LINES, LONGEST_S = 60, 300  # under a minute on two cores that have nothing
 SAID = {
     "own_arrays": r"still: (?P<less>[\d.]+) dB.*\nmoving: (?P<more>[\d.]+) dB",
     "own_motion": r"readout takes 0\.86 of an exposure\nlevel: (?P<more>[\d.]+) dB\nsagging: (?P<less>[\d.]+) dB\nPoseTable",
+    "own_poses": r"stated: (?P<less>[\d.]+) dB\nfound: (?P<more>[\d.]+) dB\ncalibrated: ",
     "sweep_in_python": r"PSNR \(dB\) +15 views +30 views[\s\S]*fista-tv +(?P<more>[\d.]+)",
     "from_tigre_or_astra": r"largest difference [\d.e-]+\n(?P<more>2\d\.\d) dB to the truth",
 }

@@ -29,6 +29,7 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.api.bridges import as_torch
 from phyradgs_cl.api.calibration import calibrate
 from phyradgs_cl.api.operators import LinearOperator, Operator
+from phyradgs_cl.api.poses import move_views, pose_gradient
 from phyradgs_cl.api.projectors import (
     initial_gaussians,
     ray_operator,
@@ -87,6 +88,8 @@ __all__ = [
     "initial_gaussians",
     "load_scan",
     "load_volume",
+    "move_views",
+    "pose_gradient",
     "prepare",
     "ray_operator",
     "reconstruct",

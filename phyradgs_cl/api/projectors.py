@@ -162,6 +162,14 @@ class SplatProjection(GaussianOperator):
             intensity=None if intensity is None else partial(_averaging, intensity, chosen),
         )
 
+    def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
+        """dL/d(turn in rad, shifts along columns and rows in pixels) of each frame, (F, 3) float64, from dL/dframes."""
+        rt, engine = self.rt, self._splats
+        if engine.is_layered:
+            raise InputError("by_poses", "averages of intensity", "averages of line integrals")
+        point = engine.rows.enter(placed(rt, self._entered(self._domain, gaussians), True))
+        return engine.by_poses(point, placed(rt, self._entered(self._range, by_frames), True))
+
     def of_densities(self, gaussians: Gaussians) -> LinearOperator:
         """The part that is linear: densities (G,) in 1/mm of this cloud to frames; not under ``intensity``."""
         rt, engine, rows = self.rt, self._splats, self._entered(self._domain, gaussians)

@@ -411,6 +411,15 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: rays()(volume_there().astype(float)), "volume: .*float64"),
         (lambda: rays()(volume_there().transpose((2, 1, 0))), "volume: .*C order"),
     ],
+    "move_views": [
+        (lambda: api.move_views(GOOD, np.zeros((2, 3))), "views"),
+        (lambda: api.move_views(FRAMES, np.zeros((4, 3))), "scan: found .*expected a Scan"),
+    ],
+    "pose_gradient": [
+        (lambda: api.pose_gradient(GOOD, GOOD.reference, FRAMES[:1]), "by_frames"),
+        (lambda: api.pose_gradient(GOOD, FRAMES, FRAMES), "volume: found shape"),
+        (lambda: api.pose_gradient(GOOD, Gaussians.from_rows(FLAT + 1), FRAMES, "quick"), "motion: found 'quick'"),
+    ],
     "as_torch": [(lambda: api.as_torch(3), "torch|operator")],
 }
 # what is raised, reported or only described: there is nothing to give it

@@ -8,12 +8,15 @@ lies on the device, without padding.
 from collections.abc import Sequence
 from copy import copy
 
+import numpy as np
+
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.operators.splats.layout import DeviceCells
 from phyradgs_cl.operators.splats.plain import PlainImages, PlainRows, SplatPoint
+from phyradgs_cl.operators.splats.poses import by_length, by_pose
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR, SplatProjector
 from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -40,7 +43,7 @@ class SplatOperator:
         pixel_footprint: bool = False,
     ) -> None:
         readout = tables[0].readout
-        self.rt, self.is_layered = rt, intensity
+        self.rt, self.is_layered, self._affine = rt, intensity, affine
         self._projector = SplatProjector(
             rt,
             *readout.shape(detector_shape),
@@ -53,6 +56,7 @@ class SplatOperator:
         self.rows = PlainRows(rt, length_mm, line_integrals=True)
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._cells = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
+        self._poses = [table.pose[table.count // 2] for table in tables]
         self._ready = _Ready()
         self.frames_shape = (len(tables), *detector_shape)
 
@@ -71,20 +75,41 @@ class SplatOperator:
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         for number, cells in enumerate(self._cells):
-            is_ready = self._ready.holds(point, cells)
-            self._ready.forget()
-            if not is_ready:
-                see = self._projector.forward if self.is_layered else self._projector.prepare
-                see(gaussians, cells)  # intensities are merged anew: their derivative depends on every layer
-            by_image = self._images.enter(by_frames, number)
-            self._projector.backward(gaussians, cells, by_image, gradients)
+            self._differentiate(point, cells, self._images.enter(by_frames, number), gradients)
             self.rows.leave(gradients, point, by_rows, add=number > 0)
         return by_rows
+
+    def _differentiate(
+        self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
+    ) -> None:
+        """Gradients (13, stride) by internal rows of a frame from dL/dframe, padded."""
+        is_ready = self._ready.holds(point, cells)
+        self._ready.forget()
+        if not is_ready:
+            see = self._projector.forward if self.is_layered else self._projector.prepare
+            see(point.gaussians, cells)  # intensities are merged anew: their derivative depends on every layer
+        self._projector.backward(point.gaussians, cells, by_image, gradients)
+
+    def by_poses(self, point: SplatPoint, by_frames: DeviceArray) -> np.ndarray:
+        """dL by a turn (rad) of the gantry about z, and by the panel's shifts (pixels) along its columns and rows, of each
+        frame: (F, 3) float64 at a cloud from dL/dframes (F, rows, columns); not under intensity."""
+        cloud, found = point.gaussians, np.empty((len(self._cells), 3))
+        rows, gradients = self.rt.download(cloud.rows), self.rt.empty((ROWS + 2, cloud.stride))
+        weighed = self.rt.download(self.forward(point)) * self.rt.download(by_frames)
+        for number, (cells, pose) in enumerate(zip(self._cells, self._poses, strict=True)):
+            self._differentiate(point, cells, self._images.enter(by_frames, number), gradients)
+            by_rows = self.rt.download(gradients)[:, : cloud.count]
+            turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
+            shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
+            found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
+            if not self._affine:  # whose rays are all as long as the middle one
+                found[number, 1:] += by_length(pose, weighed[number])
+        return found
 
     def subset(self, frames: Sequence[int]) -> "SplatOperator":
         """The same operator on some of the frames, in this order; costs nothing."""
         part = copy(self)
-        part._cells = [self._cells[f] for f in frames]
+        part._cells, part._poses = [self._cells[f] for f in frames], [self._poses[f] for f in frames]
         if not part._cells:
             raise InputError("subset", "no frames", "at least one frame")
         part.frames_shape = (len(part._cells), *self.frames_shape[1:])

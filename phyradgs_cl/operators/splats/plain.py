@@ -87,7 +87,7 @@ class PlainImages:
     """
 
     def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
-        self.rt, self._turned = rt, turned
+        self.rt, self.turned = rt, turned
         self._by_line = 1, lines, width
         self._plain = (1, width, lines) if turned else self._by_line
         self._padded = Strides(GUARD, 0, pitch_of(width))
@@ -98,13 +98,13 @@ class PlainImages:
         if self._image is None:
             self._image = padded_zeros(self.rt, *self._by_line[1:])
         source, target = (images, self._place(number)), (self._image, self._padded)
-        move(self.rt, source, target, self._plain, turned=self._turned)
+        move(self.rt, source, target, self._plain, turned=self.turned)
         return self._image
 
     def leave(self, image: DeviceArray, images: DeviceArray, number: int = 0) -> None:
         """A padded image to image ``number``."""
         source, target = (image, self._padded), (images, self._place(number))
-        move(self.rt, source, target, self._by_line, turned=self._turned)
+        move(self.rt, source, target, self._by_line, turned=self.turned)
 
     def _place(self, number: int) -> Strides:
         return Strides.plain(self._plain, (number, 0, 0))
