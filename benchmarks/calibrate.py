@@ -20,6 +20,7 @@ own times. Cases:
                once, drawn by the seed, rows read (of no volume)
     draw       columns read; offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %, drawn by the
                seed: how often the stated intervals hold the truth (no volumes are scored)
+    draw_rows  the same, rows read: readout and exposure are not to be known
 """
 
 import argparse
@@ -206,7 +207,15 @@ def drawn_beads(rng: np.random.Generator) -> tuple[EllipsoidPhantom, EllipsoidPh
 
 
 def draw(make: Maker, seed: int) -> Case:
-    right, rng = make(seed, axis="columns"), np.random.default_rng(seed)
+    return _drawn(make(seed, axis="columns"), seed)
+
+
+def draw_rows(make: Maker, seed: int) -> Case:
+    return _drawn(make(seed), seed)
+
+
+def _drawn(right: Scan, seed: int) -> Case:
+    rng = np.random.default_rng(seed)
     most = {
         "offset-u": 2.5 * right.geometry.pixel_size_mm[1], "roll": np.deg2rad(0.5), "tilt-v": np.deg2rad(1.0),
         "readout": 0.2 * right.shutter.readout_s,
@@ -219,7 +228,7 @@ def _without(scan: Scan, planted: dict[str, float]) -> Scan:
     return moved(scan, change_of({name: -value for name, value in planted.items()}))
 
 
-CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, slow, kaist, motion, beads, draw)}
+CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, slow, kaist, motion, beads, draw, draw_rows)}
 
 
 def maker(rt: Runtime, path: Path | None, size: int, views: int) -> Maker:
