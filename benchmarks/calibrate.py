@@ -228,7 +228,10 @@ def _without(scan: Scan, planted: dict[str, float]) -> Scan:
     return moved(scan, change_of({name: -value for name, value in planted.items()}))
 
 
-CASES = {one.__name__: one for one in (panel, right, columns, rows, turned, wobble, slow, kaist, motion, beads, draw, draw_rows)}
+CASES = {
+    one.__name__: one
+    for one in (panel, right, columns, rows, turned, wobble, slow, kaist, motion, beads, draw, draw_rows)
+}
 
 
 def maker(rt: Runtime, path: Path | None, size: int, views: int) -> Maker:
