@@ -16,13 +16,15 @@ _STEP_PX = 0.25  # how far a derivative's differences move the image at its edge
 _TIMING_STEP, _LEAST_TIME = 0.1, 0.7  # of the time that is stated: of a difference, and what may be taken off
 _PER_ONE = 50.0  # what moves nothing is tried by half a percent, and stepped by four at most
 _MOST_TILT_RAD = math.radians(2.0)
+_SMALL_MISMATCH = 1.3  # of signals that are the other way half a turn later, which errors of voxels are not
 _LEAST_KNOWN_RAD = math.radians(10.0)  # standard deviation of an angle that says nothing: sines are straight no further
 
 
 @dataclass(frozen=True)
 class Parameter:
     """A field of ``Change``. ``scale``: of the unit that people read per unit of the field. ``alike``: what the object does
-    instead, where the frames cannot tell. ``pixels``: by how many pixels a unit of the field moves the image at its edge."""
+    instead, where the frames cannot tell. ``pixels``: by how many pixels a unit of the field moves the image at its edge.
+    ``mismatch``: errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object."""
 
     name: str
     field: str
@@ -32,6 +34,7 @@ class Parameter:
     pixels: Callable[[Scan], float]
     scale: float = 1.0
     is_timing: bool = False
+    mismatch: float = 2.0
 
     def step(self, scan: Scan) -> float:
         """Half the distance of a central difference, in the field's unit."""
@@ -86,14 +89,17 @@ PARAMETERS = {
     for one in (
         Parameter(
             "offset-u", "offset_u_mm", "mm", "an object beside the axis",
-            lambda s: s.geometry.detector_offset_mm[1], lambda s: 1 / _pitch_mm(s),
+            lambda s: s.geometry.detector_offset_mm[1], lambda s: 1 / _pitch_mm(s), mismatch=_SMALL_MISMATCH,
         ),
         Parameter(
             "offset-v", "offset_v_mm", "mm", "an object further along the axis",
             lambda s: s.geometry.detector_offset_mm[0], lambda s: 1 / _pitch_mm(s),
         ),
         Parameter("roll", "roll_rad", "deg", "a sheared object", lambda s: 0.0, _roll_pixels, _DEGREES),
-        Parameter("tilt-v", "tilt_v_rad", "deg", "a shifted panel", lambda s: 0.0, _tilt_pixels(1), _DEGREES),
+        Parameter(
+            "tilt-v", "tilt_v_rad", "deg", "a shifted panel", lambda s: 0.0, _tilt_pixels(1), _DEGREES,
+            mismatch=_SMALL_MISMATCH,
+        ),
         Parameter("tilt-u", "tilt_u_rad", "deg", "an object wider at one end", lambda s: 0.0, _tilt_pixels(0), _DEGREES),
         Parameter(
             "source-distance", "source_distance_mm", "mm", _SCALE,

@@ -15,7 +15,6 @@ from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
 
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
-_MISMATCH = 2.0  # errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object
 _TINY = 1e-9
 _OVER_GAUGE, _MOST_GAUGE = 2.0, 0.2  # and of what is left of a gauge's, which is much where the geometry is wrong
 
@@ -24,9 +23,10 @@ _OVER_GAUGE, _MOST_GAUGE = 2.0, 0.2  # and of what is left of a gauge's, which i
 class Reduced:
     """Signals of the parameters ``names`` on one level: ``jacobian`` (K, N) beyond what a volume explains, per unit of each
     parameter's field; ``sizes`` (K,) their norms before; ``residual`` (N,) likewise beyond; both by frame, N = F · pixels.
-    ``noise``: standard deviation of a pixel's noise."""
+    ``noise``: standard deviation of a pixel's noise. ``mismatch`` (K,): of errors, over what noise alone would do."""
 
     names: tuple[str, ...]
+    mismatch: np.ndarray
     jacobian: np.ndarray
     sizes: np.ndarray
     whole: np.ndarray
@@ -37,7 +37,8 @@ class Reduced:
     def only(self, names: Sequence[str]) -> "Reduced":
         at = [self.names.index(name) for name in names]
         whole = self.whole[np.ix_(at, at)]
-        return replace(self, names=tuple(names), jacobian=self.jacobian[at], sizes=self.sizes[at], whole=whole)
+        of = {name: getattr(self, name)[at] for name in ("mismatch", "jacobian", "sizes")}
+        return replace(self, names=tuple(names), whole=whole, **of)
 
     @property
     def gram(self) -> np.ndarray:
@@ -75,7 +76,7 @@ class Reduced:
         variance = np.diag(inverse @ spread @ inverse)
         white = np.diag(inverse) * self.noise**2
         eaten = max(1.0, self.noise**2 / max(float(np.mean(left**2)), 1e-30))
-        found: np.ndarray = _MISMATCH * np.sqrt(np.maximum(variance * eaten, white)) / self.sizes
+        found: np.ndarray = self.mismatch * np.sqrt(np.maximum(variance * eaten, white)) / self.sizes
         return found
 
 
@@ -97,6 +98,7 @@ def reduced(
     unit = compared / sizes[:, None]
     return Reduced(
         names=tuple(one.name for one in parameters),
+        mismatch=np.array([one.mismatch for one in parameters]),
         jacobian=np.array([one.ravel() for one in left], np.float64),
         sizes=sizes,
         whole=unit @ unit.T,
