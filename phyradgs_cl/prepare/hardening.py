@@ -37,7 +37,7 @@ _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in 
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
 _BELOW = 0.1  # what most of the object is, of the densest: from there on there may be bone
 _AS_WELL = 0.1  # of what bone explains: with less bone, which does less harm where something else is left
-_NEARLY = 1.02  # times what is left without bone: whoever states a voltage has a scan that is hardened
+_NEARLY = 1.02  # times what water leaves: whoever states a voltage has a scan that is hardened
 _NEWTON = 3  # leave 1e-12
 _UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
 _SHADOW = 0.1  # of the longest path
@@ -151,7 +151,7 @@ def find_bone(
     enough = [pair for pair in bones if left[pair] <= least + _AS_WELL * max(alone - least, 0.0)]
     best = min(enough, key=lambda pair: float(bones[pair].sum()))
     told = {"as_they_are": none, "water": alone, "bone": left[best]}
-    if left[best] <= _NEARLY * min(none, alone):
+    if left[best] < none and left[best] <= _NEARLY * alone:
         return best, told
     return ((np.inf, np.inf) if alone < none else None), told
 
