@@ -35,7 +35,6 @@ _BONE_VOXELS = 128  # along the longest side, at most: what bone hardens is smoo
 # Of the densest, what is tried: where soft tissue ends and bone is whole; above 1 where bone is thinner than a voxel.
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_BELOW = 0.1  # what most of the object is, of the densest: from there on there may be bone
 _AS_WELL = 0.1  # of what bone explains: with less bone, which does less harm where something else is left
 _NEARLY = 1.02  # times what water leaves: whoever states a voltage has a scan that is hardened
 _NEWTON = 3  # leave 1e-12
@@ -144,8 +143,7 @@ def find_bone(
     inside = object_in(model.volume(clean))
     none, alone = left_by(frames), left_by(clean)
     volume = model.regularised(clean)
-    softest = min(_most_common(volume) - _BELOW, max(_BETWEEN)[0])
-    bones = {pair: _between(*pair, volume) for pair in _BETWEEN if pair[0] >= softest}
+    bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
     left = {pair: left_by(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
     least = min(left.values())
     enough = [pair for pair in bones if left[pair] <= least + _AS_WELL * max(alone - least, 0.0)]
@@ -154,12 +152,6 @@ def find_bone(
     if left[best] < none and left[best] <= _NEARLY * alone:
         return best, told
     return ((np.inf, np.inf) if alone < none else None), told
-
-
-def _most_common(volume: np.ndarray) -> float:
-    """The attenuation that most voxels (z, y, x) of the object have, as a share of the densest: soft tissue, not bone."""
-    counts, edges = np.histogram(volume / max(densest(volume), 1e-20), 18, (0.1, 1.0))
-    return float(edges[np.argmax(counts)])
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:

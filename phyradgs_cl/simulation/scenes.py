@@ -106,10 +106,10 @@ def _voxel_sources(
 
 def bone_from(volume: np.ndarray) -> float:
     """The attenuation from which voxels (z, y, x) are bone: half the largest, or where the material ends that half would
-    divide, or that most voxels are of; infinity for an object of one material."""
+    divide."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
-    is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max()) & (np.arange(64) > np.argmax(counts))
+    is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
     return max(_DENSE * largest, float(edges[np.argmax(is_rare)])) if is_rare.any() else np.inf
 
 
