@@ -26,7 +26,7 @@ def refine(scan, pixels):
         for batch in rng.permutation(scan.frames).reshape(-1, BATCH):
             rows = raw.copy()
             rows[LOGS] = np.exp(raw[LOGS])
-            S = phy.splat_operator(phy.move_views(scan, views, gauges=False)).frames(batch)
+            S = phy.splat_operator(phy.move_views(scan, views, without_gauges=True)).frames(batch)
             frames, back = S.vjp(rows)
             residual = frames - scan.projections[batch]
             by_rows, by_views = back(residual), S.by_poses(rows, residual) * units
@@ -42,8 +42,8 @@ if __name__ == "__main__":
     pitch_mm = scan.geometry.pixel_size_mm[0]
     pixels = np.array([2 * pitch_mm / scan.grid.size_mm[0], pitch_mm, pitch_mm])
     wrong = np.random.default_rng(1).normal(size=(scan.frames, 3)) * pixels
-    stated = phy.move_views(scan, wrong, gauges=False)
-    found = phy.move_views(stated, refine(stated, pixels), gauges=False)
+    stated = phy.move_views(scan, wrong, without_gauges=True)
+    found = phy.move_views(stated, refine(stated, pixels), without_gauges=True)
     scans = {"stated": stated, "found": found, "calibrated": phy.calibrate(stated, "wobble").scan, "right": scan}
     for name, one in scans.items():
         volume = phy.reconstruct(one, method="fista", motion="per-row", report=False).volume

@@ -43,5 +43,9 @@ def calibrate(
     scan.check_timing()
     if not (what is None or isinstance(what, str)):
         raise InputError("what", checks.shown(what), "names in one text, with commas", "write for example 'offset,roll'")
+    if not isinstance(others, Sequence):
+        raise InputError("others", checks.shown(others), "a list of Scans")
+    for other in others:
+        check_scan(other, "others")
     shape = None if phantom is None else load_beads(Path(phantom))
     return run_calibration(scan, runtime_of(device), what, others, phantom=shape, splines=splines)

@@ -29,6 +29,7 @@ from phyradgs_cl.calibrate.views import Wobble, find_sway, find_wobble
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
+from phyradgs_cl.check.questions.timing import start_azimuths_rad
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 from phyradgs_cl.check.variants import reversed_readout
 from phyradgs_cl.errors import InputError
@@ -115,6 +116,7 @@ def calibrate(
     if splines:
         checks.whole("--splines", splines, _FEWEST_SPLINES, scan.frames)
     _warn_of_truncation(ready[0], phantom)
+    _warn_of_same_turn(ready)
     search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     stages = STAGES if phantom is None else BEAD_STAGES
     levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
@@ -175,6 +177,16 @@ def _warn_of_truncation(scan: Scan, phantom: EllipsoidPhantom | None) -> None:
     if phantom is None and check_coverage(scan).unit == CUT_OFF:
         text = "calibrate: the object reaches beyond the panel, which can look like a panel that stands elsewhere: %s"
         log.warning(text, "give it a grid that holds the whole object (--roi-mm), and look at slices before and after")
+
+
+def _warn_of_same_turn(scans: Sequence[Scan]) -> None:
+    """Says where other scans are of the same turn and timing: they tell nothing of it that the first does not."""
+    first, *others = scans
+    for other in others:
+        is_as_long = len(other.frame_start_s) == len(first.frame_start_s) and other.shutter == first.shutter
+        if is_as_long and np.allclose(start_azimuths_rad(other), start_azimuths_rad(first), atol=1e-3):
+            text = "calibrate: --with turns as the first scan does: %s"
+            log.warning(text, "of readout and exposure only one that turns the other way, or at another speed, tells more")
 
 
 def _start(rt: Runtime, scan: Scan) -> dict[str, float]:

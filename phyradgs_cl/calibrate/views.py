@@ -14,6 +14,7 @@ from phyradgs_cl.calibrate.wobble import (
     KINDS,
     SHIFT_U,
     SHIFT_V,
+    TURN,
     Numbers,
     certainty,
     numbers_of_sway,
@@ -52,11 +53,12 @@ def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change, splines
     """Turns and shifts of all views of a scan after ``change``, each by itself or by so many ``splines`` of time; stages:
     columns, iterations of a first and next volume.
 
-    Shifts on each level; turns, which need fine detail, on the last one."""
-    kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 1) + [KINDS]
+    Shifts on each level; turns, which need fine detail, on the last two, each time from nothing: how well these agree says
+    how sure they are."""
+    kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 2) + [KINDS] * min(len(stages), 2)
     numbers = numbers_of_views(scan, splines)
     without = partial(without_smooth_gauges, scan, numbers) if splines else partial(without_gauges, scan)
-    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_VIEWS)
+    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_VIEWS, (TURN,))
 
 
 def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:
@@ -76,10 +78,13 @@ def _found(
     kinds: Sequence[Sequence[int]],
     without: Callable[[np.ndarray], np.ndarray],
     names: Sequence[tuple[str, str, float]],
+    anew: Sequence[int] = (),
 ) -> Wobble:
+    """``kinds`` of each stage; ``anew``: those that begin at nothing on each."""
     former = numbers.values
     for (columns, first, again), asked in zip(stages, kinds, strict=True):
         level, volume, former = Level.of(rt, False, [scan], columns, scan.frames), None, numbers.values
+        numbers = replace(numbers, values=former * ~np.isin(np.arange(len(names)), anew))
         for _ in range(_STEPS):
             operator = numbers.operator(level, change)
             volume = level.reconstruct(operator, volume, first if volume is None else again)

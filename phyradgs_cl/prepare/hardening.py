@@ -102,6 +102,8 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
     bone_in = partial(_from, options.bone_per_mm)
     if not options.bone_per_mm:
         model, blur = coarse_model(scan, make_model)
+        if densest(model.volume(smooth(frames, blur))) <= 0:
+            raise _nothing()
         mixed, facts["unexplained"] = find_bone(smooth(frames, blur), spectrum, water, model)
         if mixed is None:
             log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
@@ -192,12 +194,16 @@ def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, f
     path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))
     through = path > _SHADOW * float(path.max())
     if level <= 0 or not through.any():
-        raise InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
+        raise _nothing()
     length, seen = path[through].astype(np.float64), frames[through].astype(np.float64)
     powers = np.stack([length, length**2], axis=1)
     found = np.linalg.lstsq(powers, seen, rcond=None)[0]
     left = float(np.sqrt(np.mean((seen - powers @ found) ** 2) / np.mean(seen**2)))
     return path, level, float(found[1] / found[0] ** 2), left
+
+
+def _nothing() -> InputError:
+    return InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
 
 
 def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.dead import axis_column
 from phyradgs_cl.prepare.masked import unmasked_frames
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
@@ -97,6 +98,9 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     if method == "auto":
         method = "many" if scan.frames >= MANY_VIEWS else "few"
     frames = unmasked_frames(scan)
+    if options.window > frames.shape[2]:
+        expected = f"no more than the panel's {frames.shape[2]} columns"
+        raise InputError("rings.window", str(options.window), expected, "a little more than the rings are wide")
     if method == "many":
         clean = sort_rings(frames, window=options.window)
     else:

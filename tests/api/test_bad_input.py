@@ -270,6 +270,8 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: api.calibrate(GOOD, "rol"), "what: found .rol"),
         (lambda: api.calibrate(GOOD, "roll", splines=6), "splines: found 6; expected with what wobble"),
         (lambda: api.calibrate(GOOD, ["roll"]), "what: found .*expected names in one text"),
+        (lambda: api.calibrate(GOOD, "roll", others=GOOD), "others: found .*a list of Scans"),
+        (lambda: api.calibrate(GOOD, "roll", others=[1]), "others: found 1; expected a Scan"),
         (lambda: api.calibrate(BACKWARDS), "pose table: found the grid behind the panel"),
         (lambda: api.calibrate(GOOD), "4 frames|12 columns|8 frames|columns"),
     ],
@@ -417,7 +419,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     ],
     "pose_gradient": [
         (lambda: api.pose_gradient(GOOD, GOOD.reference, FRAMES[:1]), "by_frames"),
-        (lambda: api.pose_gradient(GOOD, FRAMES, FRAMES), "volume: found shape"),
+        (lambda: api.pose_gradient(GOOD, FRAMES, FRAMES), "x: found shape"),
         (lambda: api.pose_gradient(GOOD, Gaussians.from_rows(FLAT + 1), FRAMES, "quick"), "motion: found 'quick'"),
     ],
     "as_torch": [(lambda: api.as_torch(3), "torch|operator")],

@@ -79,14 +79,16 @@ def test_gauges_are_left_out(scan) -> None:
     assert not np.allclose(
         move_views(scan, views).trajectory.pose(0, np.zeros(1)), scan.trajectory.pose(0, np.zeros(1))
     )
-    kept = move_views(scan, views, gauges=False)
+    kept = move_views(scan, views, without_gauges=True)
     assert np.allclose(kept.trajectory.pose(0, np.zeros(1)), scan.trajectory.pose(0, np.zeros(1)))
 
 
 def test_what_does_not_fit_is_named(rt, scan, cloud) -> None:
     for call, culprit in (
         (lambda: move_views(scan, np.zeros((2, 3))), "views"),
-        (lambda: pose_gradient(scan, cloud, np.zeros((2, 3)), device=rt), "frames"),
+        (lambda: pose_gradient(scan, cloud, np.zeros((2, 3)), device=rt), "by_frames"),
+        (lambda: pose_gradient(scan, cloud.rows(), weights(scan), device=rt), "x: .*from_rows"),
+        (lambda: pose_gradient(scan, cloud, np.full_like(weights(scan), np.nan), device=rt), "by_frames"),
         (lambda: pose_gradient(scan, scan.reference, np.zeros((2, 3)), device=rt), "by_frames"),
         (lambda: splat_operator(scan, device=rt).intensity.by_poses(cloud, weights(scan)), "by_poses"),
     ):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Protocol
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, Calibration, calibrate
 from phyradgs_cl.calibrate.level import Level
@@ -23,7 +23,11 @@ from phyradgs_cl.calibrate.wobble import (
 )
 from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene
+from phyradgs_cl.simulation import simulate as simulate_frames
 from phyradgs_cl.workflow import load_scan
 
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
@@ -91,7 +95,7 @@ def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch,
     assert "beyond the panel" in caplog.text
 
 
-def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turned, tmp_path, capsys) -> None:
+def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turned, tmp_path, capsys, caplog) -> None:
     """Which one scan does not, and two that turn alike do not."""
     longer = Change(readout_s=0.08, exposure_s=0.15)
     for name, scan in (("on", right), ("back", turned(back=True))):
@@ -105,6 +109,7 @@ def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turn
     assert cli.run([*words, str(tmp_path / "on")]) == 0
     said = capsys.readouterr().out
     assert said.count(CANNOT_TELL) == 2 and "±" not in said
+    assert "turns as the first scan does" in caplog.text
 
 
 def test_blocks_mix_no_rows_that_are_read_at_other_times(rt, turned) -> None:
@@ -134,6 +139,20 @@ def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt,
     assert [one.verdict for one in found.table][1:] == [CORRECTED, CORRECTED]
     left_mm = found.views.shift_mm - planted[:, 1:]
     assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
+
+
+def test_turns_of_a_smooth_object_on_which_levels_differ_are_left(rt) -> None:
+    """0.7° (RMS) that go round twice per turn: frames of two balls look the same, and what is found has the wrong sign."""
+    balls = Ellipsoid((0, 0, 0), (0.83, 0.67, 0.75), 1.2), Ellipsoid((0.2, 0.2, -0.1), (0.25,) * 3, 2.4)
+    geometry, grid = ConeGeometry(5.0, 7.0, (48, 48), (4.0 / 48,) * 2), Grid.cube(24, 2.0)
+    plan = Protocol(views=40, exposure_deg=7.2, readout_ratio=0.2)
+    scene = phantom_scene(rt, EllipsoidPhantom(balls, "balls"), geometry, grid, 24, "rows", 0)
+    scan = simulate_frames(scene.source, geometry, scene.grid, SimulationOptions(plan, noise="beer", dose=1e5))
+    planted = np.zeros((40, 3))
+    planted[:, 0] = np.radians(np.sin(4 * np.pi * np.arange(40) / 40))
+    found = find_wobble(rt, moved(scan, Change(), views_of(planted)), [(24, 40, 15), (48, 40, 12)], Change())
+    turn = found.table[0]
+    assert turn.verdict == AGREES and found.views is None, found.table
 
 
 def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:

@@ -239,13 +239,16 @@ def test_steps_keep_their_order_and_are_told(rt, planted) -> None:
     assert input_options(facts) == InputOptions(steps="rings", rings=replace(InputOptions().rings, window=5))
 
 
-def test_what_is_no_step_or_no_option_of_one(planted) -> None:
+def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
+    empty = replace(planted(), projections=0 * planted().projections)
     full = replace(planted(), projections=planted().projections + 1)
     cases = (
         (lambda: InputOptions(steps="spark"), "did you mean 'sparks'"),
         (lambda: input_options({"rings": {"window": 5}}), "rings among the steps"),
         (lambda: input_options({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
         (lambda: input_options({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
+        (lambda: prepared(planted(), input_options({"steps": "rings", "rings": {"window": 99}}), rt), "rings.window"),
+        (lambda: prepared(empty, input_options({"steps": "hardening", "hardening": {"kvp": 80}}), rt), "nothing"),
         (lambda: input_options({"steps": "hardening", "hardening": {"bone_per_mm": 0.1}}), "without hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"anode_deg": 12}}), "without hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
