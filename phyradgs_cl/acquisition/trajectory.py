@@ -216,6 +216,9 @@ def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.n
     return resting_poses(poses, middle_s, 0.0)
 
 
+_AS_TABLE = "give it as a PoseTable"
+
+
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
     """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) +
     ``span_s``; InputError where a fine table does not, as where frames overlap in time and are elsewhere."""
@@ -234,7 +237,9 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             return made
         if apart > _MOST_SAMPLES:
             found = f"poses that {apart} samples per frame miss by {worst_mm:.3g} mm"
-            raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", "give it as a PoseTable")
+            overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
+            remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
+            raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
         apart = 2 * apart - 1
 
 

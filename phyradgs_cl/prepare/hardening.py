@@ -91,8 +91,18 @@ def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeMod
         return _by_voltage(scan, options, make_model)
     frames, fitted = unmasked_frames(scan), not any(options.polynomial)
     polynomial = fit_polynomial(frames, make_model(scan)) if fitted else options.polynomial
+    _check_rising(polynomial, float(frames.max()))
     facts = {"polynomial": list(polynomial), "fitted": fitted}
     return replace(scan, projections=straighten(frames, polynomial)), facts
+
+
+def _check_rising(polynomial: Polynomial, largest: float) -> None:
+    """InputError for a polynomial by which more attenuation is less, somewhere up to the ``largest`` line integral."""
+    p = np.linspace(0, max(largest, 1e-6), 100)
+    falls = np.diff(straighten(p, polynomial)) <= 0
+    if falls.any():
+        found = f"{list(polynomial)}, which falls from line integrals of {p[np.argmax(falls)]:.3g} on"
+        raise InputError("hardening.polynomial", found, f"one that rises up to the largest, {largest:.3g}")
 
 
 def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

@@ -11,6 +11,8 @@ from phyradgs_cl.api import (
     move_views,
     pose_gradient,
     ray_operator,
+    save_scan,
+    simulate,
     splat_operator,
     voxelise,
 )
@@ -94,3 +96,12 @@ def test_what_does_not_fit_is_named(rt, scan, cloud) -> None:
     ):
         with pytest.raises(InputError, match=culprit):
             call()
+
+
+def test_a_file_with_one_pose_at_a_time_says_so(rt, tmp_path) -> None:
+    scan = simulate("jaw", size=8, detector=12, views=6, exposure_deg=60.0, device=rt)
+    assert scan.shutter.span_s > np.diff(scan.frame_start_s).min()
+    views = np.random.default_rng(3).normal(size=(scan.frames, 3))
+    with pytest.raises(InputError, match="do not overlap in time"):
+        save_scan(tmp_path / "scan.h5", move_views(scan, views))
+    assert not list(tmp_path.iterdir())

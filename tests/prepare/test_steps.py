@@ -240,7 +240,7 @@ def test_steps_keep_their_order_and_are_told(rt, planted) -> None:
 
 
 def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
-    empty = replace(planted(), projections=0 * planted().projections)
+    empty, falling = replace(planted(), projections=0 * planted().projections), {"polynomial": [-5, 0, 0]}
     full = replace(planted(), projections=planted().projections + 1)
     cases = (
         (lambda: InputOptions(steps="spark"), "did you mean 'sparks'"),
@@ -249,6 +249,7 @@ def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
         (lambda: input_options({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
         (lambda: prepared(planted(), input_options({"steps": "rings", "rings": {"window": 99}}), rt), "rings.window"),
         (lambda: prepared(empty, input_options({"steps": "hardening", "hardening": {"kvp": 80}}), rt), "nothing"),
+        (lambda: prepared(planted(), input_options({"steps": "hardening", "hardening": falling}), rt), "falls"),
         (lambda: input_options({"steps": "hardening", "hardening": {"bone_per_mm": 0.1}}), "without hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"anode_deg": 12}}), "without hardening.kvp"),
         (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
