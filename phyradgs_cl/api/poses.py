@@ -7,9 +7,8 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.api.devices import Device
 from phyradgs_cl.api.projectors import ray_operator, splat_operator
 from phyradgs_cl.api.runs import check_scan
+from phyradgs_cl.calibrate import wobble
 from phyradgs_cl.calibrate.moved import Change, moved
-from phyradgs_cl.calibrate.wobble import units_of, views_of
-from phyradgs_cl.calibrate.wobble import without_gauges as _without_gauges
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
@@ -31,7 +30,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     check_scan(scan)
     checks.numbers("views", views, (scan.frames, 3))
     numbers = np.asarray(views, np.float64)
-    return moved(scan, Change(), views_of(_without_gauges(scan, numbers) if without_gauges else numbers))
+    return moved(scan, Change(), wobble.views_of(wobble.without_gauges(scan, numbers) if without_gauges else numbers))
 
 
 @naming_arguments()
@@ -61,7 +60,7 @@ def pose_gradient(
     if np.shape(x)[:1] == (ROWS,) and np.ndim(x) == 2:
         raise InputError("x", f"shape {np.shape(x)}", "Gaussians or a volume", "of rows (11, G): Gaussians.from_rows(rows)")
     checks.numbers("x", x, scan.grid.shape)
-    found, units = np.zeros((scan.frames, 3)), units_of(scan) * _STEP_PX
+    found, units = np.zeros((scan.frames, 3)), wobble.units_of(scan) * _STEP_PX
     for kind, unit in enumerate(units):
         for sign in (1, -1):
             step = np.zeros((scan.frames, 3))

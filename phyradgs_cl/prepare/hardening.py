@@ -112,8 +112,6 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
     bone_in = partial(_from, options.bone_per_mm)
     if not options.bone_per_mm:
         model, blur = coarse_model(scan, make_model)
-        if densest(model.volume(smooth(frames, blur))) <= 0:
-            raise _nothing()
         mixed, facts["unexplained"] = find_bone(smooth(frames, blur), spectrum, water, model)
         if mixed is None:
             log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
@@ -146,13 +144,16 @@ def find_bone(
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
     """The shares of the densest up to which all is soft and from which all is bone, with which line integrals (F, v, u)
     explain themselves best: infinity without bone, None where they do best as they are; and what either, and the best with
-    bone, leaves unexplained of them."""
+    bone, leaves unexplained of them. InputError where there is no object."""
 
     def left_by(clean: np.ndarray) -> float:
         return unexplained(clean, model.volume(clean), inside, model)
 
     clean = straighten(frames, water)
-    inside = object_in(model.volume(clean))
+    first = model.volume(clean)
+    if densest(first) <= 0:
+        raise _nothing()
+    inside = object_in(first)
     none, alone = left_by(frames), left_by(clean)
     volume = model.regularised(clean)
     bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
