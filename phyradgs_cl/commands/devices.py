@@ -33,6 +33,6 @@ def devices_command(
             f"of {d.vector_width}, {d.memory_bytes / 2**30:.1f} GiB, at most {d.largest_allocation_bytes / 2**30:.1f} GiB "
             f"at once, float64 {'yes' if d.has_fp64 else 'no'}{never}"
         )
-        say(f"     {d.version}")
+        say(f"     {d.version}" + (f", kernels built for {d.target}" if d.target else ""))
     say(f"takes {chosen.index}: {reason}")
     return 0

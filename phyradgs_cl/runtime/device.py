@@ -9,7 +9,7 @@ from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
-_repaired: dict[int, str | None] = {}
+_targets: dict[int, str | None] = {}
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class DeviceInfo:
     has_fp64: bool
     by_default: bool
     handle: "cl.Device"
+    target: str | None = None  # the processor that PoCL builds kernels for
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
@@ -118,8 +119,8 @@ def _describe(index: int, platform: "cl.Platform", device: "cl.Device") -> Devic
     kind = _kind(device)
     if is_pocl:
         pocl.tell_of_cache()
-    if is_pocl and kind == "cpu" and device.int_ptr not in _repaired:
-        _repaired[device.int_ptr] = pocl.repair_unknown_target(device.int_ptr)
+    if is_pocl and kind == "cpu" and device.int_ptr not in _targets:
+        _targets[device.int_ptr] = pocl.use_library_target(device.int_ptr, platform.version)
     text = f"{platform.name} {platform.vendor} {device.name}".lower()
     usable = bool(device.available and device.compiler_available)
     return DeviceInfo(
@@ -135,6 +136,7 @@ def _describe(index: int, platform: "cl.Platform", device: "cl.Device") -> Devic
         has_fp64=device.native_vector_width_double > 0 or "cl_khr_fp64" in device.extensions,
         by_default=usable and not any(word in text for word in _NEVER_BY_DEFAULT),
         handle=device,
+        target=_targets.get(device.int_ptr),
     )
 
 

@@ -1,12 +1,11 @@
-"""Keeps PoCL's wheel usable on processors that are newer than the LLVM inside it.
+"""Builds PoCL's kernels for the processor that PoCL's own library was compiled for.
 
-PoCL 3.0 asks LLVM 14 for the host's name. For a processor that LLVM does not know the answer is
-"generic", which LLVM's own front end then refuses ("unknown target CPU 'generic'"), so that no kernel
-builds (pocl/pocl issue 1049). Others it takes for their elder: AMD's Zen 4 is "znver3" to it, which has no
-AVX-512, while PoCL looks at the instruction sets and links its library for AVX-512: LLVM then aborts the
-whole process ("Cannot select: i64 = fma"). PoCL has no setting for either. What it does have is a device
-record that holds a pointer to that name; here the pointer is turned to the name of an older processor with
-the same instruction sets. The record is only read until exactly one of the wrong names has been found in it.
+PoCL links every kernel with a library of built-in functions (fma, min, vload16, ...), of which its wheel has one per
+family of x86 processors. LLVM inlines a function only where the caller has every instruction set of the callee. PoCL 3.0
+builds kernels for the name that LLVM 14 gives the host, which differs from the library's: an Ice Lake lacks CLWB in
+LLVM's list, so that every built-in stays a call, 3 times as slow. An unknown processor is "generic", which builds nothing
+(pocl/pocl issue 1049), and a Zen 4 is taken for a Zen 3 without AVX-512, on which LLVM aborts ("Cannot select: i64 = fma").
+PoCL has no setting for the name, but its device record points to it. The pointer is turned to the library's name here.
 """
 
 import contextlib
@@ -14,6 +13,7 @@ import ctypes
 import logging
 import os
 import platform
+import re
 import stat
 import struct
 import tempfile
@@ -28,13 +28,24 @@ from phyradgs_cl.runtime.host_cpu import cpu_facts
 log = logging.getLogger(__name__)
 
 _RECORD_BYTES = 2048
-_UNKNOWN = frozenset({b"generic"})
-# LLVM 14's names for processors of which there are some with AVX-512, though the name says that there is none
-_WITHOUT_AVX512 = frozenset({b"znver3", b"alderlake"})
-_LONGEST_NAME = max(map(len, _UNKNOWN | _WITHOUT_AVX512))
+_LONGEST_TEXT = 64
+_TRIPLE = re.compile(rb"x86_64-[a-z0-9_]+-linux-gnu\Z")
+_PROCESSOR = re.compile(rb"[a-z0-9][a-z0-9.-]*\Z")
 _USER_SPACE = 1 << 47
 CACHE_VARIABLE = "POCL_CACHE_DIR"
 AVX512_TARGET = "skylake-avx512"
+_AVX = {"avx", "cx16", "popcnt"}
+_LIBRARIES = (
+    ({"avx512f", "avx512dq", "avx512bw", "avx512vl", "avx512cd"}, AVX512_TARGET),
+    ({*_AVX, "avx2", "f16c", "fma", "bmi1", "bmi2", "abm", "movbe"}, "haswell"),
+    ({*_AVX, "fma4", "xop"}, "bdver1"),
+    ({*_AVX, "f16c"}, "ivybridge"),
+    (_AVX, "sandybridge"),
+    ({"sse4_1", "cx16"}, "penryn"),
+    ({"ssse3", "cx16"}, "core2"),
+)
+"""Flags of /proc/cpuinfo by which PoCL chooses a library, and the processor that this library was compiled for."""
+_OLDEST_TARGET = "athlon64"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
@@ -102,7 +113,7 @@ def tell_of_cache() -> None:
 
 
 def _own_cache() -> Path:
-    return _caches() / "phyradgs-cl" / f"pocl-{equivalent_target() or platform.machine()}"
+    return _caches() / "phyradgs-cl" / f"pocl-{library_target() or platform.machine()}"
 
 
 def _caches() -> Path:
@@ -132,39 +143,37 @@ def _temporary_cache() -> Path:
     return Path(tempfile.mkdtemp(prefix="phyradgs-cl-"))
 
 
-def equivalent_target() -> str | None:
-    """An LLVM 14 processor name with this machine's vector instructions, or None where there is none."""
+def library_target() -> str | None:
+    """LLVM's name of the processor that PoCL's library for this machine was compiled for; None where there is none."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return None
     flags = _cpu_flags()
-    if {"avx512f", "avx512dq", "avx512bw", "avx512vl", "avx512cd"} <= flags:
-        return AVX512_TARGET
-    if {"avx2", "fma", "bmi1", "bmi2"} <= flags:
-        return "haswell"
-    if "avx" in flags:
-        return "sandybridge"
-    return "x86-64"
+    return next((target for needed, target in _LIBRARIES if needed <= flags), _OLDEST_TARGET)
 
 
-def repair_unknown_target(device_address: int) -> str | None:
-    """Names the equivalent processor in the record of a PoCL CPU device, if LLVM does not know the real one.
+def use_library_target(device_address: int, version: str) -> str | None:
+    """Names the library's processor in the record of a PoCL CPU device; returns the processor that kernels are built for.
 
-    Returns the name that was set, or None when nothing had to be done (or nothing could be).
+    The record holds the target triple and, next to it, the processor's name. Nothing is changed, and None returned, where
+    the two are not found. version: the platform's; from 3.1 on PoCL names the library's processor itself.
     """
-    target = equivalent_target()
+    target = library_target()
     if target is None or platform.system() != "Linux":
         return None
-    wrong = _UNKNOWN | _WITHOUT_AVX512 if target == AVX512_TARGET else _UNKNOWN
     with _own_memory() as read:
         record = read(device_address, _RECORD_BYTES)
-        for offset in range(0, len(record) - 7, 8):
-            (pointer,) = struct.unpack_from("<Q", record, offset)
-            if 4096 < pointer < _USER_SPACE and _text(read(pointer, _LONGEST_NAME + 1)) in wrong:
-                name = ctypes.create_string_buffer(target.encode())
-                _kept_alive.append(name)
-                ctypes.c_uint64.from_address(device_address + offset).value = ctypes.addressof(name)
-                log.info("PoCL does not know this processor; its kernels are built for %s", target)
-                return target
+        words = struct.unpack(f"<{len(record) // 8}Q", record[: len(record) // 8 * 8])
+        texts = [_text(read(word, _LONGEST_TEXT)) if 4096 < word < _USER_SPACE else None for word in words]
+    for place, (triple, name) in enumerate(zip(texts, texts[1:], strict=False), start=1):
+        if triple and name and _TRIPLE.match(triple) and _PROCESSOR.match(name):
+            if "PoCL 3.0" not in version:
+                return name.decode()
+            if name != target.encode():
+                text = ctypes.create_string_buffer(target.encode())
+                _kept_alive.append(text)
+                ctypes.c_uint64.from_address(device_address + 8 * place).value = ctypes.addressof(text)
+                log.info("PoCL builds kernels for %s, as its library, in place of %s", target, name.decode())
+            return target
     return None
 
 
