@@ -16,6 +16,7 @@ __kernel void rays_forward(
     __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last */
     __global const int *line_cells,   /* (F, lines, 2): first cell and cell after the last that may serve a line */
     __global const int *frame_list,   /* which frames */
+    __global const float *weights, __global const int *weight_at, /* of each cell's lines, and where they begin */
     const int4 shape, const int4 origin, /* voxels of the volume, and the first of them in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
@@ -63,14 +64,15 @@ __kernel void rays_forward(
             }
         }
         p *= r.step_mm;
+        const float weight = weights[weight_at[c] + v - cell_lines[2 * c]];
         if (AVERAGE == AVERAGE_LOG) {
-            total += cell[RAY_WEIGHT] * p;
+            total += weight * p;
             continue;
         }
         if (!any)
             sum = intensity_from(p);
         any = 1;
-        intensity_add(&sum, cell[RAY_WEIGHT], p);
+        intensity_add(&sum, (vf)(weight), p);
     }
     if (AVERAGE != AVERAGE_LOG && any)
         total = AVERAGE == AVERAGE_GAP ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
@@ -88,15 +90,15 @@ __kernel void rays_forward(
 #define TILE_Y (BRICK_Y + 2)
 #define TILE_Z (BRICK_Z + 2)
 
-/* rays u_lo..u_hi of one line and cell onto the tile; row: the line's values */
-RAY_INLINE void line_onto(__global const float *cell, __global const float *row, const float4 pitch_mm,
+/* rays u_lo..u_hi of one line and cell onto the tile; row: the line's values; weight: of the line in the cell */
+RAY_INLINE void line_onto(__global const float *cell, __global const float *row, const float weight, const float4 pitch_mm,
                           const int u_lo, const int u_hi, const int v, const int4 corner, const int4 size,
                           __local float *tile)
 {
     for (int u = u_lo; u <= u_hi; u += LANES) {
         const vi real = VI_IOTA + u <= u_hi;
         const rays_t r = rays_through(cell, pitch_mm, (float)u + V_IOTA, (float)v);
-        const vf value = V_LOAD(row + u) * (cell[RAY_WEIGHT] * r.step_mm);
+        const vf value = V_LOAD(row + u) * (weight * r.step_mm);
         if (!V_ANY(value != 0.0f)) /* masked pixels, air */
             continue;
         for (int axis = 0; axis < 3; ++axis) {
@@ -133,7 +135,8 @@ __kernel void rays_adjoint(
     __global const float *matrices,   /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
     const int matrix_stride,
     __global const int *frame_cells,  /* (F + 1,): where a frame's cells begin */
-    __global const int *frame_list, const int frame_first, const int frame_stop,
+    __global const int *frame_list, __global const float *weights, __global const int *weight_at,
+    const int frame_first, const int frame_stop,
     const int4 shape, const int4 origin, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
@@ -166,8 +169,9 @@ __kernel void rays_adjoint(
                 if (!LANE(int, seen, lane))
                     continue;
                 __global const float *cell = cells + (size_t)(c + lane) * RAY_CELL;
+                __global const float *own = weights + weight_at[c + lane] - cell_lines[2 * (c + lane)];
                 for (int v = LANE(int, w.v_lo, lane); v <= LANE(int, w.v_hi, lane); ++v)
-                    line_onto(cell, frame + (size_t)v * image_pitch, pitch_mm, LANE(int, w.u_lo, lane),
+                    line_onto(cell, frame + (size_t)v * image_pitch, own[v], pitch_mm, LANE(int, w.u_lo, lane),
                               LANE(int, w.u_hi, lane), v, corner, size, tile);
             }
         }
@@ -203,7 +207,8 @@ static inline float ray_weight(const rays_t r, __global const float *cell, const
 __kernel void rays_adjoint(
     __global const float *image, __global const float *cells, __global const int *cell_lines,
     __global const float *matrices, const int matrix_stride,
-    __global const int *frame_cells, __global const int *frame_list, const int frame_first, const int frame_stop,
+    __global const int *frame_cells, __global const int *frame_list,
+    __global const float *weights, __global const int *weight_at, const int frame_first, const int frame_stop,
     const int4 shape, const int4 origin, const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,
@@ -243,12 +248,14 @@ __kernel void rays_adjoint(
             if (!window_of(matrices, matrix_stride, cell_lines, width, c, stop, convert_float4(voxel), (float4)(1.0f), &w))
                 continue;
             __global const float *cell = cells + (size_t)c * RAY_CELL;
-            float from_cell = 0.0f;
-            for (int v = w.v_lo; v <= w.v_hi; ++v)
+            __global const float *own = weights + weight_at[c] - cell_lines[2 * c];
+            for (int v = w.v_lo; v <= w.v_hi; ++v) {
+                float from_line = 0.0f;
                 for (int u = w.u_lo; u <= w.u_hi; ++u)
-                    from_cell += frame[(size_t)v * image_pitch + u]
+                    from_line += frame[(size_t)v * image_pitch + u]
                                  * ray_weight(rays_through(cell, pitch_mm, (float)u, (float)v), cell, voxel);
-            sum += cell[RAY_WEIGHT] * from_cell;
+                sum += own[v] * from_line;
+            }
         }
     }
     if (inside)

@@ -1,8 +1,10 @@
-/* The projector of rays.cl where detector columns are parallel to the volume's z and a pose serves many lines: all rays of
-   a detector column then lie in one upright plane. They cut a slice x = const (or y) at one y (or x), so that two columns
-   of voxels are blended once for all of them, and a sample reads two numbers instead of four. Volumes are turned, with z
-   along a row. Samples and weights are those of rays.cl. Twin: operators/twins/rays.py. */
-#include "common/ray.h"
+/* The projector of rays.cl where detector columns are nearly parallel to the volume's z: the rays of a column then share
+   most of their work. Volumes are turned, with z along a row, so that the samples of neighbouring lines lie side by side.
+   Samples and weights are those of rays.cl. A work-item takes a detector column of one pose.
+   LEAN 0: columns are parallel to z. Their rays cut a plane x = const (or y) at one y (or x): two columns of voxels are
+   blended once for all of them. LEAN 1: where they cut it changes a little from line to line.
+   Twin: operators/twins/rays.py. */
+#include "common/ray_column.h"
 
 #define TURN 16 /* voxels along x and z that are turned at a time */
 
@@ -30,130 +32,200 @@ __kernel void turn_upright(
 
 /* The planes of a detector column's rays along their main axis a, and where they cut them: b = s_b + g_b (i - s_a). */
 typedef struct {
-    float da, inv, sa, sb, gb;
-    int na, nb, a_first, b_first, first, last;
+    float sa, sb, sc;
+    int na, nb, a_first, b_first, b_last, c_first, c_last;
     size_t stride_a, stride_b; /* of a step along a and b among the turned columns */
-} upright_t;
+} planes_t;
 
-RAY_INLINE upright_t upright_planes(__global const float *cell, const float dx, const float dy,
-                                    const int4 shape, const int4 origin, const int column_pitch)
+RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, const int4 shape, const int4 origin,
+                              const int column_pitch)
 {
-    upright_t r;
-    const int along_x = fabs(dx) >= fabs(dy);
+    planes_t r;
     const size_t row = (size_t)column_pitch * (shape.x + 2 * BORDER);
-    r.da = along_x ? dx : dy;
     r.sa = cell[RAY_SOURCE + !along_x];
     r.sb = cell[RAY_SOURCE + along_x];
-    r.inv = 1.0f / r.da;
-    r.gb = (along_x ? dy : dx) * r.inv;
+    r.sc = cell[RAY_SOURCE + 2];
     r.na = along_x ? shape.x : shape.y;
     r.nb = along_x ? shape.y : shape.x;
     r.a_first = along_x ? origin.x : origin.y;
     r.b_first = along_x ? origin.y : origin.x;
+    r.b_last = r.b_first + r.nb - 1;
+    r.c_first = origin.z;
+    r.c_last = origin.z + shape.z - 1;
     r.stride_a = along_x ? (size_t)column_pitch : row;
     r.stride_b = along_x ? row : (size_t)column_pitch;
-    /* between source and detector, then where b touches the box */
-    float lo = fmax((float)r.a_first, fmin(r.sa, r.sa + r.da));
-    float hi = fmin((float)(r.a_first + r.na - 1), fmax(r.sa, r.sa + r.da));
-    if (fabs(r.gb) > 1e-9f) {
-        const float per = 1.0f / r.gb;
-        const float p = r.sa + ((float)(r.b_first - 1) - r.sb) * per;
-        const float q = r.sa + ((float)(r.b_first + r.nb) - r.sb) * per;
-        lo = fmax(lo, fmin(p, q) - CLIP_MARGIN);
-        hi = fmin(hi, fmax(p, q) + CLIP_MARGIN);
-    }
-    r.first = (int)ceil(fmin(lo, (float)(r.a_first + r.na)));
-    r.last = (int)floor(fmax(hi, (float)(r.a_first - 1)));
     return r;
 }
 
-/* Log average. A work-item takes UPRIGHT_LINES lines of one detector column; the host sees to it that they meet at most
-   UPRIGHT_VOXELS voxels of a column. The whole volume at once. */
-__kernel void rays_upright(
-    __global const float *columns,
-    __global const float *cells,      /* (C, RAY_CELL), frame after frame */
-    __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last */
-    __global const int *line_cells,   /* (F, lines, 2): first cell and cell after the last that may serve a line */
-    __global const int *frame_list,
-    const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,
-    const int lines, const int width, const int image_pitch,
-    const int block,                  /* lines per work-item, <= UPRIGHT_LINES */
-    __global float *image)            /* guard, then (listed frames, lines, pitch) */
+/* The voxel at or below a position on the clamped axis of a box from `first` to `last`. */
+RAY_INLINE int voxel_below(const float at, const int last) { return min((int)(at + 1.0f) - 1, last); }
+
+/* Whether LANES lines, from g[0] to g[LANES - 1] apart along c, meet voxels that two vectors hold. */
+#ifdef V_LOOKUP
+#define FIT_TWO_VECTORS(g, ahead) (fabs(((g)[LANES - 1] - (g)[0]) * (ahead)) < (float)(2 * LANES - 3))
+#endif
+
+/* Samples of LANES lines at z and z + 1, share wc, in a column of voxels of which two vectors are at hand. */
+#define BETWEEN(low, high, place, wc) \
+    fma((wc), V_LOOKUP(low, high, (place) + 1) - V_LOOKUP(low, high, place), V_LOOKUP(low, high, place))
+
+#if LEAN
+/* Adds to p what `count` lines meet on plane i; plane: its voxel b = c = 0 (counted in the grid). */
+RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, const int i, const float *gb, const float *gc,
+                             const int count, float *p, float *blended)
 {
-    const int u = (int)get_global_id(0), n = (int)get_global_id(2);
-    const int v_first = (int)get_global_id(1) * block, v_stop = min(v_first + block, lines);
-    if (u >= width || v_first >= lines)
+    const float ahead = (float)i - r.sa, lowest = (float)(r.b_first - 1), highest = (float)(r.b_last + 1);
+    const int last = (count + LANES - 1) / LANES * LANES - 1; /* of the last vector, beyond the last line */
+    const float b0 = fma(gb[0], ahead, r.sb), b1 = fma(gb[last], ahead, r.sb);
+    if (fmax(b0, b1) <= lowest || fmin(b0, b1) >= highest)
         return;
-    /* of lines, with room for a vector that begins at any; of voxels, with room for a vector and the next voxel */
-    float total[UPRIGHT_LINES + LANES], p[UPRIGHT_LINES + LANES], g[UPRIGHT_LINES + LANES];
-    float blended[UPRIGHT_VOXELS + 2 * LANES];
-    for (int k = 0; k < UPRIGHT_LINES + LANES; ++k)
-        total[k] = 0.0f;
-    __global const int *served = line_cells + 2 * ((size_t)frame_list[n] * lines);
-    for (int c = served[2 * v_first]; c < served[2 * v_stop - 1]; ++c) {
-        const int start = max(v_first, cell_lines[2 * c]), count = min(v_stop, cell_lines[2 * c + 1]) - start;
-        if (count <= 0)
-            continue;
-        __global const float *cell = cells + (size_t)c * RAY_CELL;
-        const float dx = fma((float)u, cell[RAY_EU], cell[RAY_D00]), dy = fma((float)u, cell[RAY_EU + 1], cell[RAY_D00 + 1]);
-        const upright_t r = upright_planes(cell, dx, dy, shape, origin, column_pitch);
-        const float sc = cell[RAY_SOURCE + 2];
+#ifdef V_LOOKUP
+    const int is_dense = FIT_TWO_VECTORS(gc, ahead) && FIT_TWO_VECTORS(gc + last + 1 - LANES, ahead);
+    const int top = max(r.c_last + 2 - 2 * LANES, r.c_first - 1);
+    const int j = voxel_below(fmin(b0, b1), r.b_last);
+    if (is_dense && fmin(b0, b1) >= lowest && fmax(b0, b1) < fmin((float)(j + 1), highest)) {
+        /* all lines between the same two columns of voxels */
+        __global const float *near = plane + j * (long)r.stride_b, *far = near + r.stride_b;
+        const float sb = r.sb - (float)j;
         for (int k = 0; k < count; k += LANES) {
-            const vf v = (float)(start + k) + V_IOTA;
-            V_STORE(fma(v, (vf)(cell[RAY_EV + 2]), (vf)(cell[RAY_D00 + 2])) * r.inv, g + k);
+            vf wc;
+            const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc);
+            const int base = min(min(V_FIRST(z), V_LAST(z)), top);
+            const vi own = z - base;
+            const vf first = BETWEEN(V_LOAD(near + base), V_LOAD(near + base + LANES), own, wc);
+            const vf second = BETWEEN(V_LOAD(far + base), V_LOAD(far + base + LANES), own, wc);
+            const vf wb = fma(V_LOAD(gb + k), (vf)(ahead), (vf)(sb));
+            V_STORE(V_LOAD(p + k) + fma(wb, second - first, first), p + k);
+        }
+        return;
+    }
+#endif
+    for (int k = 0; k < count; k += LANES) {
+        const float from = clamp(fma(gb[k], ahead, r.sb), lowest, highest);
+        const float to = clamp(fma(gb[k + LANES - 1], ahead, r.sb), lowest, highest);
+        const int j0 = voxel_below(fmin(from, to), r.b_last), j1 = voxel_below(fmax(from, to), r.b_last);
+        const vf b = min(max(fma(V_LOAD(gb + k), (vf)(ahead), (vf)(r.sb)), lowest), highest);
+        vf wc, sum = V_LOAD(p + k);
+        const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc);
+#ifdef V_LOOKUP
+        if (is_dense) {
+            const int base = min(min(V_FIRST(z), V_LAST(z)), top);
+            const vi own = z - base;
+            __global const float *near = plane + j0 * (long)r.stride_b + base, *far = near + r.stride_b;
+            vf first = BETWEEN(V_LOAD(near), V_LOAD(near + LANES), own, wc);
+            vf second = BETWEEN(V_LOAD(far), V_LOAD(far + LANES), own, wc);
+            if (j0 == j1)
+                sum += fma(b - (float)j0, second - first, first);
+            else { /* lines pass from one column of voxels to the next */
+                sum += max(1.0f - fabs(b - (float)j0), 0.0f) * first + max(1.0f - fabs(b - (float)(j0 + 1)), 0.0f) * second;
+                for (int j = j0 + 2; j <= j1 + 1; ++j) {
+                    far += r.stride_b;
+                    second = BETWEEN(V_LOAD(far), V_LOAD(far + LANES), own, wc);
+                    sum += max(1.0f - fabs(b - (float)j), 0.0f) * second;
+                }
+            }
+            V_STORE(sum, p + k);
+            continue;
+        }
+#endif
+        for (int j = j0; j <= j1 + 1; ++j) {
+            __global const float *column = plane + j * (long)r.stride_b;
+            const vf a = GATHER(column, z), above = GATHER(column + 1, z);
+            sum += max(1.0f - fabs(b - (float)j), 0.0f) * fma(wc, above - a, a);
+        }
+        V_STORE(sum, p + k);
+    }
+}
+#else
+/* Adds to p what `count` lines meet on plane i; plane: its voxel b = c = 0 (counted in the grid); gb: of all lines. */
+RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, const int i, const float *gb, const float *gc,
+                             const int count, float *p, float *blended)
+{
+    const float ahead = (float)i - r.sa, at = fma(gb[0], ahead, r.sb);
+    if (at <= (float)(r.b_first - 1) || at >= (float)(r.b_last + 1))
+        return;
+    const int j = voxel_below(at, r.b_last);
+    const float wb = at - (float)j;
+    __global const float *near = plane + j * (long)r.stride_b, *far = near + r.stride_b;
+#ifdef V_LOOKUP
+    if (FIT_TWO_VECTORS(gc, ahead)) {
+        const int top = max(r.c_last + 2 - 2 * LANES, r.c_first - 1);
+        for (int k = 0; k < count; k += LANES) {
+            vf wc;
+            const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc);
+            const int base = min(min(V_FIRST(z), V_LAST(z)), top);
+            const vf low = V_LOAD(near + base), high = V_LOAD(near + base + LANES);
+            const vf lower = fma((vf)(wb), V_LOAD(far + base) - low, low);
+            const vf upper = fma((vf)(wb), V_LOAD(far + base + LANES) - high, high);
+            V_STORE(V_LOAD(p + k) + BETWEEN(lower, upper, z - base, wc), p + k);
+        }
+        return;
+    }
+#endif
+    /* voxels that the lines' samples need: from the one below the lowest to the one above the highest */
+    const float z0 = fma(gc[0], ahead, r.sc), z1 = fma(gc[count - 1], ahead, r.sc);
+    const int base = voxel_below(clamp(fmin(z0, z1), (float)(r.c_first - 1), (float)(r.c_last + 1)), r.c_last);
+    const int stop = voxel_below(clamp(fmax(z0, z1), (float)(r.c_first - 1), (float)(r.c_last + 1)), r.c_last) + 2;
+    for (int k = 0; k < stop - base; k += LANES) {
+        const vf a = V_LOAD(near + base + k);
+        V_STORE(fma((vf)(wb), V_LOAD(far + base + k) - a, a), blended + k);
+    }
+    for (int k = 0; k < count; k += LANES) {
+        vf wc;
+        /* the last vector's lanes beyond the last line may point outside of what was blended */
+        const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc) - base;
+        const vi own = min(max(z, 0), stop - base - 2);
+        const vf a = GATHER(blended, own), b = GATHER(blended + 1, own);
+        V_STORE(V_LOAD(p + k) + fma(wc, b - a, a), p + k);
+    }
+}
+#endif
+
+__kernel void rays_upright(
+    __global const float *columns,    /* the turned volume, whole */
+    __global const float *cells,      /* (C, RAY_CELL) */
+    __global const int *slots,        /* (S, SLOT): which poses, and for which part of the panel */
+    const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,
+    const int block,                  /* lines per work-item, <= UPRIGHT_LINES */
+    const long4 to,                   /* where line integrals go: start + u s0 + v s1 + slot s2, of a slot's own u and v */
+    __global float *image)
+{
+    __global const int *slot = slots + SLOT * (size_t)get_global_id(2);
+    const int u = slot[SLOT_U] + (int)get_global_id(0), start = slot[SLOT_V] + (int)get_global_id(1) * block;
+    const int count = min(block, slot[SLOT_V_STOP] - start);
+    if (u >= slot[SLOT_U_STOP] || count <= 0)
+        return;
+    __global const float *cell = cells + (size_t)slot[SLOT_CELL] * RAY_CELL;
+    /* of lines, with room for a vector that begins at any; of voxels, with room for a vector and the next voxel */
+    float total[UPRIGHT_LINES + LANES], p[UPRIGHT_LINES + LANES], gc[UPRIGHT_LINES + LANES], gb[UPRIGHT_LINES + LANES];
+    float blended[UPRIGHT_VOXELS + 2 * LANES];
+    const int first_along_x = is_along_x(cell, u, start), last_along_x = is_along_x(cell, u, start + count - 1);
+    for (int turn = 0; turn < 1 + (first_along_x != last_along_x); ++turn) { /* lines that lean may have both main axes */
+        const int along_x = turn ? last_along_x : first_along_x;
+        const planes_t r = planes_of(cell, along_x, shape, origin, column_pitch);
+        for (int k = 0; k < count; k += LANES) {
+            const column_rays_t d = column_rays(cell, u, start + k);
+            const vf inv = 1.0f / (along_x ? d.x : d.y);
+            V_STORE((along_x ? d.y : d.x) * inv, gb + k);
+            V_STORE(d.z * inv, gc + k);
             V_STORE((vf)(0.0f), p + k);
         }
-        const int c_first = origin.z, c_last = origin.z + shape.z - 1;
-        for (int i = r.first; i <= r.last; ++i) {
-            const float ahead = (float)i - r.sa;
-            const float at = clamp(fma(r.gb, ahead, r.sb), (float)(r.b_first - 1), (float)(r.b_first + r.nb));
-            const int j = min((int)(at + 1.0f) - 1, r.b_first + r.nb - 1);
-            const float wb = at - (float)j;
-            const size_t column = IMAGE_GUARD + (j - r.b_first + BORDER) * r.stride_b + (i - r.a_first + BORDER) * r.stride_a;
-#ifdef V_LOOKUP
-            if (fabs(cell[RAY_EV + 2] * r.inv * ahead) * (LANES - 1) < (float)(2 * LANES - 3)) {
-                /* LANES lines meet voxels that two vectors hold */
-                for (int k = 0; k < count; k += LANES) {
-                    vf wc;
-                    const vi z = sample_at(V_LOAD(g + k), sc, ahead, c_first, c_last, &wc) - c_first;
-                    const int base = min(min(V_FIRST(z), V_LAST(z)), max(shape.z + 1 - 2 * LANES, -1));
-                    __global const float *near = columns + column + base, *far = near + r.stride_b;
-                    const vf low = V_LOAD(near), high = V_LOAD(near + LANES);
-                    const vf lower = fma((vf)(wb), V_LOAD(far) - low, low);
-                    const vf upper = fma((vf)(wb), V_LOAD(far + LANES) - high, high);
-                    const vf a = V_LOOKUP(lower, upper, z - base), b = V_LOOKUP(lower, upper, z - base + 1);
-                    V_STORE(V_LOAD(p + k) + fma(wc, b - a, a), p + k);
-                }
-                continue;
-            }
-#endif
-            /* voxels that the lines' samples need: from the one below the lowest to the one above the highest */
-            const float z0 = fma(g[0], ahead, sc), z1 = fma(g[count - 1], ahead, sc);
-            const float lowest = clamp(fmin(z0, z1), (float)(c_first - 1), (float)(c_last + 1));
-            const float highest = clamp(fmax(z0, z1), (float)(c_first - 1), (float)(c_last + 1));
-            const int base = min((int)(lowest + 1.0f) - 1, c_last), stop = min((int)(highest + 1.0f) - 1, c_last) + 2;
-            __global const float *near = columns + column + (base - c_first), *far = near + r.stride_b;
-            for (int k = 0; k < stop - base; k += LANES) {
-                const vf a = V_LOAD(near + k);
-                V_STORE(fma((vf)(wb), V_LOAD(far + k) - a, a), blended + k);
-            }
-            for (int k = 0; k < count; k += LANES) {
-                vf wc;
-                /* the last vector's lanes beyond the last line may point outside of what was blended */
-                const vi z = sample_at(V_LOAD(g + k), sc, ahead, c_first, c_last, &wc) - base;
-                const vi own = min(max(z, 0), stop - base - 2);
-                const vf a = GATHER(blended, own), b = GATHER(blended + 1, own);
-                V_STORE(V_LOAD(p + k) + fma(wc, b - a, a), p + k);
-            }
-        }
-        for (int k = 0; k < count; ++k) {
-            const float dz = fma((float)(start + k), cell[RAY_EV + 2], cell[RAY_D00 + 2]);
-            const float lx = dx * pitch_mm.x, ly = dy * pitch_mm.y, lz = dz * pitch_mm.z;
-            const float step_mm = sqrt(lx * lx + ly * ly + lz * lz) / fabs(r.da);
-            total[start - v_first + k] += cell[RAY_WEIGHT] * (p[k] * step_mm);
+        const int last = (count + LANES - 1) / LANES * LANES - 1;
+        const int2 planes = planes_within(planes_between(cell, u, along_x, r.a_first, r.na), r.sa, r.sb, gb[0], gb[last],
+                                          (float)(r.b_first - 1), (float)(r.b_last + 1));
+        __global const float *plane = columns + IMAGE_GUARD + (long)(planes.x - r.a_first + BORDER) * r.stride_a
+                                      - (long)(r.b_first - BORDER) * r.stride_b - r.c_first;
+        for (int i = planes.x; i <= planes.y; ++i, plane += r.stride_a)
+            sample_plane(plane, r, i, gb, gc, count, p, blended);
+        for (int k = 0; k < count; k += LANES) {
+            const column_rays_t d = column_rays(cell, u, start + k);
+            const vf part = V_LOAD(p + k) * column_steps_mm(d, pitch_mm);
+            V_STORE(V_PICK(turn ? V_LOAD(total + k) : (vf)(0.0f), part, column_along_x(d) == along_x),
+                    total + k);
         }
     }
-    __global float *pixels = image + IMAGE_GUARD + ((size_t)n * lines + v_first) * image_pitch + u;
-    for (int k = 0; k < v_stop - v_first; ++k)
-        pixels[(size_t)k * image_pitch] = total[k];
+    __global float *pixels = image + to.x + (u - slot[SLOT_U]) * to.y + (start - slot[SLOT_V]) * to.z
+                             + (size_t)get_global_id(2) * to.w;
+    for (int k = 0; k < count; ++k)
+        pixels[k * to.z] = total[k];
 }

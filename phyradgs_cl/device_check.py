@@ -5,13 +5,14 @@ that rounds as OpenCL asks, and far below what a wrong kernel does.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.acquisition.common_times import common_time_cells
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
@@ -197,7 +198,10 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     tall = (32, 5)  # lines enough for the vectors of any CPU
     orbit = CircularOrbit(ConeGeometry(5.0, 7.5, tall, (3.9 / 32, 4.1 / 5)), ConstantSpeed(0.3, 0.5))
     upright = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, tall[0])
-    for cells, shape in ((still, SHAPE), (table, SHAPE), (upright, tall)):
+    common = common_time_cells(orbit, Shutter(0.8, 0.6), 0, np.array([0.2]), tall[0], 3)
+    leaning = replace(common, pose=common.pose.copy())
+    leaning.pose[:, 9:12] += 0.02 * common.pose[:, 6:9]
+    for cells, shape in ((still, SHAPE), (table, SHAPE), (upright, tall), (common, tall), (leaning, tall)):
         y = _noise((1, *shape), 6)
         operator = RayOperator(rt, GRID, shape, [cells])
         yield operator.forward(volume)[0], ray_frame(volume, GRID, cells, shape), VALUE

@@ -16,7 +16,7 @@ static inline intensity_t intensity_from(const vf p)
     return sum;
 }
 
-static inline void intensity_add(intensity_t *sum, const float weight, const vf p)
+static inline void intensity_add(intensity_t *sum, const vf weight, const vf p)
 {
     sum->mean += weight * (p - sum->from);
     sum->light += weight * expm1(min(sum->from - p, 80.0f)); /* 80: finite in float32 */

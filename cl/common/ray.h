@@ -8,7 +8,6 @@
 #define RAY_D00 3      /* from source to pixel (0, 0) */
 #define RAY_EU 6
 #define RAY_EV 9
-#define RAY_WEIGHT 12
 
 #define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does */
 #define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside weigh nothing anyway */

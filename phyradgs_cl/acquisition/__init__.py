@@ -8,6 +8,7 @@ from phyradgs_cl.acquisition.motion import (
     LineMiddles,
     MicroViews,
     Motion,
+    OwnTimes,
     PerRow,
     Static,
     StaticStart,
@@ -27,7 +28,7 @@ from phyradgs_cl.acquisition.trajectory import (
 
 __all__ = [
     "MOTIONS", "PROTOCOLS", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable",
-    "Exact", "FrameSweeps", "LineMiddles", "MicroViews", "Motion", "PerRow", "PoseTable",
+    "Exact", "FrameSweeps", "LineMiddles", "MicroViews", "Motion", "OwnTimes", "PerRow", "PoseTable",
     "Protocol", "Saturation", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells",
     "Trajectory", "make_protocol", "pixel_centres", "transpose_pose"
 ]  # fmt: skip

@@ -28,7 +28,8 @@ class TimeCells:
     """The cells of one frame, sorted by line_start, so that those that serve a line are neighbours.
 
     pose (C, 12) mm, in the detector's own rows and columns whatever the readout axis; time_s (C,); line_start, line_stop
-    (C,) along the readout ``axis`` of ``lines`` lines; weight (C,).
+    (C,) along the readout ``axis`` of ``lines`` lines; weight (C,). ``line_share`` (C, lines) multiplies the weight of a
+    still cell by the share of each line's window that lies in it; None: 1 for every line that the cell serves.
 
     Cells with motion are segments of the frame: ``end_poses`` (C, 2, 12), and ``line_times`` (C, 3, lines): middle and
     half length of every line's window in the segment, in units of the segment's length from its mid-time, and the share
@@ -44,6 +45,7 @@ class TimeCells:
     axis: str = "rows"
     end_poses: np.ndarray | None = None
     line_times: "NDArray[np.float64] | None" = None
+    line_share: "NDArray[np.float64] | None" = None
 
     @property
     def count(self) -> int:
@@ -53,11 +55,23 @@ class TimeCells:
     def line_weights(self) -> np.ndarray:
         """Sum of weights (lines,) that each line receives; 1 for a complete table."""
         total = np.zeros(self.lines)
-        if self.line_times is not None:
-            return self.weight @ self.line_times[:, 2]
-        for start, stop, weight in zip(self.line_start, self.line_stop, self.weight, strict=True):
-            total[start:stop] += weight
+        for cell, lines in enumerate(self.ranges):
+            total[lines] += self.weights_of(cell)
         return total
+
+    @property
+    def ranges(self) -> list[slice]:
+        """The lines of every cell."""
+        return [slice(int(a), int(b)) for a, b in zip(self.line_start, self.line_stop, strict=True)]
+
+    def weights_of(self, cell: int) -> np.ndarray:
+        """The weight (line_stop − line_start,) of a cell on each of its lines."""
+        lines = slice(int(self.line_start[cell]), int(self.line_stop[cell]))
+        share = self.line_share[cell, lines] if self.line_share is not None else np.ones(lines.stop - lines.start)
+        if self.line_times is not None:
+            share = self.line_times[cell, 2, lines]
+        weights: np.ndarray = self.weight[cell] * share
+        return weights
 
     @property
     def readout(self) -> Readout:
@@ -85,7 +99,8 @@ class TimeCells:
         pose[:, 6:] /= factor
         pose[:, 3:6] -= (factor - 1) / 2 * (pose[:, 6:9] + pose[:, 9:12])
         lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
-        return replace(self, pose=pose, **lines)
+        share = None if self.line_share is None else self.line_share.repeat(factor, 1)
+        return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
         """These cells, for operators without motion within a cell; InputError where there is some."""
@@ -104,7 +119,7 @@ class TimeCells:
         line = np.arange(cell.size) + np.repeat(self.line_start - (np.cumsum(lengths) - lengths), lengths)
         order = np.lexsort((self.time_s[cell], line))
         cell, line = cell[order], line[order]
-        weight = self.weight[cell]
+        weight = self.weight[cell] * (1 if self.line_share is None else self.line_share[cell, line])
         total = np.bincount(line, weight, self.lines)
         past = np.cumsum(weight) - weight / 2 - (np.cumsum(total) - total)[line]
         nearest = np.lexsort((np.abs(past - total[line] / 2), line))
@@ -137,10 +152,8 @@ class TimeCells:
     def layer_weights(self) -> np.ndarray:
         """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``, 0 where it has none."""
         weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
-        for cell, layer in enumerate(self.layer_numbers):
-            lines = slice(int(self.line_start[cell]), int(self.line_stop[cell]))
-            share = 1.0 if self.line_times is None else self.line_times[cell, 2, lines]
-            weights[layer, lines] = self.weight[cell] * share
+        for cell, lines in enumerate(self.ranges):
+            weights[self.layer_numbers[cell], lines] = self.weights_of(cell)
         return weights
 
 
@@ -183,7 +196,7 @@ def micro_view_cells(
     times = np.concatenate(time_s)
     weight = np.full(times.size, 1.0 / sub_intervals)
     ranges = np.concatenate(first), np.concatenate(last)
-    return _table(trajectory, shutter, frame, times, *ranges, weight, lines)
+    return cell_table(trajectory, shutter, frame, times, *ranges, weight, lines)
 
 
 def per_line_cells(
@@ -198,7 +211,7 @@ def per_line_cells(
     times = (start_s + opens_s[:, None] + share * (closes_s - opens_s)[:, None]).ravel()
     line = np.repeat(np.arange(lines), samples)
     weight = np.full(times.size, 1.0 / samples)
-    return _table(trajectory, shutter, frame, times, line, line + 1, weight, lines)
+    return cell_table(trajectory, shutter, frame, times, line, line + 1, weight, lines)
 
 
 def exact_cells(
@@ -220,7 +233,7 @@ def exact_cells(
     order = np.argsort(line_start, kind="stable")
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[kept][order]
     ends = line_start, lines - served[kept, ::-1].argmax(axis=1)
-    table = _table(trajectory, shutter, frame, middle_s, *ends, np.ones(kept.size), lines)
+    table = cell_table(trajectory, shutter, frame, middle_s, *ends, np.ones(kept.size), lines)
     end_poses = trajectory.pose(frame, ends_s)
     if np.all(end_poses == table.pose[0]) and np.all(table.pose == table.pose[0]):
         return static_cells(trajectory, shutter, frame, start_s, lines)
@@ -291,10 +304,10 @@ def _single_cell(
     trajectory: Trajectory, shutter: Shutter, frame: int, time_s: float, lines: int
 ) -> TimeCells:
     one = np.ones(1)
-    return _table(trajectory, shutter, frame, time_s * one, 0 * one, lines * one, one, lines)
+    return cell_table(trajectory, shutter, frame, time_s * one, 0 * one, lines * one, one, lines)
 
 
-def _table(
+def cell_table(
     trajectory: Trajectory,
     shutter: Shutter,
     frame: int,
@@ -304,6 +317,7 @@ def _table(
     weight: np.ndarray,
     lines: int,
 ) -> TimeCells:
+    """Cells at times (C,) s, in the order of their first lines."""
     order = np.argsort(line_start, kind="stable")
     return TimeCells(
         pose=trajectory.pose(frame, time_s[order]),

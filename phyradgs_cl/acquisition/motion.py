@@ -14,6 +14,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.common_times import common_time_cells
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
@@ -78,9 +79,33 @@ class MicroViews:
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line at its own ``sub_intervals`` exact times, as in the simulator. Raises InputError for a count below 1."""
+    """Every line over its own window, at times that all lines of a frame share: ``sub_intervals`` to an exposure.
+
+    A line weighs each time by the share of its window that lies there. Raises InputError for a count below 1.
+    """
 
     name: str = field(default="per-row", init=False, repr=False)
+    sub_intervals: int = 5
+
+    def __post_init__(self) -> None:
+        checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """The ``TimeCells`` of one frame of a scan: an exposure / sub-intervals each, from first light to last."""
+        if not scan.is_fly:
+            return Static().cells(scan, frame)
+        where = scan.trajectory, scan.shutter, frame, scan.frame_start_s, scan.lines
+        return common_time_cells(*where, self.sub_intervals)
+
+
+@dataclass(frozen=True)
+class OwnTimes:
+    """Every line at ``sub_intervals`` times of its own exposure, as in the simulator: ``per-row`` is faster and as exact.
+
+    Raises InputError for a count below 1.
+    """
+
+    name: str = field(default="own-times", init=False, repr=False)
     sub_intervals: int = 5
 
     def __post_init__(self) -> None:
@@ -101,7 +126,7 @@ class LineMiddles:
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """The ``TimeCells`` of one frame of a scan: one for every line."""
-        return PerRow(1).cells(scan, frame)
+        return OwnTimes(1).cells(scan, frame)
 
 
 @dataclass(frozen=True)
@@ -129,9 +154,9 @@ class Exact:
         return cells.exact_cells(*where, segments)
 
 
-STILL = (Static(), StaticStart(), MicroViews(), PerRow())
+STILL = (Static(), StaticStart(), MicroViews(), PerRow(), OwnTimes())
 """The models whose cells stand still, as they are by themselves."""
-MODELS = (Static, StaticStart, MicroViews, PerRow, Exact, LineMiddles)
+MODELS = (Static, StaticStart, MicroViews, PerRow, OwnTimes, Exact, LineMiddles)
 MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
 """The names of the models."""
 
@@ -189,6 +214,8 @@ def check_own_motion(motion: object, scan: Scan) -> None:
     checks.shape(f"{culprit}: pose", made.pose, (made.count, POSE_LENGTH))
     for name in ("time_s", "line_start", "line_stop"):
         checks.shape(f"{culprit}: {name}", getattr(made, name), (made.count,))
+    if made.line_share is not None:
+        checks.shape(f"{culprit}: line_share", made.line_share, (made.count, made.lines))
     weights = made.line_weights()
     worst = float(weights[np.argmax(np.abs(weights - 1))])
     if abs(worst - 1) > _WHOLE:

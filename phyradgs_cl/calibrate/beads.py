@@ -11,7 +11,7 @@ import scipy
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import Rotation
 
-from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition import OwnTimes, Scan
 from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.calibrate.level import MOST_FRAMES
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
@@ -184,7 +184,7 @@ class BeadLevel:
             edge_px = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification / min(small.geometry.pixel_size_mm)
             times = int(np.clip(math.ceil(exposure_arc_rad(scan) * edge_px), _LEAST_SAMPLES, _MOST_SAMPLES))
             spread = _as_wide(small, times)
-            tables += [PerRow(times).cells(spread, frame) for frame in range(small.frames)]
+            tables += [OwnTimes(times).cells(spread, frame) for frame in range(small.frames)]
         radius_mm = float(np.median([body.reach_mm for body in self.phantom.ellipsoids])) * small.geometry.magnification
         per_pixel = math.ceil(_PIXEL_SAMPLES * min(small.geometry.pixel_size_mm) / radius_mm)
         samples = int(np.clip(per_pixel, _PIXEL_SAMPLES, _MOST_PIXEL_SAMPLES))

@@ -89,7 +89,7 @@ class Level:
         for scan in self.scans:
             small = binned(moved(scan, change, views), self.block)
             voxels = exposure_arc_rad(scan) * max(self.grid.shape[1:]) / 2
-            motion = PerRow(sub_intervals=int(np.clip(math.ceil(voxels / _VOXELS_PER_SAMPLE), 1, _MOST_SAMPLES)))
+            motion = PerRow(sub_intervals=int(np.clip(math.ceil(voxels / _VOXELS_PER_SAMPLE), 2, _MOST_SAMPLES)))
             tables += [motion.cells(small, frame) for frame in range(small.frames)]
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables)
 

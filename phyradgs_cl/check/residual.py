@@ -73,7 +73,7 @@ class Fit:
 def system_of(rt: Runtime, scan: Scan) -> System:
     """The scan's equations, every line at its own times: a time for each voxel that its edge moves in an exposure."""
     voxels = exposure_arc_rad(scan) * max(scan.grid.shape[1:]) / 2
-    samples = int(np.clip(math.ceil(voxels), 1, _MOST_SAMPLES))
+    samples = int(np.clip(math.ceil(voxels), 2, _MOST_SAMPLES))
     system = System.of_scan(rt, scan, PerRow(sub_intervals=samples))
     return replace(system, operator=WithFlats.of(system.operator, system.measured.shape))
 

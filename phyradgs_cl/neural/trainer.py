@@ -5,7 +5,7 @@ import json
 import numpy as np
 import torch
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import OwnTimes, PerRow, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.arrays import to_array, to_tensor
 from phyradgs_cl.neural.field.on_grid import NeuralField, voxel_values
@@ -40,7 +40,10 @@ class Trainer:
         self.density_per_mm = density_per_mm
         self.unit = density_per_mm * scan.grid.half_longest_mm  # of line integrals
         self.rng = np.random.default_rng(seed)
-        tables = [options.motion.cells(scan, frame).still() for frame in range(scan.frames)]
+        motion = options.motion
+        if isinstance(motion, PerRow):  # a field is asked for each ray by itself: common times would save nothing
+            motion = OwnTimes(motion.sub_intervals)
+        tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model

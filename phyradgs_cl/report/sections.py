@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, PerRow, Scan
+from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
@@ -247,6 +247,8 @@ def _motion_words(motion: Motion) -> str:
         case MicroViews():
             words = f"dots are the poses of {motion.strips} strips × {motion.sub_intervals} sub-intervals"
         case PerRow():
+            words = f"dashed lines are the times that all lines share, {motion.sub_intervals} to an exposure"
+        case OwnTimes():
             words = f"dots are the {motion.sub_intervals} poses of some of the lines"
         case LineMiddles():
             words = "dots are the poses of some of the lines"

@@ -129,7 +129,8 @@ def _asked_for(options: object) -> dict[str, object]:
         strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
         counts = {"micro-views": f" {strips} × {sub_intervals}"}
         if sub_intervals is not None:  # FDK has one time per line
-            counts["per-row"] = f", {sub_intervals} times per line"
+            counts["per-row"] = f", {sub_intervals} times per exposure"
+            counts["own-times"] = f", {sub_intervals} times per line"
         told["motion"] = f"{motion.get('name')}{counts.get(str(motion.get('name')), '')}"
     if "iterations" in options:
         told["iterations_asked"] = options["iterations"]

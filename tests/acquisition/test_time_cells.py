@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition import (
     Exact,
     LineMiddles,
     MicroViews,
+    OwnTimes,
     PerRow,
     Scan,
     Shutter,
@@ -137,7 +138,7 @@ def scan(is_fly: bool) -> Scan:
 
 def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
     counts = {
-        Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 30,
+        Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 5, OwnTimes(sub_intervals=3): 30,
         Exact(segments=5): 5, LineMiddles(): 10,
     }
     for motion, count in counts.items():

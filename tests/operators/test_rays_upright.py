@@ -1,4 +1,4 @@
-"""Detector columns parallel to z, and poses that serve many lines: other kernels; of frames the same bits."""
+"""Detector columns nearly parallel to z, and poses that serve many lines: other kernels, the same samples and weights."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +16,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.rays.upright import columns_floats, serve_one_line_each, upright_block
+from phyradgs_cl.operators.rays.upright import columns_floats, upright_of
 from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
 from phyradgs_cl.runtime import Runtime
 
@@ -45,15 +45,18 @@ def assert_same_bits(
     return frames
 
 
-@pytest.mark.parametrize("motion", ["static", "micro-views"])
+@pytest.mark.parametrize("motion", ["static", "micro-views", "common"])
 @pytest.mark.parametrize("shape", [TALL_PANEL, (131, 18), (96, 1)])
-def test_the_same_bits_as_the_general_kernel(cpu_rt, monkeypatch, motion, shape) -> None:
+def test_frames_are_the_twins(cpu_rt, monkeypatch, motion, shape) -> None:
+    """Of a pose that serves all lines to the bits of the general kernel."""
     cells, x = tables(motion, shape, frames=2), noise(GRID.shape, 101)
     with monkeypatch.context() as patch:
         launched = note_launches(patch)
-        RayOperator(cpu_rt, GRID, shape, cells).forward(x)
-    assert set(launched) == {"turn_upright", "rays_upright"}
-    frames = assert_same_bits(cpu_rt, GRID, cells, x, shape)
+        frames = RayOperator(cpu_rt, GRID, shape, cells).forward(x)
+    merged = {"merge_slots"} if motion != "static" else set()
+    assert set(launched) == {"turn_upright", "rays_upright"} | merged
+    if motion == "static":
+        assert_same_bits(cpu_rt, GRID, cells, x, shape)
     expected = np.stack([ray_frame(x, GRID, table, shape) for table in cells])
     assert np.abs(frames - expected).max() <= RAYS * expected.max() and expected.max() > 0
 
@@ -72,10 +75,12 @@ def test_source_inside_or_close_to_the_volume(cpu_rt, source_mm) -> None:
 
 
 def test_lines_without_cells_are_zero(cpu_rt) -> None:
-    whole = tables("micro-views", TALL_PANEL, frames=1)[0]
+    whole, x = tables("micro-views", TALL_PANEL, frames=1)[0], noise(GRID.shape, 104)
     keep = whole.line_start != 17
     parts = {n: getattr(whole, n)[keep] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    frames = assert_same_bits(cpu_rt, GRID, [replace(whole, **parts)], noise(GRID.shape, 104))
+    cells = [replace(whole, **parts)]
+    frames = RayOperator(cpu_rt, GRID, TALL_PANEL, cells).forward(x)
+    assert np.abs(frames - ray_frame(x, GRID, cells[0], TALL_PANEL)).max() <= RAYS * frames.max()
     assert not frames[0, 17:34].any() and frames[0, :17].any() and frames[0, 34:].any()
 
 
@@ -85,8 +90,8 @@ def test_a_subset_and_batches_of_frames(banded_rt) -> None:
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
     operator = RayOperator(rt, GRID, TALL_PANEL, cells)
     layout = RayLayout.of_scan(GRID, TALL_PANEL, "rows")
-    volumes = 4 * (layout.volume_floats + columns_floats(GRID))
-    with room_for(rt, int((volumes + 4 * layout.frames_floats(2) + 64) / PLANNED)):
+    volumes = layout.volume_floats + columns_floats(GRID) + 5 * operator.slot_floats + 32
+    with room_for(rt, int(4 * (volumes + layout.frames_floats(2) + 16) / PLANNED)):
         assert [part.stop for part in operator.memory.batches(5)] == [2, 4, 5]
         np.testing.assert_array_equal(operator.forward(x), expected)
         np.testing.assert_array_equal(operator.subset([4, 1]).forward(x), expected[[4, 1]])
@@ -104,12 +109,77 @@ def test_without_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
         assert set(launched) == {"rays_forward"}
 
 
-def test_intensities_take_the_general_kernel(rt) -> None:
-    cells, x = tables("micro-views", TALL_PANEL), noise(GRID.shape, 107)
-    operator = RayOperator(rt, GRID, TALL_PANEL, cells)
-    gap = operator.forward(x) - operator.project(x, "intensity")
-    np.testing.assert_allclose(operator.intensity_gap(x), gap, atol=1e-5)
-    assert gap.max() > 1e-3
+@pytest.mark.parametrize("motion", ["micro-views", "common"])
+def test_intensities(cpu_rt, motion) -> None:
+    cells, x = tables(motion, TALL_PANEL), noise(GRID.shape, 107)
+    operator = RayOperator(cpu_rt, GRID, TALL_PANEL, cells)
+    found = operator.project(x, "intensity")
+    expected = np.stack([ray_frame(x, GRID, table, TALL_PANEL, "intensity") for table in cells])
+    assert np.abs(found - expected).max() <= RAYS * expected.max()
+    np.testing.assert_allclose(operator.intensity_gap(x), operator.forward(x) - found, atol=1e-5)
+    assert operator.intensity_gap(x).max() > 1e-3
+
+
+def leaning(cells: list[TimeCells], roll_deg: float, tilt_deg: float) -> list[TimeCells]:
+    """The same frames on a panel turned about its middle: in its plane, and about its rows."""
+    made = []
+    for table in cells:
+        pose = table.pose.copy()
+        eu, ev = pose[:, 6:9], pose[:, 9:12]
+        lines = (table.lines - 1) / 2
+        middle = pose[:, 3:6] + lines * ev + 3 * eu
+        du, dv = np.linalg.norm(eu, axis=1, keepdims=True), np.linalg.norm(ev, axis=1, keepdims=True)
+        u_hat, v_hat, normal = eu / du, ev / dv, np.cross(eu / du, ev / dv)
+        roll, tilted = np.deg2rad(roll_deg), np.deg2rad(tilt_deg)
+        v_hat = np.cos(tilted) * v_hat + np.sin(tilted) * normal
+        pose[:, 6:9] = du * (np.cos(roll) * u_hat + np.sin(roll) * v_hat)
+        pose[:, 9:12] = dv * (np.cos(roll) * v_hat - np.sin(roll) * u_hat)
+        pose[:, 3:6] = middle - lines * pose[:, 9:12] - 3 * pose[:, 6:9]
+        made.append(replace(table, pose=pose))
+    return made
+
+
+@pytest.mark.parametrize("motion, axis", [("static", "rows"), ("common", "rows"), ("common", "columns")])
+@pytest.mark.parametrize("roll_deg, tilt_deg", [(0.01, 0.0), (0.3, 0.5), (-5.0, 3.0), (5.0, -6.0)])
+@pytest.mark.parametrize("shape", [(85, 40), (40, 131)])
+def test_panels_that_lean(cpu_rt, motion, axis, roll_deg, tilt_deg, shape) -> None:
+    """Frames and adjoint; some columns have rays of both main axes."""
+    grid = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.0, -0.05, 0.1))
+    cells = leaning(tables(motion, shape, axis, frames=2, direction=-1), roll_deg, tilt_deg)
+    operator = RayOperator(cpu_rt, grid, shape, cells)
+    assert operator._upright is not None and operator._upright.leans
+    x, y = noise(grid.shape, 111), noise((2, *shape), 112)
+    frames, volume = operator.forward(x), operator.adjoint(y)
+    plain = general(cpu_rt, grid, shape, cells)
+    assert np.abs(frames - plain.forward(x)).max() <= RAYS * frames.max() and frames.max() > 0
+    assert np.abs(volume - plain.adjoint(y)).max() <= RAYS_BACK * volume.max()
+    seen = operator.project(x, "intensity")
+    assert np.abs(seen - plain.project(x, "intensity")).max() <= RAYS * seen.max()
+
+
+def test_a_leaning_panel_is_the_twins(cpu_rt) -> None:
+    cells = leaning(tables("common", TALL_PANEL, frames=1), 2.0, 4.0)
+    x, y = noise(GRID.shape, 113), noise((1, *TALL_PANEL), 114)
+    operator = RayOperator(cpu_rt, GRID, TALL_PANEL, cells)
+    expected = ray_frame(x, GRID, cells[0], TALL_PANEL)
+    assert np.abs(operator.forward(x)[0] - expected).max() <= RAYS * expected.max()
+    back = ray_volume(y[0], GRID, cells[0])
+    assert np.abs(operator.adjoint(y) - back).max() <= RAYS_BACK * back.max()
+
+
+def test_frames_without_gaps_share_their_poses(cpu_rt, monkeypatch) -> None:
+    """The end of a frame and the beginning of the next are projected once; a subset of frames has the same bits."""
+    cells, x = tables("gapless", TALL_PANEL, frames=4), noise(GRID.shape, 115)
+    operator = RayOperator(cpu_rt, GRID, TALL_PANEL, cells)
+    frames = operator.forward(x)
+    slots = operator._slots[(0, 4)]
+    assert slots.count < sum(table.count for table in cells) - 5
+    expected = np.stack([ray_frame(x, GRID, table, TALL_PANEL) for table in cells])
+    assert np.abs(frames - expected).max() <= RAYS * expected.max()
+    y = noise((4, *TALL_PANEL), 116)
+    back = adjoint_of_twins(cells, GRID, y)
+    assert np.abs(operator.adjoint(y) - back).max() <= RAYS_BACK * back.max()
+    np.testing.assert_allclose(operator.subset([2, 0]).forward(x), frames[[2, 0]], rtol=0, atol=RAYS * frames.max())
 
 
 def adjoint_of_twins(cells: list[TimeCells], grid: Grid, y: np.ndarray) -> np.ndarray:
@@ -134,21 +204,19 @@ def test_the_adjoint_is_the_twins(cpu_rt, monkeypatch, case) -> None:
     with monkeypatch.context() as patch:
         launched = note_launches(patch)
         found = RayOperator(cpu_rt, grid, shape, cells).adjoint(y)
-    assert set(launched) == {"weigh_columns", "rays_upright_adjoint"}
+    assert set(launched) == {"split_slots", "rays_upright_adjoint"}
     expected = adjoint_of_twins(cells, grid, y)
     assert np.abs(found - expected).max() <= RAYS_BACK * expected.max() and expected.max() > 0
 
 
 def test_strips_and_lines_without_cells_go_back_too(cpu_rt) -> None:
-    """A cell per line; several cells take the general kernel."""
     (cells,), y = tables("micro-views", TALL_PANEL, frames=1), noise((1, *TALL_PANEL), 109)
     first_of_each = np.unique(cells.line_start, return_index=True)[1][[0, 2, 4]]
     parts = {n: getattr(cells, n)[first_of_each] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    strips = replace(cells, **parts)
-    assert serve_one_line_each([strips]) and not serve_one_line_each([cells])
-    expected = ray_volume(y[0], GRID, strips)
-    found = RayOperator(cpu_rt, GRID, TALL_PANEL, [strips]).adjoint(y)
-    assert np.abs(found - expected).max() <= RAYS_BACK * expected.max()
+    for table in (replace(cells, **parts), cells):
+        expected = ray_volume(y[0], GRID, table)
+        found = RayOperator(cpu_rt, GRID, TALL_PANEL, [table]).adjoint(y)
+        assert np.abs(found - expected).max() <= RAYS_BACK * expected.max()
 
 
 def test_the_adjoints_bits_do_not_tell_of_bricks_batches_or_where_frames_are(banded_rt) -> None:
@@ -176,27 +244,33 @@ def tilt(pose: np.ndarray) -> None:
     pose[:, 9:12] += 1e-4 * pose[:, 6:9]
 
 
+def lie_down(pose: np.ndarray) -> None:
+    pose[:, 9:12] += 0.5 * pose[:, 6:9]
+
+
 def steepen(pose: np.ndarray) -> None:
     pose[:, 5] += 30.0
 
 
 def test_where_it_applies() -> None:
+    close = leaning(tables("static", TALL_PANEL, source_mm=1.3), 1.0, 0.0)
     cases = {
-        "static": (tables("static", TALL_PANEL), True), "strips": (tables("micro-views", TALL_PANEL), True),
-        "a pose per line": (tables("per line", TALL_PANEL), False),
-        "few lines": (tables("static", (15, 85)), False),
-        "columns": (tables("static", (7, 85), "columns"), False),
-        "tilted": (changed(tilt), False), "steep": (changed(steepen), False),
+        "static": (tables("static", TALL_PANEL), False), "strips": (tables("micro-views", TALL_PANEL), False),
+        "common": (tables("common", TALL_PANEL), False), "columns": (tables("static", TALL_PANEL, "columns"), False),
+        "a pose per line": (tables("per line", TALL_PANEL), None), "few rows": (tables("static", (15, 85)), None),
+        "tilted": (changed(tilt), True), "lying": (changed(lie_down), None), "steep": (changed(steepen), None),
+        "leaning from within": (close, None),
     }  # fmt: skip
-    for name, (cells, applies) in cases.items():
-        width = 85 if cells[0].lines == 15 else 7
-        assert (upright_block(GRID, cells, width, 16) > 0) == applies, name
+    for name, (cells, leans) in cases.items():
+        shape = (15, 85) if name == "few rows" else TALL_PANEL
+        how = upright_of(GRID, cells, shape, 16)
+        assert (None if how is None else how.leans) is leans, name
 
 
 def test_lines_far_apart_in_voxels() -> None:
     """A work-item takes fewer lines then, and none where a vector of them is too many."""
     fine = [Grid((9, 14, 11), (pitch_mm,) * 3) for pitch_mm in (1e-2, 5e-3, 1e-3)]
     cells = tables("static", TALL_PANEL)
-    blocks = [upright_block(grid, cells, TALL_PANEL[1], 16) for grid in fine]
+    ways = [upright_of(grid, cells, TALL_PANEL, 16) for grid in fine]
     spacing_mm = 3.9 / TALL_PANEL[0]
-    assert blocks == [85, int(508 / (spacing_mm / 5e-3)), 0]
+    assert [way and way.block for way in ways] == [85, int(508 / (spacing_mm / 5e-3)), None]

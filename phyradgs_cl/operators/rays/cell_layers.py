@@ -26,7 +26,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
         parts = [p[k] if k < len(p) else _empty(p[0]) for p in split]
         weight = np.stack([part.line_weights() for part in parts]).astype(np.float32)
         weights.append(tables[0].readout.spread(weight))
-        ones.append([replace(part, weight=np.ones(part.count)) for part in parts])
+        ones.append([replace(part, weight=np.ones(part.count), line_share=None) for part in parts])
     return ones, weights
 
 
@@ -45,7 +45,8 @@ def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], ave
 
 
 def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    names = ("pose", "time_s", "line_start", "line_stop", "weight")
+    names = ["pose", "time_s", "line_start", "line_stop", "weight"]
+    names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})
 
 

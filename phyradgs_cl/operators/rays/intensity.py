@@ -36,8 +36,9 @@ class IntensityOperator:
         self.volume_shape = grid.shape
         self.frames_shape = (len(tables), *detector_shape)
         self._operators: list[RayOperator] = []
-        for part in ones:  # one memory for all: they are used in turns
-            memory = self._operators[0].memory if self._operators else None
+        # one memory for all: they are used in turns; that of the operator over all cells has room for each
+        memory = RayOperator(rt, grid, detector_shape, tables).memory
+        for part in ones:
             self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
         self._by_row = tables[0].axis == "rows"
         self._device = DeviceSpace(rt)

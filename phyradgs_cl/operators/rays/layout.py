@@ -74,6 +74,16 @@ class RayLayout:
         row = pitch_of(self.lines)
         return Strides(GUARD, self.width * row, row)
 
+    def pixel_strides(self, axis: str) -> tuple[int, int, int, int]:
+        """Where the pixels of padded frames lie: start, and floats from column to column, row to row, frame to frame."""
+        row = pitch_of(self.width)
+        slice_ = self.lines * row
+        return (GUARD, 1, row, slice_) if axis == "rows" else (GUARD, row, 1, slice_)
+
+    def column_floats(self, axis: str) -> int:
+        """What a padded frame takes with detector columns as rows."""
+        return self.width * pitch_of(self.lines) if axis == "rows" else self.lines * pitch_of(self.width)
+
     def inside(self, flat: np.ndarray) -> np.ndarray:
         """The volume (z, y, x) as a view of its padded floats."""
         nz, ny, nx = self.brick.shape
@@ -110,31 +120,41 @@ class RayCells:
     matrices: DeviceArray
     matrix_stride: int
     frame_cells: DeviceArray
+    weights: DeviceArray
+    weight_at: DeviceArray
 
     @classmethod
     def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "RayCells":
         counts = np.array([table.count for table in tables])
         starts = np.concatenate([[0], np.cumsum(counts)])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
-        weight = np.concatenate([table.weight for table in tables])
+        weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
-        stride = int(starts[-1]) + _WIDEST
-        matrices = np.zeros((12, stride))
-        matrices[:, : starts[-1]] = voxel_matrices(pose, grid).T
+        matrices, stride = matrix_table(pose, grid)
         cell_lines = np.zeros((stride, 2), np.int32)
         cell_lines[: starts[-1]] = np.concatenate(ranges)
         return cls(
-            cells=rt.upload(ray_constants(pose, weight, grid)),
+            cells=rt.upload(ray_constants(pose, grid)),
             cell_lines=rt.upload(cell_lines),
             line_cells=rt.upload(np.stack(served), np.int32),
             matrices=rt.upload(matrices, np.float32),
             matrix_stride=stride,
             frame_cells=rt.upload(starts, np.int32),
+            weights=rt.upload(np.concatenate(weights), np.float32),
+            weight_at=rt.upload(np.concatenate([[0], np.cumsum([len(w) for w in weights])]), np.int32),
         )
 
 
-def ray_constants(pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:
+def matrix_table(pose: np.ndarray, grid: Grid) -> tuple[np.ndarray, int]:
+    """``voxel_matrices`` of poses (C, 12) as kernels read them, (12, stride), and the stride: vectors may run past C."""
+    stride = len(pose) + _WIDEST
+    matrices = np.zeros((12, stride))
+    matrices[:, : len(pose)] = voxel_matrices(pose, grid).T
+    return matrices, stride
+
+
+def ray_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
     """Poses (C, 12) in voxel indices: the (C, 16) float32 table that cl/common/ray.h describes."""
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
@@ -143,7 +163,6 @@ def ray_constants(pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarra
     constants[:, 3:6] = (pose[:, 3:6] - pose[:, 0:3]) / pitch
     constants[:, 6:9] = pose[:, 6:9] / pitch
     constants[:, 9:12] = pose[:, 9:12] / pitch
-    constants[:, 12] = weight
     return constants.astype(np.float32)
 
 

@@ -11,24 +11,28 @@ from phyradgs_cl.operators.rays.launches import owner_steps
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime
-from phyradgs_cl.runtime.layout import Strides, move, pad_rows, unpad_rows
+from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
 
 _FRAMES_SHARE = 0.25  # of the room, for frames beside a brick
+_SLOTS_SHARE = 0.125  # of the room, for slots of frames
+_MOST_SLOT_FLOATS = 2**26  # for the slots of some frames at a time: more would not be faster
 
 
 class RayMemory:
     """Buffers for frames of ``layout`` and its volume, planned when they are first needed.
 
-    A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. ``upright``: it
-    is wanted turned as well, where both fit, and so are frames. Operators may share one, in turns: each call writes what it
-    reads.
+    A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. slot_floats: what
+    the slots of a frame take (``slots.py``); the volume is then wanted turned as well, where both fit, and so are frames; 0:
+    no slots. Operators may share one, in turns: each call writes what it reads.
     """
 
-    def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, upright: bool = False) -> None:
+    def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
-        self.is_upright = upright
-        self._columns_bytes = 4 * columns_floats(layout.grid) if upright else 0
+        self.slot_floats = slot_floats
+        self.slot_frames = 0
+        self._columns_bytes = 4 * columns_floats(layout.grid) if slot_floats else 0
         self._columns: DeviceArray | None = None
+        self._slots: DeviceArray | None = None
         self._bricks: list[Brick] = []
         self._batch = 0
         self._volume: DeviceArray | None = None
@@ -39,7 +43,7 @@ class RayMemory:
     def plan(self, share: float = 1.0) -> list[Brick]:
         """The bricks. A share below 1 plans anew, for so much of the room."""
         if not self._bricks or share < 1:
-            self._volume = self._frames = self._columns = None
+            self._volume = self._frames = self._columns = self._slots = None
             self._padded.clear()
             self._bricks, self._batch = self._planned(share)
         return self._bricks
@@ -47,15 +51,19 @@ class RayMemory:
     def _planned(self, share: float) -> tuple[list[Brick], int]:
         layout, room = self.layout, self.rt.room()
         each_bytes = 4 * (self._frames_floats(1) - layout.frames_floats(0))
+        if self.slot_floats:
+            fitting = min(int(_SLOTS_SHARE * share * room.free_bytes) // 4, _MOST_SLOT_FLOATS) // self.slot_floats
+            self.slot_frames = min(self.most_frames, fitting)
+        slots_bytes = 4 * self._slots_floats
 
         def batch(free_bytes: int) -> int:
-            fitting = (min(free_bytes, room.largest_bytes) - 4 * layout.frames_floats(0)) // each_bytes
+            fitting = (min(free_bytes - slots_bytes, room.largest_bytes) - 4 * layout.frames_floats(0)) // each_bytes
             return max(1, min(self.most_frames, fitting))
 
         everything = whole(layout.grid.shape)
         volume_bytes = 4 * layout.of(everything).volume_floats
-        if share == 1 and room.holds(volume_bytes, 4 * self._frames_floats(1)):
-            if not room.holds(volume_bytes, 4 * self._frames_floats(1), self._columns_bytes):
+        if share == 1 and room.holds(volume_bytes, 4 * self._frames_floats(1), slots_bytes):
+            if not room.holds(volume_bytes, 4 * self._frames_floats(1), slots_bytes, self._columns_bytes):
                 self._columns_bytes = 0
             return [everything], batch(room.free_bytes - volume_bytes - self._columns_bytes)
         self._columns_bytes = 0
@@ -66,8 +74,8 @@ class RayMemory:
         beside = room.free_bytes - 4 * layout.of(whole(smallest)).volume_floats
         frames = batch(min(int(_FRAMES_SHARE * share * room.free_bytes), beside))
 
-        def needs(shape: tuple[int, int, int]) -> tuple[int, int]:
-            return 4 * layout.of(whole(shape)).volume_floats, 4 * self._frames_floats(frames)
+        def needs(shape: tuple[int, int, int]) -> tuple[int, ...]:
+            return 4 * layout.of(whole(shape)).volume_floats, 4 * self._frames_floats(frames), slots_bytes
 
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
@@ -137,6 +145,16 @@ class RayMemory:
         turn_volume(self.rt, layout, volume, self._columns)
         return self._columns
 
+    def slots(self) -> DeviceArray:
+        """Memory for the slots of ``slot_frames`` frames, whatever was in it. There is none where the room is too small."""
+        if self._slots is None:
+            self._slots = self.rt.zeros(self._slots_floats)
+        return self._slots
+
+    @property
+    def _slots_floats(self) -> int:
+        return 2 * GUARD + self.slot_frames * self.slot_floats if self.slot_frames else 0
+
     def frames(self, count: int) -> DeviceArray:
         """Memory for ``count`` frames of one batch, whatever was in it."""
         return self._some_frames(self.layout.frames_floats(count))
@@ -148,7 +166,7 @@ class RayMemory:
 
     def _frames_floats(self, count: int) -> int:
         """Of frames that lie either way, where both are wanted."""
-        turned = self.layout.turned_floats(count) if self.is_upright else 0
+        turned = self.layout.turned_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str) -> DeviceArray:

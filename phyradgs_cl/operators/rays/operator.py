@@ -1,6 +1,6 @@
 """The system matrix of a whole scan: all frames under one motion model, as one linear operator and its transpose."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any
 from typing import Protocol as Interface
@@ -11,16 +11,11 @@ from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import averaged, layered
-from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.launches import AVERAGES, launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.rays.upright import (
-    launch_upright,
-    launch_upright_adjoint,
-    serve_one_line_each,
-    upright_block,
-    weigh_columns,
-)
+from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
+from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
 
 
@@ -74,9 +69,15 @@ class RayOperator:
         self._readout = tables[0].readout
         layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
         # a GPU's work-items are pixels, whose loads the general kernel has side by side
-        self._upright = 0 if rt.pixel_items else upright_block(grid, tables, layout.width, rt.lanes)
-        self.memory = memory or RayMemory(rt, layout, len(tables), upright=self._upright > 0)
-        self._is_turned = self._upright > 0 and self.memory.is_upright and serve_one_line_each(tables)
+        self._upright = None if rt.pixel_items else upright_of(grid, tables, detector_shape, rt.lanes)
+        self._poses: UprightPoses | None = None
+        self.slot_floats = 0
+        if self._upright is not None:
+            self._poses = UprightPoses.upload(rt, grid, tables)
+            self.slot_floats = self._poses.floats_per_frame(detector_shape, self._upright.leans)
+        self.memory = memory or RayMemory(rt, layout, len(tables), self.slot_floats)
+        if self.slot_floats > self.memory.slot_floats:
+            self._upright = None
         self._tables = list(tables)
         self._cells = RayCells.upload(rt, grid, self._tables)
         self._choose(np.arange(len(tables)))
@@ -118,18 +119,45 @@ class RayOperator:
             for k, brick in enumerate(bricks):
                 if k + part.start == 0 or len(bricks) > 1:
                     layout, on_device = self.memory.write_volume(volume, brick)
-                    columns = self._turned(layout, on_device, average)
+                    columns = self.memory.turned(layout, on_device) if self._is_upright else None
                 if columns is not None:
-                    launch_upright(self.rt, layout, self._cells, listed, columns, frames, self._upright)
+                    self._project_upright(layout, columns, part, average, frames)
                     continue
                 launch_forward(
                     self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
                 )
             self.memory.read_frames(frames, result, part, self._readout.axis)
 
-    def _turned(self, layout: RayLayout, volume: DeviceArray, average: str) -> DeviceArray | None:
-        """The volume for the kernel of upright rays; None where that does not apply."""
-        return self.memory.turned(layout, volume) if self._upright and average == "log" else None
+    @property
+    def _is_upright(self) -> bool:
+        """Whether the upright kernels serve, and the memory planned for has room for slots."""
+        return self._upright is not None and self.memory.slot_frames > 0
+
+    def _project_upright(
+        self, layout: RayLayout, columns: DeviceArray, part: slice, average: str, frames: DeviceArray
+    ) -> None:
+        """Some frames of a turned volume, into their padded memory."""
+        assert self._upright is not None and self._poses is not None
+        start, *steps = layout.pixel_strides(self._readout.axis)
+        for first, slots in self._slots_of(part):
+            target = frames, np.array([start + first * steps[-1], *steps], np.int64)
+            if slots.is_plain and average == "log":
+                launch_upright(self.rt, layout, self._upright, self._poses, slots, columns, target)
+                continue
+            there = self.memory.slots()
+            launch_upright(self.rt, layout, self._upright, self._poses, slots, columns, (there, slots.strides))
+            like = self.detector_shape, self._readout.axis, AVERAGES.index(average)
+            merge_slots(self.rt, self._cells, slots, there, target, *like)
+
+    def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
+        """Where runs of the part's frames begin in it, and their slots, as many as fit into memory together."""
+        assert self._upright is not None and self._poses is not None
+        for first in range(part.start, part.stop, self.memory.slot_frames):
+            key = first, min(first + self.memory.slot_frames, part.stop)
+            if key not in self._slots:
+                chosen = self._chosen[slice(*key)]
+                self._slots[key] = self._poses.slots(self.rt, chosen, self.detector_shape, self._upright.leans)
+            yield first - part.start, self._slots[key]
 
     def _project_layers(self, volume: Array, average: str, result: Array) -> None:
         """Averages that need a whole ray at a time, where no brick has one: every layer by itself, averaged on the host."""
@@ -158,18 +186,30 @@ class RayOperator:
         for k, brick in enumerate(bricks):
             layout, on_device = self.memory.volume(brick)
             for part in parts:
-                listed = self._listed(part)
-                add = part.start > 0
-                if self._is_turned:
-                    if k == 0 or len(parts) > 1:
-                        turned = self.memory.write_turned(frames, part, self._readout.axis)
-                        weigh_columns(self.rt, layout, self._cells, listed, turned)
-                    launch_upright_adjoint(self.rt, layout, self._cells, listed, turned, on_device, add=add)
-                    continue
+                add, axis = part.start > 0, self._readout.axis
                 if k == 0 or len(parts) > 1:
-                    by_line = self.memory.write_frames(frames, part, self._readout.axis)
-                launch_adjoint(self.rt, layout, self._cells, listed, by_line, on_device, add=add)
+                    turns = self._is_upright and axis == "rows"
+                    write = self.memory.write_turned if turns else self.memory.write_frames
+                    there = write(frames, part, axis)
+                if self._is_upright:
+                    self._adjoint_upright(layout, part, there, on_device, add)
+                    continue
+                launch_adjoint(self.rt, layout, self._cells, self._listed(part), there, on_device, add=add)
             self.memory.read_volume(layout, on_device, result)
+
+    def _adjoint_upright(
+        self, layout: RayLayout, part: slice, frames: DeviceArray, volume: DeviceArray, add: bool
+    ) -> None:
+        """Sums some frames, with detector columns as rows, onto a padded volume."""
+        assert self._upright is not None and self._poses is not None
+        there, pitch_mm = self.memory.slots(), layout.constants()[3]
+        each = layout.column_floats(self._readout.axis)
+        for first, slots in self._slots_of(part):
+            like = self.detector_shape, pitch_mm, first * each
+            split_slots(self.rt, self._cells, self._poses, slots, frames, *like, there)
+            launch_upright_adjoint(
+                self.rt, layout, self._upright, self._poses, slots, there, volume, add=add or first > 0
+            )
 
     def subset(self, frames: Sequence[int]) -> "RayOperator":
         """The same operator on some of the frames, in this order; cheap, but worth keeping if it is used again."""
@@ -184,6 +224,7 @@ class RayOperator:
         self._chosen = chosen
         self.frames_shape = (len(chosen), *self.detector_shape)
         self._lists: dict[tuple[int, int], DeviceArray] = {}
+        self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
         """The indices of some of the chosen frames on the device."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pitch_of
 
@@ -75,6 +76,8 @@ class DeviceCells:
 
     @classmethod
     def upload(cls, rt: Runtime, table: TimeCells) -> "DeviceCells":
+        if table.line_share is not None:
+            raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")
         pose = table.readout.poses(table.pose)
         poses, times = pose, np.zeros(1, np.float32)
         if table.end_poses is not None and table.line_times is not None:

@@ -44,7 +44,8 @@ def ray_frame(
     for cell in range(table.count):
         image = joseph_image(volume, grid, table.pose[cell], detector_shape)
         where = _lines(table, cell)
-        frame[where] += table.weight[cell] * (np.exp(-image[where]) if model == "intensity" else image[where])
+        seen = np.exp(-image[where]) if model == "intensity" else image[where]
+        frame[where] += table.readout.spread(table.weights_of(cell)) * seen
     return -np.log(frame) if model == "intensity" else frame
 
 
@@ -54,7 +55,7 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
     for cell in range(table.count):
         image = np.zeros(frame.shape)
         where = _lines(table, cell)
-        image[where] = table.weight[cell] * frame[where]
+        image[where] = table.readout.spread(table.weights_of(cell)) * frame[where]
         volume += joseph_adjoint(image, grid, table.pose[cell])
     return volume
 
@@ -86,7 +87,7 @@ def _shares(
     for cell in range(table.count):
         share, where = np.zeros(shape), _lines(table, cell)
         light = np.exp(-joseph_image(volume, grid, table.pose[cell], shape)[where])
-        share[where] = table.weight[cell] * light / total[where]
+        share[where] = table.readout.spread(table.weights_of(cell)) * light / total[where]
         yield cell, share
 
 

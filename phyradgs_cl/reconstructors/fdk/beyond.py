@@ -29,7 +29,7 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
     def told(progress: Progress) -> None:
         report(replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None))
 
-    at_times: Motion = PerRow(sub_intervals=1) if isinstance(motion, LineMiddles) else motion
+    at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
     result = fista_tv.METHOD.run(scan, FistaTvOptions(motion=at_times, iterations=_ITERATIONS), rt, report=told)
     if result.facts["interrupted_at"] is not None:
         raise KeyboardInterrupt

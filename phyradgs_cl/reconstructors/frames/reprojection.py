@@ -12,7 +12,7 @@ from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
 
-_LITTLE_VARIATION = FistaTvOptions(motion=PerRow(sub_intervals=1), iterations=30, tv_weight=0.002)
+_LITTLE_VARIATION = FistaTvOptions(motion=PerRow(sub_intervals=2), iterations=30, tv_weight=0.002)
 
 
 def reprojection(rt: Runtime, scan: Scan) -> Model:

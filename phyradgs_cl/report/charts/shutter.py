@@ -2,7 +2,16 @@
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, LineMiddles, MicroViews, Motion, PerRow, Scan, StaticStart
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    LineMiddles,
+    MicroViews,
+    Motion,
+    OwnTimes,
+    PerRow,
+    Scan,
+    StaticStart,
+)
 from phyradgs_cl.report.charts.axes import TOP, Axes, svg, text
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.markup import Markup, element, joined
@@ -73,12 +82,14 @@ def _windows(axes: Axes, scan: Scan, start_s: float) -> list[Markup]:
 def _sampling(axes: Axes, scan: Scan, motion: Motion) -> list[Markup]:
     """When the run took its poses: a line for one per frame, edges of segments, or dots on lines."""
     bottom, top = axes.y
-    if isinstance(motion, MicroViews | PerRow | LineMiddles) and scan.is_fly:
+    if isinstance(motion, MicroViews | OwnTimes | LineMiddles) and scan.is_fly:
         return [axes.dot(time_s, line, "sample") for time_s, line in _sample_times(scan, motion)]
     first_s, last_s = scan.shutter.lit_span_s
     cells = motion.cells(scan, 0)
-    at_s = [first_s if isinstance(motion, StaticStart) else scan.shutter.middle_s]
-    if cells.is_moving:
+    at_s: list[float] = [first_s if isinstance(motion, StaticStart) else scan.shutter.middle_s]
+    if isinstance(motion, PerRow) and scan.is_fly:
+        at_s = (cells.time_s - float(scan.frame_start_s[0])).tolist()
+    elif cells.is_moving:
         at_s = np.linspace(first_s, last_s, cells.count + 1).tolist()
     return [axes.polyline([(t, bottom), (t, top)], "pose") for t in at_s]
 

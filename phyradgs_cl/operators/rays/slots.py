@@ -1,0 +1,206 @@
+"""Slots: poses of many frames, each with the part of the panel that it serves; and frames as weighted averages of them.
+
+A line of a frame has a weight in each of its slots. Poses that frames share, as neighbours in a scan without gaps between
+exposures do, are projected once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.rays.layout import RayCells, matrix_table, ray_constants
+from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD, pitch_of
+
+_SLOT_INTS, _SHARE_INTS = 8, 4  # as in cl/common/ray_column.h and cl/rays_slots.cl
+_SAME_POSE = 10  # decimals of the longest distance to which poses agree that are projected once
+
+
+@dataclass(frozen=True, eq=False)
+class UprightPoses:
+    """The distinct poses of many frames on the device, and which of them each frame's cells have.
+
+    pose_of (E,): of every cell, frame after frame; first, stop (E,): its lines; frame_cells (F + 1,).
+    """
+
+    cells: DeviceArray
+    matrices: DeviceArray
+    matrix_stride: int
+    pose_of: np.ndarray
+    first: np.ndarray
+    stop: np.ndarray
+    frame_cells: np.ndarray
+    is_plain: bool  # one cell with all lines for each frame, of weight 1
+    axis: str
+
+    @classmethod
+    def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "UprightPoses":
+        poses = np.concatenate([table.pose for table in tables])
+        scale = np.abs(poses).max() or 1.0
+        _, where, pose_of = np.unique(np.round(poses / scale, _SAME_POSE), axis=0, return_index=True, return_inverse=True)
+        matrices, stride = matrix_table(poses[where], grid)
+        weights = np.concatenate([table.weights_of(c) for table in tables for c in range(table.count)])
+        counts = [table.count for table in tables]
+        first = np.concatenate([table.line_start for table in tables])
+        stop = np.concatenate([table.line_stop for table in tables])
+        whole = all(n == 1 for n in counts) and (stop - first == tables[0].lines).all()
+        return cls(
+            cells=rt.upload(ray_constants(poses[where], grid)),
+            matrices=rt.upload(matrices, np.float32),
+            matrix_stride=stride,
+            pose_of=pose_of.reshape(-1),
+            first=first,
+            stop=stop,
+            frame_cells=np.concatenate([[0], np.cumsum(counts)]),
+            is_plain=bool(whole and (weights == 1).all()),
+            axis=tables[0].axis,
+        )
+
+    def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
+        """The most that the slots of a frame take: values and, where columns lean, slopes."""
+        rows, columns = detector_shape
+        widest = int((self.stop - self.first).max())
+        each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
+        return int(np.diff(self.frame_cells).max()) * each * (2 if leans else 1)
+
+    def slots(self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool) -> "Slots":
+        """The slots of some frames, in the order in which these need them."""
+        rows, columns = detector_shape
+        cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
+        of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
+        _, appears, slot = np.unique(self.pose_of[cells], return_index=True, return_inverse=True)
+        order = np.argsort(appears)
+        slot = np.argsort(order)[slot.reshape(-1)]
+        first, stop = np.full(len(order), 2**31 - 1), np.zeros(len(order), np.int64)
+        np.minimum.at(first, slot, self.first[cells])
+        np.maximum.at(stop, slot, self.stop[cells])
+        table = np.zeros((len(order), _SLOT_INTS), np.int32)
+        table[:, 0] = self.pose_of[cells][appears[order]]
+        table[:, 2], table[:, 4] = columns, rows
+        along = (3, 4) if self.axis == "rows" else (1, 2)
+        table[:, along] = np.stack([first, stop], -1)
+        by_slot = np.argsort(slot, kind="stable")
+        return Slots(
+            slots=rt.upload(table),
+            frame_shares=rt.upload(np.concatenate([[0], np.cumsum(np.diff(self.frame_cells)[frames])]), np.int32),
+            shares=rt.upload(self._shares(cells, slot), np.int32),
+            slot_shares=rt.upload(np.searchsorted(slot[by_slot], np.arange(len(order) + 1)), np.int32),
+            shares_by_slot=rt.upload(self._shares(cells[by_slot], of_frame[by_slot]), np.int32),
+            count=len(order),
+            frames=len(frames),
+            columns=int((table[:, 2] - table[:, 1]).max()),
+            rows=int((table[:, 4] - table[:, 3]).max()),
+            is_plain=self.is_plain and len(order) == len(frames),
+            leans=leans,
+        )
+
+    def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """(E, 4): slot or frame, lines [first, stop), and where the cell's weights begin among those of ``RayCells``."""
+        begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
+        return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """Some frames' slots on the device, as cl/rays_slots.cl describes them; ``columns``, ``rows``: of the largest."""
+
+    slots: DeviceArray
+    frame_shares: DeviceArray
+    shares: DeviceArray
+    slot_shares: DeviceArray
+    shares_by_slot: DeviceArray
+    count: int
+    frames: int
+    columns: int
+    rows: int
+    is_plain: bool
+    leans: bool
+
+    @property
+    def pitch(self) -> int:
+        """Floats from one column of a slot to the next."""
+        return pitch_of(self.rows)
+
+    @property
+    def floats(self) -> int:
+        """Of one value for each pixel of all slots."""
+        return self.count * self.columns * self.pitch
+
+    @property
+    def strides(self) -> np.ndarray:
+        """Where line integrals lie: start, and floats from column to column, row to row, slot to slot."""
+        return np.array([GUARD, self.pitch, 1, self.columns * self.pitch], np.int64)
+
+    @property
+    def defines(self) -> dict[str, int]:
+        return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "LEAN": int(self.leans)}
+
+
+def merge_slots(
+    rt: Runtime,
+    cells: RayCells,
+    slots: Slots,
+    integrals: DeviceArray,
+    target: tuple[DeviceArray, np.ndarray],
+    detector_shape: tuple[int, int],
+    axis: str,
+    average: int,
+) -> None:
+    """Frames from slots; target: an array and its strides (start, column, row, frame); ``average``: as in the kernel."""
+    rows, columns = detector_shape
+    rt.launch(
+        rt.kernel("rays_slots", "merge_slots", AVERAGE=average, **{**slots.defines, "LEAN": 0}),
+        (columns, slots.frames),
+        integrals,
+        np.int32(slots.columns),
+        np.int32(slots.pitch),
+        slots.slots,
+        slots.frame_shares,
+        slots.shares,
+        cells.weights,
+        np.int32(axis == "rows"),
+        np.int32(columns),
+        np.int32(rows),
+        target[1],
+        target[0],
+        group=min(columns, 8),
+    )
+
+
+def split_slots(
+    rt: Runtime,
+    cells: RayCells,
+    poses: UprightPoses,
+    slots: Slots,
+    turned: DeviceArray,
+    detector_shape: tuple[int, int],
+    pitch_mm: np.ndarray | np.int32,
+    start: int,
+    values: DeviceArray,
+) -> None:
+    """Slots' weighted shares of frames, times the length of each ray from plane to plane. turned: frames (F, columns,
+    rows) from ``start`` floats on."""
+    rows, columns = detector_shape
+    rt.launch(
+        rt.kernel("rays_slots", "split_slots", AVERAGE=0, **slots.defines),
+        (slots.columns, slots.count),
+        turned,
+        np.int64(start),
+        np.int32(pitch_of(rows)),
+        poses.cells,
+        slots.slots,
+        slots.slot_shares,
+        slots.shares_by_slot,
+        cells.weights,
+        np.int32(poses.axis == "rows"),
+        np.int32(columns),
+        pitch_mm,
+        np.int32(slots.columns),
+        np.int32(slots.pitch),
+        np.int64(slots.floats),
+        values,
+        group=1,
+    )
