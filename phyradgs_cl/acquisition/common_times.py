@@ -52,8 +52,9 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        return origin_s + edges_s[0] + (round(cells) + number) * step_s
-    return start_s + edges_s[0] + number * step_s
+        start_s, number = origin_s, round(cells) + number
+    middles_s: np.ndarray = start_s + edges_s[0] + number * step_s
+    return middles_s
 
 
 def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
