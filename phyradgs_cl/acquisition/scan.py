@@ -18,6 +18,7 @@ from phyradgs_cl.acquisition.field_of_view import (
 )
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.summary import summary
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
 from phyradgs_cl.errors import InputError
@@ -170,6 +171,10 @@ class Scan:
         times_s = self.frame_start_s + self.shutter.middle_s
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)
+
+    def summary(self) -> str:
+        """Two lines: shutter, frame rate, exposure; field of view, fan and cone, voxels, largest line integral."""
+        return summary(self)
 
     def plot(self, frame: int = 0) -> "Figure":
         """A figure of one frame (rows, columns) and of when its lines open and close, in degrees of the gantry too.

@@ -1,11 +1,13 @@
 """The last step of every importer: parts of a scan put together, with what the user says over them."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
+from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.options import ImportOptions
@@ -26,8 +28,11 @@ def put_together(
     grid: Grid | None = None,
     reference: np.ndarray | None = None,
     lag: float = 0.0,
+    names: Mapping[str, str] | None = None,
 ) -> Scan:
-    """A scan of line integrals, row 0 the lowest already; the grid is the cone's cube where none is given."""
+    """A scan of line integrals, row 0 the lowest already; the grid is the cone's cube where none is given. ``names``: how
+    messages about implausible values call what a file states. InputError for such values."""
+    assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values,
         geometry=geometry,
@@ -40,11 +45,13 @@ def put_together(
         pixel_mask=integrals.mask,
         reference=reference,
         title=title,
-        provenance={"imported_from": source},
+        provenance={"imported_from": source, **({"assumed": assumed} if assumed else {})},
         lag=lag,
         saturation=integrals.saturation,
     )
     scan.warn_of_near_panel()
+    subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
+    check_plausible(scan, lambda name: subjects.get(name) or options.called(name))
     return scan
 
 
