@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
 # by the side of the panel that is read first, seen from the source: readout axis and direction
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
+SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]
 """How a message calls a field: an argument of Python, an option of the command line or a key of a TOML file."""
 
@@ -39,6 +42,51 @@ def readout_of(readout_ms: float | None, readout_s: float | None, named: Named =
         return readout_s
     checks.at_least(named("readout_ms"), readout_ms, 0)
     return _agreed(readout_ms / 1000, named("readout_ms"), f"{readout_ms:g}", readout_s, named("readout_s"))
+
+
+def exposure_of(
+    exposure_deg: float | None, exposure_s: float | None, fps: float | None, turned_deg: np.ndarray
+) -> tuple[float, float]:
+    """Arc in degrees and time in s of an exposure. With ``fps`` one states the other, by the median step of ``turned_deg``
+    (F,); without it the time is 1 s unless given. InputError where neither or both are given beside ``fps``."""
+    if exposure_s is not None:
+        checks.positive("exposure_s", exposure_s)
+    if exposure_deg is not None:
+        checks.within("exposure_deg", exposure_deg, -3600, 3600)
+    if exposure_deg == 0:
+        raise InputError("exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops")
+    if fps is None:
+        if exposure_deg is None:
+            raise InputError("exposure_deg", "nothing", "the arc of an exposure", "give it, or fps and exposure_s")
+        return exposure_deg, exposure_s or 1.0
+    checks.positive("fps", fps)
+    if (exposure_deg is None) == (exposure_s is None):
+        found = f"{fps:g} with {'neither' if exposure_s is None else 'both'} exposure_s and exposure_deg"
+        raise InputError("fps", found, "one of the two", "give exposure_s and leave exposure_deg out")
+    deg_per_s = fps * float(np.median(np.diff(turned_deg))) if len(turned_deg) > 1 else 0.0
+    if deg_per_s == 0:
+        raise InputError("fps", f"{fps:g} with angles that do not change", "angles that turn", "leave fps out")
+    if exposure_s is not None:
+        return deg_per_s * exposure_s, exposure_s
+    assert exposure_deg is not None
+    return exposure_deg, abs(exposure_deg / deg_per_s)
+
+
+def readout_ratio_of(
+    readout_ms: float | None, readout_ratio: float | None, fps: float | None, exposure_s: float | None, named: Named = str
+) -> float | None:
+    """``readout_ratio``, checked; InputError for a readout in ms with a ratio as well, or without a rate or an exposure."""
+    if readout_ratio is not None:
+        checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
+    if readout_ms is None:
+        return readout_ratio
+    checks.at_least(named("readout_ms"), readout_ms, 0)
+    if readout_ratio is not None:
+        subject = named("readout_ratio")
+        raise InputError(named("readout_ms"), f"{readout_ms:g} with {subject}", "one of the two", f"leave {subject} out")
+    if fps is None and exposure_s is None:
+        raise InputError(named("readout_ms"), f"{readout_ms:g} without a frame rate", "both", f"give {named('fps')} too")
+    return None
 
 
 def _agreed(time_s: float, subject: str, found: str, other_s: float | None, other: str) -> float:

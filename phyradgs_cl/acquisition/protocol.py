@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.acquisition.data_sheet import Named
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
@@ -45,6 +46,21 @@ class Protocol:
     @property
     def step_deg(self) -> float:
         return 360.0 / self.views
+
+    def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
+        """The same arcs at a panel's frames per second and readout in ms, which state the exposure and the readout ratio.
+
+        Raises InputError for an arc of 0, and a readout that is longer than a frame."""
+        checks.positive(named("fps"), fps)
+        if self.exposure_deg == 0:
+            raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
+        exposure_s = self.exposure_deg / (self.step_deg * fps)
+        if readout_ms is None:
+            return replace(self, exposure_s=exposure_s)
+        if readout_ms > 1000 / fps:
+            expected = f"at most the {1000 / fps:.4g} ms of a frame at {fps:g} fps"
+            raise InputError(named("readout_ms"), f"{readout_ms:g}", expected, "correct its unit, or the frame rate")
+        return replace(self, exposure_s=exposure_s, readout_ratio=readout_ms / 1000 / exposure_s)
 
     def shutter(self, axis: str = "rows", direction: int = 1) -> Shutter:
         start, length = self.pulse or (0.0, 0.0)

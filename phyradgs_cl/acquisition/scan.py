@@ -18,7 +18,6 @@ from phyradgs_cl.acquisition.field_of_view import (
 )
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
-from phyradgs_cl.acquisition.summary import summary
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
 from phyradgs_cl.errors import InputError
@@ -174,6 +173,8 @@ class Scan:
 
     def summary(self) -> str:
         """Two lines: shutter, frame rate, exposure; field of view, fan and cone, voxels, largest line integral."""
+        from phyradgs_cl.acquisition.plausible import summary
+
         return summary(self)
 
     def plot(self, frame: int = 0) -> "Figure":

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, fields
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.data_sheet import FIRST_LINES, Named, frame_time_of, readout_of, readout_order
+from phyradgs_cl.acquisition.data_sheet import SIDES, Named, frame_time_of, readout_of, readout_order
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
@@ -16,7 +16,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "row_0": ("top", "bottom"),
     "column_0": ("left", "right"),
     "readout_axis": AXES,
-    "first": tuple(FIRST_LINES),
+    "first": SIDES,
     "detector_model": DETECTOR_MODELS,
 }
 _POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm")
@@ -30,8 +30,8 @@ class ImportOptions:
     Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next: the gantry turned
     without a stop; ``angle_at``: a frame's angle is that of its first line's opening ("start") or mid-exposure. Readout
     axis and direction are those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
-    In the words of a data sheet: ``first`` ("top", "bottom", "left", "right") is the line that is read first, and states axis
-    and direction; ``fps`` states the frame time, ``readout_ms`` the readout. Two that contradict are refused.
+    In a data sheet's words: ``first`` ("top", "bottom", "left", "right") is the line that is read first and states axis and
+    direction; ``fps`` states the frame time, ``readout_ms`` the readout. Two that contradict are refused.
     Geometry: distances, pixel size and detector offset (v, u) in mm; ``unit_mm``: a scene unit where formats have none;
     ``rotates``: what the angles turn; ``row_0``, ``column_0``: where the first stored ones are, seen from the source.
     Pixels: ``quantity`` that is stored; ``flat_value``: counts without an object, where there are no flat frames.
@@ -116,7 +116,10 @@ FIELDS = tuple(_DEFAULTS)
 """The names of what a user may say; ``named`` is none of it."""
 
 # what formats that say little take from the user
-TIMING = ("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction", "first", "fps", "readout_ms")
+TIMING = (
+    *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
+    *("first", "fps", "readout_ms"),
+)
 OF_BARE_FRAMES = (
     *TIMING,
     *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),

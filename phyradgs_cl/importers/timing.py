@@ -18,7 +18,7 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 class Timing:
     """When frames were taken. ``start_s`` (F,) opening of each first-read line; ``is_fly``: the gantry never stops;
     ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure. ``assumed``: what neither
-    file nor user stated, in the words of ``acquisition/summary.py``."""
+    file nor user stated, in the words of ``acquisition/plausible.py``."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -101,7 +101,8 @@ def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: 
     asked = [options.called(name) for name in options.given(_OF_A_TURN)]
     frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
     for name in (*asked, *stored.written):
-        raise InputError(name, "no time from frame to frame beside it", "both, or neither for frames taken at rest", f"say {frame_time}")
+        expected = "both, or neither for frames taken at rest"
+        raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")
     if shutter.exposure_s > 0:
         text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; say %s if the gantry did not stop"
         _log.warning(text, culprit, shutter.exposure_s, frame_time)

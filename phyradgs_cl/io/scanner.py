@@ -17,7 +17,7 @@ from phyradgs_cl.io.hdf5.units import LENGTH
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.text import near_miss
 
-_TABLES: dict[str, tuple[str, ...]] = {
+TABLES: dict[str, tuple[str, ...]] = {
     "source": ("to_axis_mm", "to_detector_mm"),
     "detector": (
         *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"), "lag"
@@ -84,8 +84,8 @@ def _describes_scanner(path: Path) -> bool:
 
 def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
     """The scanner that a TOML file's content describes; ``path`` names it in messages."""
-    refuse_unknown(str(path), content, (*_TABLES, *_WORDS), "a table")
-    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in _TABLES.items()}
+    refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
     readout = tables["readout"]
     axis, direction = _order(readout)
@@ -114,8 +114,12 @@ def _order(readout: Fields) -> tuple[str, int]:
     axis, stated = readout.word("axis", AXES, default=AXES[0]), int(direction)
     if not readout.has("first"):
         return axis, stated
+
+    def named(field: str) -> str:
+        return readout.name(field) if field == "first" else field.removeprefix("readout_")
+
     given = axis if readout.has("axis") else None, stated if readout.has("direction") else None
-    order = readout_order(readout.word("first"), *given, lambda name: readout.name(name.removeprefix("readout_")))
+    order = readout_order(readout.word("first"), *given, named)
     return order[0] or axis, order[1] or stated
 
 

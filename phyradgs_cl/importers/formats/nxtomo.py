@@ -49,7 +49,7 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         _refuse_moves(source, entry, used)
         title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
-        text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
+        text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
     frames = oriented(turn.frames(frames), options, "bottom")
     flats, darks = (frames[key == kind] for kind in (schema.FLAT, schema.DARK))

@@ -21,7 +21,7 @@ from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign
 from phyradgs_cl.importers.scan_parts import put_together, with_options
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.scan.reader import united
-from phyradgs_cl.io.scanner import Scanner, scanner_from
+from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
 OWN_TABLES = {
@@ -85,7 +85,7 @@ def _tables(path: Path) -> dict[str, Fields]:
     content = read_toml(path)
     refuse_unknown(str(path), content, (*_SCANNER, *OWN_TABLES), "a name")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in OWN_TABLES.items()}
-    tables["readout"] = Fields(f"{path} [readout]", content.get("readout", {}))
+    tables["readout"] = Fields(f"{path} [readout]", content.get("readout", {}), TABLES["readout"])
     return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in OWN_TABLES}), **tables}
 
 
@@ -162,15 +162,17 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
     exposure_s, readout_s = (timing.number(name, lowest=0.0) if timing.has(name) else None for name in names)
 
     def named(field: str) -> str:
-        return (timing if field in OWN_TABLES["timing"] else readout).name(field)
+        return _KEYS[field] if field in OWN_TABLES["timing"] else readout.name(field)
 
     readout_s = readout_of(scanner.readout_ms, readout_s, named)
     if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
         readout_s = scanner.readout_ratio * exposure_s
     frame_time_s = frame_time_of(scanner.fps, timing.length("frame_time_s") if timing.has("frame_time_s") else None, named)
     if scanner.fps is not None and timing.has("start_s"):
-        raise readout.error("fps", f"{scanner.fps:g} with {timing.name('start_s')}", "one of the two", "leave fps out")
-    written = [table.name(key) for table, keys in ((timing, names), (readout, ("readout_ms",))) for key in keys if table.has(key)]
+        found = f"{scanner.fps:g} with [timing] start_s"
+        raise readout.error("fps", found, "one of the two", "leave fps out")
+    written = [timing.name(key) for key in names if timing.has(key)]
+    written += [readout.name("readout_ms")] if readout.has("readout_ms") else []
     return StoredTiming(
         exposure_s=exposure_s,
         readout_s=readout_s,
