@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.data_sheet import Named
 from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.readout import Named
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
 from phyradgs_cl.errors import InputError

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.data_sheet import FIRST_LINES
-from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
-from phyradgs_cl.acquisition.data_sheet import exposure_of, readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
+from phyradgs_cl.acquisition.readout import exposure_of, readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import check_not_counts, check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.detector.attenuation import QUANTITIES

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, fields
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.data_sheet import SIDES, Named, frame_time_of, readout_of, readout_order
+from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout_of, readout_order
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError

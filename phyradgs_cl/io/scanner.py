@@ -6,8 +6,8 @@ from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
-from phyradgs_cl.acquisition.data_sheet import readout_order
 from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.readout import readout_order
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError

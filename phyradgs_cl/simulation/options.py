@@ -5,7 +5,7 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Protocol, make_protocol
-from phyradgs_cl.acquisition.data_sheet import readout_order, readout_ratio_of
+from phyradgs_cl.acquisition.readout import readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError

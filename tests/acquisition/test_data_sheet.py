@@ -8,7 +8,7 @@ import pytest
 from refusals import assert_refused
 
 from phyradgs_cl.acquisition import make_protocol
-from phyradgs_cl.acquisition.data_sheet import FIRST_LINES
+from phyradgs_cl.acquisition.readout import FIRST_LINES
 from phyradgs_cl.api import ConeGeometry, Grid, fly_scan, simulate, static_scan
 from phyradgs_cl.simulation import scanner_for, scanner_options
 

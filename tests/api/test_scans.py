@@ -68,7 +68,7 @@ def test_what_looks_like_radians_transmissions_percent_or_lines_that_open_while_
         (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=36.0), "2 times the 0.5 s from frame"),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=2.0), ""),
-        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=86), "readout_ratio: .* 86 s, 43 times .* its unit"),
+        (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=86), "_ratio: .* 43 times"),
         (lambda: static_scan(transmission, cone, turn_deg), "frames: 1 at their borders.* quantity="),
         (lambda: static_scan(transmission, cone, turn_deg, quantity="transmission"), ""),
         (lambda: static_scan(1 - transmission, cone, turn_deg), ""),

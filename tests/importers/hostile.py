@@ -446,7 +446,7 @@ TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a readout without a frame time": (timed("readout_s = 1"), ("[timing] readout_s", SAY)),
     "the middle of no exposure": (in_text(TOML, "[angles]", "[angles]\nat = 'middle'"), ("[angles] at", SAY)),
     "exposure without end": (in_text(TOML, "[frames]", "[timing]\nexposure_s = -1\n[frames]"), ("exposure_s",)),
-    "motion without exposure": (in_text(TOML, "[frames]", "[timing]\nframe_time_s = 1\n[frames]"), ("say [timing] exposure",)),
+    "motion without exposure": (in_text(TOML, "[frames]", "[timing]\nframe_time_s = 1\n[frames]"), ("[timing] exposure",)),
     "times that stand still": (in_text(TOML, "[frames]", STANDING), ("start times",)),
 }  # fmt: skip
 

@@ -1,12 +1,12 @@
 """What a user says in a data sheet's words, at each door in the words of that door; and the TOML to fill in."""
 
 import re
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+import tomllib
 import writers_of_importers as w
 
 from phyradgs_cl.acquisition import Shutter
@@ -107,8 +107,8 @@ def test_absurd_sizes_are_refused_at_import(run, tmp_path, make_truth, caplog) -
     folder = w.write_tiff(tmp_path / "tiff", make_truth())
     good = (folder / "scan.toml").read_text()
     for pattern, replacement, said in (
-        (r"pixel_size_u_mm = .*", "pixel_size_u_mm = 1560", "[detector] pixel_size_v_mm, pixel_size_u_mm: found pixels"),
-        (r"shape = .*\nsize_mm = .*", "shape = [1, 1, 1]\nsize_mm = [585, 585, 585]", "[volume]: found 1×1×1 voxels of 585 mm"),
+        (r"pixel_size_u_mm = .*", "pixel_size_u_mm = 1560", "[detector] pixel_size_v_mm, pixel_size_u_mm: found"),
+        (r"shape = .*\nsize_mm = .*", "shape = [1, 1, 1]\nsize_mm = [585, 585, 585]", "[volume]: found 1×1×1 voxels"),
     ):
         (folder / "scan.toml").write_text(re.sub(pattern, replacement, good))
         assert said in run(folder)[2]

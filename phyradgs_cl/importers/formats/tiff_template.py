@@ -116,7 +116,7 @@ def _patterns(tiffs: list[Path]) -> dict[str, str]:
     for file in tiffs:
         pattern = re.sub(r"\d+(?=\D*$)", "*", file.name)
         series[pattern] = series.get(pattern, 0) + 1
-    found = {}
+    found: dict[str, str] = {}
     for kind, words in _KINDS.items():
         for pattern in [name for name in series if re.search(words, name, re.I)]:
             found.setdefault(kind, pattern)
