@@ -80,12 +80,15 @@ def _timing(scan: "Scan") -> str:
 def _sizes(scan: "Scan") -> str:
     cone, fan = _cone_deg(scan.geometry)
     seen_mm = tuple(2 * half for half in field_of_view_mm(scan.geometry))
-    largest = float(np.max(scan.projections, where=scan.valid, initial=-np.inf))
     voxel_mm = scan.grid.voxel_size_mm
     return (
-        f"sizes: field of view {_joined(seen_mm)} mm (z, y, x), fan {fan:.3g}°, cone {cone:.3g}°, "
-        f"voxels {_joined(voxel_mm[:1] if len(set(voxel_mm)) == 1 else voxel_mm)} mm, largest line integral {largest:.3g}"
+        f"sizes: field of view {_joined(seen_mm)} mm (z, y, x), fan {fan:.3g}°, cone {cone:.3g}°, voxels "
+        f"{_joined(voxel_mm[:1] if len(set(voxel_mm)) == 1 else voxel_mm)} mm, largest line integral {_largest(scan):.3g}"
     )
+
+
+def _largest(scan: "Scan") -> float:
+    return float(np.max(scan.projections, where=scan.valid, initial=-np.inf))
 
 
 def _joined(values: tuple[float, ...]) -> str:
@@ -102,10 +105,10 @@ def check_plausible(scan: "Scan", named: Named = str) -> None:
     if scan.is_fly and scan.frames > 1 and not looks_like_radians:
         for what in ("readout", "exposure"):
             _check_time(named(f"{what}_s"), what, getattr(scan.shutter, f"{what}_s"), _frame_time_s(scan))
-    opaque = (scan.projections > _OPAQUE) & scan.valid
-    if np.count_nonzero(opaque) > _FEW * opaque.size:
+    opaque = sum(np.count_nonzero(frame[valid] > _OPAQUE) for frame, valid in zip(scan.projections, scan.valid, strict=True))
+    if opaque > _FEW * scan.projections.size:
         text = "line integrals of up to %.3g: no panel sees through more than %g; are they counts? say %s"
-        log.warning(text, scan.projections[opaque].max(), _OPAQUE, named("quantity"))
+        log.warning(text, _largest(scan), _OPAQUE, named("quantity"))
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:

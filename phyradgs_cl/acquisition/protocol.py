@@ -30,9 +30,9 @@ class Protocol:
     def __post_init__(self) -> None:
         checks.whole("--views", self.views, 1, 100_000)
         object.__setattr__(self, "views", int(self.views))
-        checks.within("start angle (degrees)", self.start_deg, -1e6, 1e6)
-        checks.within("exposure arc (degrees)", self.exposure_deg, 0, 3600)
-        checks.within("readout ratio", self.readout_ratio, 0, 1000)
+        checks.within("--start-deg", self.start_deg, -1e6, 1e6)
+        checks.within("--exposure-deg", self.exposure_deg, 0, 3600)
+        checks.within("--readout-ratio", self.readout_ratio, 0, 1000)
         if self.pulse is not None:
             self._check_pulse(*self.pulse)
 
@@ -41,7 +41,7 @@ class Protocol:
         fits = np.isfinite(start) and np.isfinite(length) and start < last and start + length > 0
         if not (fits and length > 0):
             expected = f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
-            raise InputError("pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
+            raise InputError("--pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
 
     @property
     def step_deg(self) -> float:

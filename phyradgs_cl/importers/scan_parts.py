@@ -1,8 +1,6 @@
 """The last step of every importer: parts of a scan put together, with what the user says over them."""
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -57,19 +55,24 @@ def put_together(
 
 def with_options(geometry: ConeGeometry, options: ImportOptions) -> ConeGeometry:
     """The geometry with the distances, pitches and offset that the user gives in place of the file's."""
-    changes: dict[str, Any] = {
-        "source_to_axis_mm": options.source_to_axis_mm,
-        "source_to_detector_mm": options.source_to_detector_mm,
-        "pixel_size_mm": options.pixel_size_mm,
-        "detector_offset_mm": options.detector_offset_mm,
-    }
-    return checked(replace(geometry, **{k: v for k, v in changes.items() if v is not None}))
+    own = geometry.source_to_axis_mm, geometry.source_to_detector_mm
+    return cone(options, *own, geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm)
 
 
-def checked(geometry: ConeGeometry) -> ConeGeometry:
-    """InputError unless the detector stands behind the axis."""
-    to_axis, to_detector = geometry.source_to_axis_mm, geometry.source_to_detector_mm
-    if to_detector <= to_axis:
-        expected = f"more than the distance to the axis ({to_axis:g} mm)"
-        raise InputError("source-to-detector distance", f"{to_detector:g} mm", expected)
-    return geometry
+def cone(
+    options: ImportOptions,
+    to_axis_mm: float,
+    to_detector_mm: float,
+    panel: tuple[int, int],
+    pitch_mm: tuple[float, ...],
+    offset_mm: tuple[float, float],
+) -> ConeGeometry:
+    """A geometry of a file's numbers, over which the options win. InputError unless the panel stands behind the axis."""
+    to_axis_mm = options.source_to_axis_mm or to_axis_mm
+    to_detector_mm = options.source_to_detector_mm or to_detector_mm
+    if to_detector_mm <= to_axis_mm:
+        expected = f"more than {options.named('source_to_axis_mm')} ({to_axis_mm:g})"
+        subject = options.named("source_to_detector_mm")
+        raise InputError(subject, f"{to_detector_mm:g}", expected, "are the two exchanged?")
+    dv, du = options.pixel_size_mm or pitch_mm
+    return ConeGeometry(to_axis_mm, to_detector_mm, panel, (dv, du), options.detector_offset_mm or offset_mm)

@@ -64,7 +64,12 @@ def make_timing(
     assumed = tuple(name for name, value in unstated.items() if value is None)
     start, length = stored.pulse or (0.0, 0.0)
     pulse_s = (start * exposure_s, length * exposure_s) if stored.pulse and exposure_s > 0 else None
-    shutter = Shutter(exposure_s, readout_s or 0.0, axis or "rows", direction or 1, pulse_s)
+    try:
+        shutter = Shutter(exposure_s, readout_s or 0.0, axis or "rows", direction or 1, pulse_s)
+    except InputError as error:
+        if pulse_s is None:
+            raise
+        raise InputError(f"{culprit} [beam] pulse_start", error.found, error.expected, error.remedy) from error
     angle_at = angle_at or "start"
     frame_time_s = _first(options.frame_time_s, stored.frame_time_s)
     if options.frame_time_s is None and stored.start_s is not None:

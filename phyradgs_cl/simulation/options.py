@@ -101,7 +101,12 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
         del own["readout_ratio"], own["readout_ms"]
     chosen = {**own, **given}
     chosen.update({key: value for key, value in zip(usual, order, strict=False) if value is not None})
-    readout_ratio_of(chosen.get("readout_ms"), chosen.get("readout_ratio"), chosen.get("fps"), None, _flag)
+
+    def named(name: str) -> str:
+        is_scanner_s = name not in given and own.get(name) is not None
+        return f"{scanner.name} [readout] {name}" if is_scanner_s else _flag(name)
+
+    readout_ratio_of(chosen.get("readout_ms"), chosen.get("readout_ratio"), chosen.get("fps"), None, named)
     if unknown := sorted(set(chosen) - OPTION_NAMES):
         expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
@@ -109,7 +114,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     sheet = {key: chosen.pop(key, None) for key in _DATA_SHEET}
     made = make_protocol(protocol, **timing)
     if sheet["fps"] is not None:
-        made = made.at_rate(sheet["fps"], sheet["readout_ms"], _flag)
+        made = made.at_rate(sheet["fps"], sheet["readout_ms"], named)
     return SimulationOptions(protocol=made, **chosen)
 
 

@@ -67,6 +67,8 @@ def test_words_that_contradict_each_other_are_refused_in_one_line() -> None:
         "^--first: found 'left' with --readout 'rows'": options(first="left", readout_axis="rows"),
         "^--readout-ms: found 62 with --readout-ratio": options(fps=15, readout_ms=62, readout_ratio=0.9),
         "^--readout-ms: found 62 without .*--fps": options(readout_ms=62),
+        "^first: found 'left' with readout_axis 'rows'": lambda: simulate(first="left", readout_axis="rows"),
+        "^exposure_deg: found 5000": lambda: simulate(exposure_deg=5000.0),
         "^--readout-ms: found 62000; expected at most the 66.67 ms": options(fps=15, readout_ms=62000),
     })  # fmt: skip
 

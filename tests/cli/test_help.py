@@ -71,9 +71,9 @@ def test_the_defaults_are_those_of_the_default_method(told) -> None:
     options = method_options(DEFAULT_METHOD, None, {})
     text = " ".join(told("reconstruct", "-h").split())
     assert f"Defaults are those of {DEFAULT_METHOD}." in text
-    shown = {"--method": DEFAULT_METHOD, "--motion": options.motion.name, "--iterations": options.iterations, "--prior": options.prior}
-    for flag, value in shown.items():
-        assert f"[default: ({value})]" in text.split(f" {flag} ")[1].split(" --")[0], flag
+    shown = {"motion": options.motion.name, "iterations": options.iterations, "prior": options.prior}
+    for name, value in {"method": DEFAULT_METHOD, **shown}.items():
+        assert f"[default: ({value})]" in text.split(f" --{name} ")[1].split(" --")[0], name
 
 
 def test_a_default_is_that_of_the_command(told) -> None:

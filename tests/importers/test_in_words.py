@@ -119,6 +119,16 @@ def test_absurd_sizes_are_refused_at_import(run, tmp_path, make_truth, caplog) -
     assert "[angles]: 12 frames within 5.8°: are they radians?" in caplog.text
 
 
+def test_distances_and_pulses_are_named_by_the_door(run, tmp_path, make_truth) -> None:
+    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
+    words = ("--source-to-axis-mm", "800", "--source-to-detector-mm", "500")
+    assert "--source-to-detector-mm: found 500; expected more than --source-to-axis-mm (800)" in run(data, *words)[2]
+    beam = SHEET_TOML + "\n[beam]\npulse_start = 5\npulse_length = 1"
+    assert "[beam] pulse_start: found 2 to 2.4 s" in run(w.write_tiff(tmp_path / "tiff", make_truth(), beam))[2]
+    negative = SHEET_TOML.replace("0.4", "-0.4")
+    assert "[timing] exposure_s: found -0.4" in run(w.write_tiff(tmp_path / "other", make_truth(), negative))[2]
+
+
 def test_one_pixel_size_means_square_pixels(run, tmp_path, make_truth) -> None:
     data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
     cone = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800")

@@ -10,7 +10,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import checked, put_together
+from phyradgs_cl.importers.scan_parts import cone, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import read_array, read_title
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -51,4 +51,4 @@ def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions
         hdf5_frames.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
         hdf5_frames.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
     )
-    return checked(ConeGeometry(to_axis, to_detector, panel, pitch, options.detector_offset_mm or (0.0, 0.0)))
+    return cone(options, to_axis, to_detector, panel, pitch, (0.0, 0.0))

@@ -15,7 +15,7 @@ from phyradgs_cl.importers.formats.moving_poses import Turned
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import checked, put_together
+from phyradgs_cl.importers.scan_parts import cone, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -112,7 +112,7 @@ def _geometry(
     stored = hdf5_frames.stored_pitch
     pitch = options.pixel_size_mm or (stored(source, options, v), stored(source, options, u))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
-    return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
+    return cone(options, to_axis, to_detector, panel, pitch, offset)
 
 
 def _axis_offset(

@@ -67,7 +67,7 @@ class Circle:
 def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     """A folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON itself."""
     options.refuse_unused("phyradgs-real", OPTIONS)
-    checks.one_of(options.named("readout_axis"), options.readout_axis or "rows", ("rows",))
+    checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
     meta = Fields(f"{description}:", read_json(description))
     frames, views = _frames_and_views(description, list(meta.tables("views")), options)
