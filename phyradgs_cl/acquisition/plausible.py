@@ -20,12 +20,12 @@ _WIDEST_DEG = 120.0  # of a panel seen from the source; dental scanners reach 30
 _WRONG_UNIT = 100.0  # frames that one readout takes: ms for s makes it some hundreds
 _TIMES = 17  # of an exposure: between two of them no gantry turns by half a turn
 _SLACK = 1e-3  # relative: times and angles come rounded
-_MANY_FRAMES = 10  # of which fewer may well lie within a few degrees
+_MANY_FRAMES = 10  # fewer may lie within a few degrees on purpose
 _OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels that may be broken
 
 
 def summary(scan: "Scan") -> str:
-    """Both lines. What an import assumed, by the scan's provenance, is marked as such."""
+    """Returns both lines. Values that the scan's provenance lists as assumed are marked as such."""
     return f"{_timing(scan)}\n{_sizes(scan)}"
 
 

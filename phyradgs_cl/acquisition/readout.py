@@ -75,7 +75,7 @@ def exposure_of(
     exposure_deg: float | None, exposure_s: float | None, fps: float | None, turned_deg: np.ndarray
 ) -> tuple[float, float]:
     """Arc in degrees and time in s of an exposure. With ``fps`` one states the other, by the median step of ``turned_deg``
-    (F,); without it the time is 1 s unless given. InputError where neither or both are given beside ``fps``."""
+    (F,); without it the time is 1 s unless given. InputError where neither or both are given with ``fps``."""
     if exposure_s is not None:
         checks.positive("exposure_s", exposure_s)
     if exposure_deg is not None:

@@ -347,9 +347,9 @@ EXCHANGE: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "an angle that is NaN": (in_hdf5(lambda f: replaced(f, "exchange/theta", np.full(6, np.nan))), ("/exchange/theta",)),
     "an unknown unit": (in_hdf5(lambda f: f["exchange/theta"].attrs.update(units="gon")), ("gon",)),
     "flats of another size": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.ones((1, 2, 3)))), ("data_white",)),
-    "no flats": (in_hdf5(lambda f: f.pop("exchange/data_white")), ("say quantity",)),
+    "no flats": (in_hdf5(lambda f: f.pop("exchange/data_white")), ("what the pixels hold",)),
     "dead flats": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.zeros((1, 10, 14)))), ("no usable value",)),
-    "no pixel size": (in_hdf5(lambda f: f.pop("measurement")), ("say pixel_size_mm",)),
+    "no pixel size": (in_hdf5(lambda f: f.pop("measurement")), ("found nothing; expected a length; say",)),
 }  # fmt: skip
 
 DETECTOR = "entry0000/instrument/detector"
@@ -358,15 +358,15 @@ NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "truncated": (truncated(""), ("HDF5",)),
     "no data": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/data")), ("detector/data",)),
     "data elsewhere": (in_hdf5(lambda f: linked(f, f"{DETECTOR}/data")), ("passwd",)),
-    "no distance": (in_hdf5(lambda f: f.pop("entry0000/instrument/source/distance")), ("say source_to_axis_mm",)),
-    "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("say source_to_detector_mm",)),
+    "no distance": (in_hdf5(lambda f: f.pop("entry0000/instrument/source/distance")), ("source/distance", "in mm")),
+    "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("detector/distance", "in mm")),
     "no projections": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.ones(9, int))), ("image_key",)),
     "a key short": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.zeros(3, int))), ("image_key",)),
     "exposures that differ": (in_hdf5(lambda f: replaced(f, COUNT_TIME, np.arange(9.0), units="s")), ("count_time",)),
     "a tilted detector": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/transformations/rx", 12.0, units="deg")), ("rx", "12")),
     "a sample that moves": (in_hdf5(lambda f: f.create_dataset(MOVES, data=np.arange(9.0))), ("x_translation",)),
     "a scan of this package": (in_hdf5(lambda f: f.create_group("entry0000/phyradgs")), ("as it is",)),
-    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("say quantity",)),
+    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("what the pixels hold",)),
 }  # fmt: skip
 
 TOML = "scan.toml"

@@ -111,7 +111,7 @@ def _toml(value: object) -> str:
 
 
 def _patterns(tiffs: list[Path]) -> dict[str, str]:
-    """A pattern of names for the projections, the largest series, and for flats, darks and mask where names say so."""
+    """A pattern of names for the projections, the largest series, and for flats, darks and mask by their names."""
     series: dict[str, int] = {}
     for file in tiffs:
         pattern = re.sub(r"\d+(?=\D*$)", "*", file.name)
