@@ -366,7 +366,7 @@ NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a tilted detector": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/transformations/rx", 12.0, units="deg")), ("rx", "12")),
     "a sample that moves": (in_hdf5(lambda f: f.create_dataset(MOVES, data=np.arange(9.0))), ("x_translation",)),
     "a scan of this package": (in_hdf5(lambda f: f.create_group("entry0000/phyradgs")), ("as it is",)),
-    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("what the pixels hold",)),
+    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("what the pixels",)),
 }  # fmt: skip
 
 TOML = "scan.toml"
