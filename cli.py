@@ -47,7 +47,9 @@ class Loaded(Mapping[str, Any]):
         module = importlib.import_module(f"phyradgs_cl.commands.{module_name}")
         alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP)
         alone.command(name, cls=PanelledCommand, short_help=told, epilog=module.EXAMPLE)(getattr(module, f"{name}_command"))
-        return typer.main.get_command(alone)
+        command: Any = typer.main.get_command(alone)
+        command.groups = getattr(module, "GROUPS", {})
+        return command
 
     def __iter__(self) -> Iterator[str]:
         return iter(COMMANDS)

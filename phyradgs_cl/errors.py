@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from phyradgs_cl.text import plain_text
 
 _OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # what is quoted, a command or a value, stays
-_ELSEWHERE = {"with": "others"}  # options whose argument has another name
+_ELSEWHERE = {"with": "others", "readout": "readout_axis"}  # options whose argument has another name
 
 
 class PhyradgsError(Exception):

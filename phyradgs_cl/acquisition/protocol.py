@@ -7,6 +7,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.readout import Named
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
 from phyradgs_cl.errors import InputError
@@ -29,9 +30,9 @@ class Protocol:
     def __post_init__(self) -> None:
         checks.whole("--views", self.views, 1, 100_000)
         object.__setattr__(self, "views", int(self.views))
-        checks.within("start angle (degrees)", self.start_deg, -1e6, 1e6)
-        checks.within("exposure arc (degrees)", self.exposure_deg, 0, 3600)
-        checks.within("readout ratio", self.readout_ratio, 0, 1000)
+        checks.within("--start-deg", self.start_deg, -1e6, 1e6)
+        checks.within("--exposure-deg", self.exposure_deg, 0, 3600)
+        checks.within("--readout-ratio", self.readout_ratio, 0, 1000)
         if self.pulse is not None:
             self._check_pulse(*self.pulse)
 
@@ -40,11 +41,26 @@ class Protocol:
         fits = np.isfinite(start) and np.isfinite(length) and start < last and start + length > 0
         if not (fits and length > 0):
             expected = f"a start and a length above 0, in exposures, that meet a frame's window (0 to {last:g})"
-            raise InputError("pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
+            raise InputError("--pulse", f"{start:g},{length:g}", expected, "write for example 0.86,0.14")
 
     @property
     def step_deg(self) -> float:
         return 360.0 / self.views
+
+    def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
+        """The same arcs at a panel's frames per second and readout in ms, which state the exposure and the readout ratio.
+
+        Raises InputError for an arc of 0, and a readout that is longer than a frame."""
+        checks.positive(named("fps"), fps)
+        if self.exposure_deg == 0:
+            raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
+        exposure_s = self.exposure_deg / (self.step_deg * fps)
+        if readout_ms is None:
+            return replace(self, exposure_s=exposure_s)
+        if readout_ms > 1000 / fps:
+            expected = f"at most the {1000 / fps:.4g} ms of a frame at {fps:g} fps"
+            raise InputError(named("readout_ms"), f"{readout_ms:g}", expected, "correct its unit, or the frame rate")
+        return replace(self, exposure_s=exposure_s, readout_ratio=readout_ms / 1000 / exposure_s)
 
     def shutter(self, axis: str = "rows", direction: int = 1) -> Shutter:
         start, length = self.pulse or (0.0, 0.0)

@@ -1,15 +1,25 @@
-"""Lines first: operators see a frame with the readout's lines as its rows, whatever they are on the detector."""
+"""Readout of a panel: lines before columns or rows, for operators; and a data sheet's words for order, rate and time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.errors import InputError
+
+# by the side of the panel that is read first, seen from the source: readout axis and direction
+FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
+SIDES = tuple(FIRST_LINES)
+Named = Callable[[str], str]
+"""How a message calls a field: an argument of Python, an option of the command line or a key of a TOML file."""
 
 
 @dataclass(frozen=True)
 class Readout:
-    """``axis``: what a line is, "rows" or "columns" of the detector."""
+    """Lines first: operators see a frame with the readout's lines as its rows. ``axis``: what a line is on the detector,
+    "rows" or "columns"."""
 
     axis: str
 
@@ -29,3 +39,84 @@ class Readout:
     def spread(self, by_line: np.ndarray) -> np.ndarray:
         """Values (..., lines) that broadcast with frames (..., rows, columns)."""
         return by_line[..., :, None] if self.axis == "rows" else by_line[..., None, :]
+
+
+def readout_order(
+    first: str | None, axis: str | None, direction: int | None, named: Named = str
+) -> tuple[str | None, int | None]:
+    """Readout axis and direction; ``first``, a key of ``FIRST_LINES``, states both. InputError where they contradict."""
+    if first is None:
+        return axis, direction
+    checks.one_of(named("first"), first, FIRST_LINES)
+    for name, value, meant in zip(("readout_axis", "readout_direction"), (axis, direction), FIRST_LINES[first], strict=True):
+        if value not in (None, meant):
+            found = f"{first!r} with {named(name)} {value!r}"
+            raise InputError(named("first"), found, f"{meant!r}, which {first!r} means", f"leave {named(name)} out")
+    return FIRST_LINES[first]
+
+
+def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
+    """Seconds from frame to frame, from frames per second or as given. InputError where the two differ."""
+    if fps is None:
+        return frame_time_s
+    checks.positive(named("fps"), fps)
+    return _agreed(1 / fps, named("fps"), f"{fps:g} (every {1 / fps:.4g} s)", frame_time_s, named("frame_time_s"))
+
+
+def readout_of(readout_ms: float | None, readout_s: float | None, named: Named = str) -> float | None:
+    """Readout time in s, from ms or as given. InputError where the two differ."""
+    if readout_ms is None:
+        return readout_s
+    checks.at_least(named("readout_ms"), readout_ms, 0)
+    return _agreed(readout_ms / 1000, named("readout_ms"), f"{readout_ms:g}", readout_s, named("readout_s"))
+
+
+def exposure_of(
+    exposure_deg: float | None, exposure_s: float | None, fps: float | None, turned_deg: np.ndarray
+) -> tuple[float, float]:
+    """Arc in degrees and time in s of an exposure. With ``fps`` one states the other, by the median step of ``turned_deg``
+    (F,); without it the time is 1 s unless given. InputError where neither or both are given with ``fps``."""
+    if exposure_s is not None:
+        checks.positive("exposure_s", exposure_s)
+    if exposure_deg is not None:
+        checks.within("exposure_deg", exposure_deg, -3600, 3600)
+    if exposure_deg == 0:
+        raise InputError("exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops")
+    if fps is None:
+        if exposure_deg is None:
+            raise InputError("exposure_deg", "nothing", "the arc of an exposure", "give it, or fps and exposure_s")
+        return exposure_deg, exposure_s or 1.0
+    checks.positive("fps", fps)
+    if (exposure_deg is None) == (exposure_s is None):
+        found = f"{fps:g} with {'neither' if exposure_s is None else 'both'} exposure_s and exposure_deg"
+        raise InputError("fps", found, "one of the two", "give exposure_s and leave exposure_deg out")
+    deg_per_s = fps * float(np.median(np.diff(turned_deg))) if len(turned_deg) > 1 else 0.0
+    if deg_per_s == 0:
+        raise InputError("fps", f"{fps:g} with angles that do not change", "angles that turn", "leave fps out")
+    if exposure_s is not None:
+        return deg_per_s * exposure_s, exposure_s
+    assert exposure_deg is not None
+    return exposure_deg, abs(exposure_deg / deg_per_s)
+
+
+def readout_ratio_of(
+    readout_ms: float | None, readout_ratio: float | None, fps: float | None, exposure_s: float | None, named: Named = str
+) -> float | None:
+    """``readout_ratio``, checked; InputError for a readout in ms with a ratio as well, or without a rate or an exposure."""
+    if readout_ratio is not None:
+        checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
+    if readout_ms is None:
+        return readout_ratio
+    checks.at_least(named("readout_ms"), readout_ms, 0)
+    if readout_ratio is not None:
+        subject = named("readout_ratio")
+        raise InputError(named("readout_ms"), f"{readout_ms:g} with {subject}", "one of the two", f"leave {subject} out")
+    if fps is None and exposure_s is None:
+        raise InputError(named("readout_ms"), f"{readout_ms:g} without a frame rate", "both", f"give {named('fps')} too")
+    return None
+
+
+def _agreed(time_s: float, subject: str, found: str, other_s: float | None, other: str) -> float:
+    if other_s not in (None, time_s):
+        raise InputError(subject, f"{found} with {other} {other_s:g}", "one of the two", f"leave {other} out")
+    return time_s

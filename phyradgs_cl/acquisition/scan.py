@@ -171,6 +171,12 @@ class Scan:
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)
 
+    def summary(self) -> str:
+        """Two lines: shutter, frame rate, exposure; field of view, fan and cone, voxels, largest line integral."""
+        from phyradgs_cl.acquisition.plausible import summary
+
+        return summary(self)
+
     def plot(self, frame: int = 0) -> "Figure":
         """A figure of one frame (rows, columns) and of when its lines open and close, in degrees of the gantry too.
 

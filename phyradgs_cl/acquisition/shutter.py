@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
@@ -61,6 +61,11 @@ class Shutter:
     def readout(self) -> Readout:
         """How frames and poses turn to lines first."""
         return Readout(self.axis)
+
+    @property
+    def first(self) -> str:
+        """The side of the panel that is read first: "top", "bottom", "left" or "right", seen from the source."""
+        return next(side for side, order in FIRST_LINES.items() if order == (self.axis, self.direction))
 
     @property
     def span_s(self) -> float:

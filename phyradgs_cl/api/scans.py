@@ -1,6 +1,7 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.plausible import check_plausible
+from phyradgs_cl.acquisition.readout import exposure_of, readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import check_not_counts, check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.detector.attenuation import QUANTITIES
@@ -19,9 +22,11 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
 
 log = logging.getLogger(__name__)
-_TURN_RAD = 2 * np.pi
+# how messages call what ``fly_scan`` takes under another name
+_ARGUMENTS = {
+    "angles": "angles_deg", "exposure_s": "exposure_deg", "readout_s": "readout_ratio", "readout_axis": "readout",
+}  # fmt: skip
 _SLACK = 1e-3  # relative: angles come rounded
-_MANY = 16  # frames: fewer may well be of a few degrees
 _AIR_SLACK = 0.2  # of a transmission, with noise
 _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the gantry turns
 
@@ -31,11 +36,14 @@ def fly_scan(
     geometry: ConeGeometry,
     angles_deg: "ArrayLike",
     *,
-    exposure_deg: float,
-    readout_ratio: float = 0.0,
-    readout: str = "rows",
-    readout_direction: int = 1,
-    exposure_s: float = 1.0,
+    exposure_deg: float | None = None,
+    readout_ratio: float | None = None,
+    readout: str | None = None,
+    readout_direction: int | None = None,
+    exposure_s: float | None = None,
+    first: str | None = None,
+    fps: float | None = None,
+    readout_ms: float | None = None,
     flats: "ArrayLike | None" = None,
     darks: "ArrayLike | None" = None,
     mask: "ArrayLike | None" = None,
@@ -48,45 +56,54 @@ def fly_scan(
     frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given.
     geometry: distances and pixels in mm.
     angles_deg: (F,) the gantry's, as each frame's first line opens, counterclockwise seen from above.
-    exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise.
-    readout_ratio: readout over exposure time, from the first line's opening to the last's; 0 is a global shutter.
+    exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise; by fps and exposure_s when None.
+    readout_ratio: readout over exposure time, from the first line's opening to the last's; 0, when None: a global shutter.
     readout: what is read out at one time, "rows" or "columns". readout_direction: 1 index 0 first, -1 last.
-    exposure_s: of one line, s; only files and times in plots show it.
+    exposure_s: of one line, s; 1 when None, or by fps and exposure_deg.
+    first, fps, readout_ms: a data sheet's words. first: which line is read first, "top", "bottom", "left" or "right" seen
+    from the source, for readout and readout_direction. fps: frames per second. readout_ms: for readout_ratio.
     flats, darks: (n, rows, columns) counts without an object, and without a beam (0 when None).
     mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used.
     quantity: what ``frames`` hold, "attenuation", "transmission" or "counts", where ``flats`` do not say it.
     grid: the cube that a full turn sees, no higher than the panel does, in voxels of one pixel at the axis, when None.
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
-    Raises InputError for shapes that do not fit, numbers out of range, and angles that turn against the exposure.
+    Raises InputError for shapes that do not fit, numbers out of range or implausible, words that contradict each other, and
+    angles that turn against the exposure.
     """
+    axis, direction = readout_order(first, readout, readout_direction, lambda name: _ARGUMENTS.get(name, name))
+    readout, readout_direction = axis or "rows", 1 if direction is None else direction
     checks.one_of("readout", readout, AXES)
-    checks.within("readout_ratio", readout_ratio, 0, 1000)
-    checks.within("exposure_deg", exposure_deg, -3600, 3600)
-    checks.positive("exposure_s", exposure_s)
-    if exposure_deg == 0:
-        raise InputError(
-            "exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops"
-        )
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     turned_deg = np.unwrap(start_deg, period=360.0)
+    readout_ratio = readout_ratio_of(readout_ms, readout_ratio, fps, exposure_s)
+    exposure_deg, exposure_s = exposure_of(exposure_deg, exposure_s, fps, turned_deg)
+    readout_s = readout_ms / 1000 if readout_ms is not None else (readout_ratio or 0.0) * exposure_s
     steps = np.diff(turned_deg) / exposure_deg
     if np.all(steps < 0) and 0 < np.abs(np.diff(turned_deg)).max(initial=0) < _CLEAR_STEP_DEG:
         remedy = f"write exposure_deg={-exposure_deg:g}, or reverse the angles' sign"
         found = f"{exposure_deg:g} with angles that turn the other way"
         raise InputError("exposure_deg", found, "the sign of the angles' steps", remedy)
-    shutter = Shutter(exposure_s, readout_ratio * exposure_s, readout, readout_direction)
-    in_turn = np.all(steps > 0)
-    _warn_of_angles(turned_deg, steps.min(initial=np.inf) if in_turn else np.inf, readout_ratio)
-    exposures = (
-        (turned_deg - turned_deg[:1]) / exposure_deg
-        if in_turn
-        else np.arange(len(start_deg)) * (1 + readout_ratio)
+    shutter = Shutter(exposure_s, readout_s, readout, readout_direction)
+    start_s = (
+        (turned_deg - turned_deg[:1]) / exposure_deg * exposure_s
+        if np.all(steps > 0)
+        else np.arange(len(start_deg)) * shutter.span_s
     )
-    start_s, first = exposures * exposure_s, np.deg2rad(start_deg)
-    orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first, first + np.deg2rad(exposure_deg)))
-    return _scan(pixels, orbit, shutter, start_s, grid, True, others)
+    first_rad = np.deg2rad(start_deg)
+    last_rad = first_rad + np.deg2rad(exposure_deg)
+    orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first_rad, last_rad))
+    _warn_of_exposure(steps)
+    called = _ARGUMENTS if readout_ms is None else {**_ARGUMENTS, "readout_s": "readout_ms"}
+    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called)
+
+
+def _warn_of_exposure(steps: np.ndarray) -> None:
+    """Warns of steps (F − 1,), in exposures, that are as long as if the exposure were in radians."""
+    least_step = steps.min(initial=np.inf)
+    if np.rad2deg(1 - _SLACK) < least_step < np.inf:
+        log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
 
 
 def static_scan(
@@ -110,28 +127,10 @@ def static_scan(
     """
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     angle_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
-    _warn_of_angles(angle_deg)
     angle_rad = np.deg2rad(angle_deg)
     start_s = np.arange(len(angle_rad), dtype=np.float64)
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, 0.0, angle_rad, angle_rad))
     return _scan(pixels, orbit, Shutter(0.0), start_s, grid, False, others)
-
-
-def _warn_of_angles(angle_deg: np.ndarray, least_step: float = np.inf, readout_ratio: float = 0.0) -> None:
-    """Says what angles (F,) look like that are radians, and what no panel does; ``least_step``: of the shortest step, how
-    many exposures it has.
-    """
-    span_deg = float(np.ptp(angle_deg))
-    if len(angle_deg) >= _MANY and 0 < span_deg <= _TURN_RAD * (1 + _SLACK):
-        log.warning("angles_deg: %d frames within %.4g°: are they radians? np.rad2deg(angles)", len(angle_deg), span_deg)
-    elif least_step < 1 - _SLACK:
-        found = "angles_deg: frames follow each other within %.3g of an exposure: a line would open again while it is open"
-        log.warning(found + "; expected steps of exposure_deg or more, but where turns are sorted by angle", least_step)
-    elif np.rad2deg(1 - _SLACK) < least_step < np.inf:
-        log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
-    elif readout_ratio > least_step * (1 + _SLACK):
-        found = "readout_ratio: readout takes %.4g of the time between frames: a frame would be read while the last one is"
-        log.warning(found + "; is it in percent?", readout_ratio / least_step)
 
 
 def _warn_of_transmission(frames: np.ndarray) -> None:
@@ -183,13 +182,15 @@ def _pixels(
 
 def _scan(
     pixels: LineIntegrals, orbit: CircularOrbit, shutter: Shutter, start_s: np.ndarray, grid: Grid | None, is_fly: bool,
-    others: dict[str, Any],
+    others: dict[str, Any], called: Mapping[str, str] = _ARGUMENTS,
 ) -> Scan:  # fmt: skip
     check_others(others)
     if "pixel_mask" in others:
         raise InputError("pixel_mask", "an option of Scan itself", "mask", "write mask=")
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly
-    return Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
+    scan = Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
+    check_plausible(scan, lambda name: called.get(name, name))
+    return scan
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:

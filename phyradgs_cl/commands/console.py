@@ -78,14 +78,21 @@ def give_up_stdout() -> None:
 
 
 class PanelledCommand(TyperCommand):
-    """A command whose help lists options with a ``rich_help_panel`` apart; Typer does so only with rich, in boxes."""
+    """A command whose help lists its options under the headings of ``groups``, heading: names of parameters. ``help`` comes
+    last under the first heading, what no group names under "Options"."""
+
+    groups: Mapping[str, Sequence[str]] = {}
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        panels: dict[str, list[tuple[str, str]]] = {}
-        for parameter in self.get_params(ctx):
+        headings = {name: heading for heading, names in self.groups.items() for name in names}
+        order = list(headings)
+        headings["help"] = next(iter(self.groups), "Options")
+        panels: dict[str, list[tuple[str, str]]] = {name: [] for name in ("Arguments", "Options", *self.groups)}
+        for parameter in sorted(self.get_params(ctx), key=lambda p: order.index(p.name) if p.name in order else len(order)):
             usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
             if (record := parameter.get_help_record(ctx)) is not None:
-                panels.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(record)
-        for name in sorted(panels, key=lambda name: name not in ("Arguments", "Options")):
-            with formatter.section(name):
-                formatter.write_dl(panels[name])
+                panels[headings.get(parameter.name or "", usual)].append(record)
+        for name, records in panels.items():
+            if records:
+                with formatter.section(name):
+                    formatter.write_dl(records)

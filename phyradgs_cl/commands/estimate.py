@@ -2,6 +2,7 @@
 
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import Scan
+from phyradgs_cl.commands.run_options import GROUPS as GROUPS
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
 from phyradgs_cl.reconstructors import Reconstruction, method_options

@@ -1,7 +1,6 @@
 """import: a scan of another program becomes one of ours."""
 
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,18 +8,20 @@ import numpy as np
 
 from phyradgs_cl.commands.console import remark, say
 from phyradgs_cl.commands.files import file_argument, file_option, option
-from phyradgs_cl.commands.options import Axis, DetectorModel, RoiMm, Size, VoxelMm, lengths
+from phyradgs_cl.commands.options import Axis, DetectorModel, First, RoiMm, Size, VoxelMm, lengths, pitches
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
-from phyradgs_cl.importers.options import WORDS
+from phyradgs_cl.importers.formats.tiff_template import template_of
+from phyradgs_cl.importers.options import FIELDS, WORDS, option_name
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.workflow.files import refuse_foreign_suffix
 
 EXAMPLE = (
     "Example: phyradgs import chest_50.pickle -o scan.h5\n\n"
-    "Example: phyradgs import scan.xml -o scan.h5 --exposure-s 0.03 --readout-s 0.02 --frame-time-s 0.05"
+    "Example: phyradgs import scan.xml -o scan.h5 --fps 15 --exposure-s 0.06 --readout-ms 62 --first top\n\n"
+    "Example: phyradgs import tiffs --template > tiffs/scan.toml"
 )
 
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
@@ -31,48 +32,59 @@ Rotates = Literal[WORDS["rotates"]]  # type: ignore[name-defined, valid-type]
 Row0 = Literal[WORDS["row_0"]]  # type: ignore[name-defined, valid-type]
 Column0 = Literal[WORDS["column_0"]]  # type: ignore[name-defined, valid-type]
 
-_FIELDS = frozenset(f.name for f in fields(ImportOptions))
 _FILE, _FORMAT = "the file's", "the format's"
+# heading of the help: names of parameters
+GROUPS = {
+    "Basics": (
+        *("output", "template", "form", "source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm"),
+        *("fps", "exposure_s", "readout_ms", "first"),
+    ),
+    "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
+    "Timing": ("frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
+    "Pixels": ("quantity", "flat_value", "row_0", "column_0", "part", "first_view"),
+    "Volume": ("size", "voxel_mm", "roi_mm"),
+}
 
 
 def import_command(
-    source: Annotated[Path, file_argument("SRC", "File or folder of another program; see docs/import.md.")],
-    output: Annotated[
-        Path, file_option("Scan file to write; an existing one is replaced whole.", "--output", "-o")
-    ],
+    source: Annotated[Path, file_argument("SRC", "File or folder of another program (docs: import.md).")],
+    output: Annotated[Path | None, file_option("Scan file to write; an existing one is replaced.", "--output", "-o")] = None,
+    template: Annotated[
+        bool, option("Print a TOML to fill in for a folder of TIFFs, and write nothing.", True, "--template")
+    ] = False,
     form: Annotated[FormatName | None, option("Format of SRC.", "recognised", "--format")] = None,  # type: ignore[valid-type]
     exposure_s: Annotated[float | None, option("Exposure of a line, s.", _FILE)] = None,
-    readout_s: Annotated[
-        float | None, option("From the first line's opening to the last line's, s.", _FILE)
+    readout_ms: Annotated[float | None, option("From the first line's opening to the last line's, ms.", _FILE)] = None,
+    readout_s: Annotated[float | None, option("--readout-ms in s.", _FILE)] = None,
+    fps: Annotated[
+        float | None, option("Frames per second of a gantry that never stops.", f"{_FILE}, else at rest")
     ] = None,
-    frame_time_s: Annotated[
-        float | None,
-        option("From one frame's opening to the next, s: the gantry turned without a stop.", f"{_FILE}, else at rest"),
-    ] = None,
+    frame_time_s: Annotated[float | None, option("From frame to frame, s: in place of --fps.", f"{_FILE}")] = None,
     angle_at: Annotated[
-        AngleAt | None, option("What a frame's angle belongs to: start or middle of its exposure.", "start")
+        AngleAt | None, option("A frame's angle is that of its first line's start or middle.", "start")
     ] = None,
-    readout_axis: Annotated[Axis | None, option("What is read out at one time.", _FORMAT, "--readout")] = None,
+    first: Annotated[First | None, option("Line that is read first, seen from the source.", _FORMAT)] = None,
+    readout_axis: Annotated[Axis | None, option("What is read at one time.", _FORMAT, "--readout")] = None,
     readout_direction: Annotated[
-        int | None, option("1 reads our row 0 (lowest) or column 0 (left) first, -1 last.", _FORMAT)
+        int | None, option("1 reads row 0 (lowest) or column 0 (left) first, -1 last.", _FORMAT)
     ] = None,
     source_to_axis_mm: Annotated[float | None, option("Source to rotation axis, mm.", _FILE)] = None,
     source_to_detector_mm: Annotated[float | None, option("Source to detector, mm.", _FILE)] = None,
-    pixel_size_mm: Annotated[Any, lengths("--pixel-size-mm", "Pixel size V,U in mm.", _FILE)] = None,
+    pixel_size_mm: Annotated[Any, pitches("--pixel-size-mm", "Pixel's side, or height and width, mm.", _FILE)] = None,
     detector_offset_mm: Annotated[Any, lengths("--detector-offset", "Detector offset V,U in mm.", _FILE)] = None,
     unit_mm: Annotated[float, option("Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
     rotates: Annotated[Rotates | None, option("What the stored angles turn.", _FORMAT)] = None,
     row_0: Annotated[Row0 | None, option("Where the first stored row is.", _FORMAT, "--row-0")] = None,
     column_0: Annotated[
-        Column0 | None, option("Where the first stored column is, seen from the source.", "left", "--column-0")
+        Column0 | None, option("Where the first stored column is, from the source.", "left", "--column-0")
     ] = None,
     quantity: Annotated[Quantity | None, option("What the pixels hold.", _FILE)] = None,
     flat_value: Annotated[
-        float | None, option("Counts without an object, where there are no flat frames.", _FILE)
+        float | None, option("Counts without an object, in place of flat frames.", _FILE)
     ] = None,
     detector_model: Annotated[
         DetectorModel | None,
-        option("What is averaged over an exposure: line integrals or intensity.", "log"),
+        option("What an exposure averages: line integrals (log) or intensity.", "log"),
     ] = None,
     part: Annotated[Part, option("Projections of a benchmark folder (r2, phyradgs, naf).")] = "train",
     first_view: Annotated[
@@ -83,8 +95,13 @@ def import_command(
     roi_mm: RoiMm = None,
 ) -> None:
     """Import a scan of another program: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF."""
-    given = {name: value for name, value in locals().items() if name in _FIELDS}
-    options = ImportOptions(**given)
+    given = {name: value for name, value in locals().items() if name in FIELDS}
+    if template:
+        say(template_of(source))
+        return
+    if output is None:
+        raise InputError("--output", "nothing", "a scan file to write", "say -o scan.h5")
+    options = ImportOptions(**given, named=option_name)
     grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
     refuse_foreign_suffix(output)
@@ -99,15 +116,12 @@ def import_command(
             write_scan(output, scan)
     frames, rows, columns = scan.projections.shape
     bad = np.zeros(1, bool) if scan.pixel_mask is None else np.asarray(scan.pixel_mask) != 0
-    masked, largest = int(np.count_nonzero(bad)), float(np.max(scan.projections, where=~bad, initial=-np.inf))
+    masked = int(np.count_nonzero(bad))
     whole = [] if bad.ndim < 3 else np.flatnonzero(bad.all((1, 2))).tolist()
     if whole:
         remark(f"no pixel can be used in {len(whole)} frames (from 0): {', '.join(map(str, whole[:10]))}")
     kind = "fly-scan" if scan.is_fly else "at rest"
-    say(
-        f"{output}: {chosen}, {frames} frames of {rows}×{columns}, {kind}, "
-        f"largest line integral {largest:.3g}, {masked} pixels masked"
-    )
+    say(f"{output}: {chosen}, {frames} frames of {rows}×{columns}, {kind}, {masked} pixels masked\n{scan.summary()}")
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:

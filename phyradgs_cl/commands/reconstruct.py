@@ -10,6 +10,7 @@ from phyradgs_cl.commands.console import complain, say, scores
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Output, Scan
 from phyradgs_cl.commands.ranks import last_words
+from phyradgs_cl.commands.run_options import GROUPS as GROUPS
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
@@ -25,9 +26,9 @@ EXAMPLE = (
     "Example: phyradgs reconstruct scan.h5 -o volume.h5 --method phyradgs --iterations 2000\n\n"
     "Ctrl-C keeps what there is, here as volume.partial.h5, and a checkpoint; --resume goes on from it."
 )
-_CHECKPOINT = "Keep a checkpoint beside the output so often, for --resume after a kill; 0: on Ctrl-C only."
-_PREVIEW = "PNG of the three middle slices; of the run under way, every five seconds, as NAME.partial.png."
-_PROFILE = "Say where the device's time went, kernel by kernel, beside its best rates."
+_CHECKPOINT = "Seconds from checkpoint to checkpoint, for --resume; 0: on Ctrl-C only."
+_PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, every five seconds."
+_PROFILE = "Print the device's time by kernel."
 
 
 @with_run_options()
@@ -36,14 +37,14 @@ def reconstruct_command(
     output: Output,
     request: RunRequest,
     initial: Annotated[
-        Path | None, file_option("Volume to start from, for iterative and splatting methods.", "--initial")
+        Path | None, file_option("Volume to start from.", "--initial")
     ] = None,
-    resume: Annotated[bool, option("Go on from the checkpoint of an interrupted run.", True, "--resume")] = False,
+    resume: Annotated[bool, option("Go on from an interrupted run's checkpoint.", True, "--resume")] = False,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
     profile: Annotated[bool, option(_PROFILE, True, "--profile")] = False,
 ) -> None:
-    """Reconstruct a scan into a volume; say PSNR and SSIM if the scan carries the truth."""
+    """Reconstruct a scan into a volume; print PSNR and SSIM if the scan carries the truth. Defaults are those of fista."""
     settings = request.settings()
     job = request.job(settings, scan, output, initial=initial, resume=resume, checkpoint_every_s=checkpoint_every)
     ranks = launched_ranks()

@@ -14,34 +14,27 @@ from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
 from phyradgs_cl.settings import RunSettings, run_settings
 from phyradgs_cl.workflow import ReconstructionJob
 
-_METHOD = (
-    "phyradgs: exact splats; r2: R2-Gaussian's affine splats; fdk: analytic; "
-    "naf, sax-nerf: neural fields; MODULE:NAME: a function of your own (docs: api.md); "
-    "the others are iterative on voxels."
-)
+# heading of the help: names of parameters; a command shows those that it has
+GROUPS = {
+    "Basics": ("output", "method", "motion", "size", "iterations"),
+    "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial"),
+    "Motion": ("strips", "sub_intervals", "segments", "time_error", "detector_model"),
+    "Quality": (
+        *("prior", "preset", "assignments", "tune", "holdout", "steps", "median_filter", "ignore_lag", "gaussians", "seed"),
+    ),
+    "Run": ("device", "memory", "config", "preview", "resume", "checkpoint_every", "profile"),
+    "Under mpiexec (docs: cluster.md)": ("batch",),
+}
+_METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
 _MOTION = (
-    "How frames see the moving gantry: frozen at mid-window (static), at the start, M×N micro-views, "
-    "every line at its own times (per-row), or splats that move while lines integrate (exact); "
-    "not every method has all of them."
+    "Poses of a frame: one (static, static-start), M×N micro-views, every line at its own times (per-row), or, of "
+    "splats, integrals over them (exact)."
 )
-_PRIOR = (
-    "The prior, for fista: dct, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own "
-    "(docs: methods.md)."
-)
-_PRESET = "Constants: default, quick, paper or released (phyradgs); published (r2, naf, sax-nerf); the window of fdk."
-_CONFIG = (
-    "TOML file of options (underscores for dashes; docs: formats.md) and the method's constants; "
-    "the command line wins."
-)
-_SET = (
-    "Any option of the method by name, as in the file: --set tv_weight=0.002 --set order=random. "
-    "Docs: methods.md."
-)
-_TUNE = (
-    "Option of the method that the scan chooses, by the error on pixels that trials do not see: tv_weight, "
-    "prior_weight=0.4,0.8,1.6, iterations. Docs: methods.md."
-)
-_RANKS = "Under mpiexec (docs: cluster.md)"  # a panel of its own at the end of a command's help
+_PRIOR = "Prior, for fista: dct, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own."
+_PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
+_CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
+_SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
+_TUNE = "Option that held-out pixels choose: tv_weight, prior_weight=0.4,0.8,1.6, iterations (docs: methods.md)."
 
 
 def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
@@ -53,44 +46,44 @@ RUN_OPTIONS: dict[str, Any] = {
     "motion": _asked(
         Literal[MOTIONS],
         _MOTION,
-        "each line at its own times for fista, phyradgs and fused; else static",
+        "per-row",
     ),
-    "strips": _asked(int, "Strips M of a frame (rolling shutter); means micro-views.", "8"),
+    "strips": _asked(int, "Strips M of a frame; means micro-views.", "8"),
     "sub_intervals": _asked(
-        int, "Sub-intervals N of an exposure (motion blur); for phyradgs means micro-views.", "5"
+        int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "5"
     ),
-    "segments": _asked(int, "Segments of a frame (motion exact); 0: by the time error.", "0"),
-    "time_error": _asked(float, "Relative error that averaging over time may leave (motion exact).", "0.005"),
+    "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),
+    "time_error": _asked(float, "Relative error of averaging over time (exact).", "0.005"),
     "iterations": _asked(
-        int, "Iterations: one frame each for splats, all frames for voxels.", "preset's: 3000 for splats"
+        int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "35"
     ),
     "prior": _asked(str, _PRIOR, "dct", metavar="NAME|MODULE:NAME"),
-    "gaussians": _asked(int, "Gaussians at the start.", "preset's: from the grid"),
+    "gaussians": _asked(int, "Gaussians at the start, of splats.", "from the grid"),
     "size": options.Size,
     "voxel_mm": options.VoxelMm,
     "roi_mm": options.RoiMm,
     "margin_mm": options.MarginMm,
-    "seed": _asked(int, "Seed of cloud, frame order and sub-volumes.", "0"),
+    "seed": _asked(int, "Seed of the random numbers.", "0"),
     "preset": _asked(str, _PRESET, "the method's first"),
     "batch": _asked(
-        int, "Frames per step, for splats.", "as many as ranks", metavar="B", rich_help_panel=_RANKS
+        int, "Frames per step, for splats.", "as many as ranks", metavar="B"
     ),
     "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
     "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
     "detector_model": _asked(
         options.DetectorModel,
-        "What is averaged over an exposure: line integrals (log) or intensity.",
+        "What an exposure averages: line integrals (log) or intensity.",
         "the scan's",
     ),
     "ignore_lag": Annotated[
-        bool, option("Leave the lag that the scan file states in the frames.", True, "--ignore-lag")
+        bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")
     ],
     "steps": options.Steps,
     "holdout": _asked(
-        float, "Pixels that the method does not see, to say how far its volume is from them.", "0", metavar="PERCENT"
+        float, "Pixels hidden from the method, to measure its error on them.", "0", metavar="PERCENT"
     ),
     "tune": _asked(str, _TUNE, "none", metavar="NAME[=VALUES]"),
-    "median_filter": _asked(int, "Median filter of the frames: 3 or 5 pixels per side, 0 none.", "0"),
+    "median_filter": _asked(int, "Median filter of the frames, of 3 or 5 pixels a side.", "0"),
     "device": options.Device,
     "memory": options.Memory,
 }

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.files import file_option, option
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, Memory, Output, lengths
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, First, Memory, Output, lengths
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
@@ -16,14 +16,24 @@ from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_opti
 
 EXAMPLE = "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"
 
+# heading of the help: names of parameters
+GROUPS = {
+    "Basics": ("output", "phantom", "volume", "scanner", "protocol", "size", "detector", "noise", "dose", "seed"),
+    "Timing": (
+        *("views", "exposure_deg", "fps", "readout_ms", "readout_ratio", "first", "readout_axis", "readout_direction"),
+        *("start_deg", "jitter_deg", "pulse"),
+    ),
+    "Panel and beam": (
+        *("detector_offset", "truncation", "detector_model", "peak", "electronic_noise", "lag", "rings", "sparks"),
+        *("drift", "scatter", "kvp"),
+    ),
+    "Run": ("pixel_samples", "time_samples", "device", "memory"),
+}
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]
 _PHANTOM = f"Built-in phantom ({', '.join(PHANTOMS)}) or a TOML file of beads and wires."
-_VOLUME = "Volume file: ours, an HDF5 file with a dataset /volume (z, y, x), mha, nii, nrrd, npy or tiff."
-_PROTOCOL = (
-    "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: stop-and-shoot at the mid-window poses of "
-    "rapid, or of the fly-scan that the options below describe."
-)
+_VOLUME = "Volume file: HDF5 with /volume (z, y, x), mha, nii, nrrd, npy or tiff."
+_PROTOCOL = "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: rapid with a gantry that stops."
 
 
 def _phantoms(incomplete: str) -> list[str]:
@@ -40,16 +50,21 @@ def simulate_command(
     protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]
     views: Annotated[int | None, option("Frames in the turn.", "protocol's")] = None,
     exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,
-    readout_ratio: Annotated[float | None, option("Readout over exposure time, T_ro/T_exp.", "0.86")] = None,
+    readout_ratio: Annotated[float | None, option("Readout over exposure time.", "0.86")] = None,
+    fps: Annotated[float | None, option("Frames per second; states the times of the arcs.", "scanner's")] = None,
+    readout_ms: Annotated[
+        float | None, option("Readout in ms, with --fps in place of --readout-ratio.", "scanner's")
+    ] = None,
+    first: Annotated[First | None, option("Line that is read first, seen from the source.", "scanner's")] = None,
     start_deg: Annotated[float | None, option("Gantry angle at the start, degrees.", "0")] = None,
     readout_axis: Annotated[
-        Axis | None, option("What is read out at one time.", "scanner's", "--readout")
+        Axis | None, option("What is read at one time.", "scanner's", "--readout")
     ] = None,
     readout_direction: Annotated[int | None, option("1 reads index 0 first, -1 last.", "scanner's")] = None,
     pulse: Annotated[
         Any,
         option(
-            "When the beam is on, after a frame's start, in shares of the exposure.",
+            "When the beam is on, in exposures after a frame's start.",
             "scanner's: always on",
             parser=pair_parser("--pulse", "START,LENGTH in shares of the exposure", "0.86,0.14"),
             metavar="START,LENGTH",
@@ -57,50 +72,50 @@ def simulate_command(
     ] = None,
     lag: Annotated[
         float | None,
-        option("Share of a recorded frame that comes from the frames before, 0 to 0.9.", "scanner's: 0"),
+        option("Share of a frame that comes from the frames before.", "scanner's: 0"),
     ] = None,
     detector_model: Annotated[
-        DetectorModel, option("Average line integrals (log) or transmitted intensity over the exposure.")
+        DetectorModel, option("What an exposure averages: line integrals (log) or intensity.")
     ] = "log",
     peak: Annotated[
-        float, option("Scale attenuation so that the largest line integral is this; 0 leaves it.")
+        float, option("Largest line integral, by scaling the attenuation; 0: as it is.")
     ] = 0.0,
     noise: Annotated[
         Noise,
-        option("tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts; both plus electronic noise."),
+        option("tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts."),
     ] = "none",
-    dose: Annotated[float | None, option("Photons per pixel without object, for --noise.", "10000")] = None,
+    dose: Annotated[float | None, option("Photons per pixel without object.", "10000")] = None,
     electronic_noise: Annotated[
-        float | None, option("Standard deviation of electronic noise, counts, for --noise.", "10")
+        float | None, option("Standard deviation of electronic noise, counts.", "10")
     ] = None,
     rings: Annotated[float | None, option("Spread of the pixels' gains (std), seen as rings.", "0")] = None,
     sparks: Annotated[float | None, option("Share of all pixels that a spark hits.", "0")] = None,
     drift: Annotated[float | None, option("Largest change of the tube's light from frame to flat.", "0")] = None,
     scatter: Annotated[float | None, option("Scatter over primary light behind the object.", "0")] = None,
     kvp: Annotated[
-        float | None, option("Tube voltage, kV, of a beam that hardens; dense voxels are bone.", "0: one energy")
+        float | None, option("Tube voltage, kV: a beam that hardens.", "0: one energy")
     ] = None,
     truncation: Annotated[float, option("Share of the panel's columns cut off, half at each side.")] = 0.0,
     jitter_deg: Annotated[
         float | None,
-        option("Wander of the gantry about constant speed (std, degrees), written to the encoder table.", "0"),
+        option("Wander of the gantry (std, degrees), in the encoder table.", "0"),
     ] = None,
     detector: Annotated[
         int | None,
-        option("Detector columns (rows in proportion); the panel keeps its size.", "scanner's"),
+        option("Detector columns, rows in proportion; the panel's size stays.", "scanner's"),
     ] = None,
     detector_offset: Annotated[
         Any, lengths("--detector-offset", "Detector offset V,U in mm.", "scanner's")
     ] = None,
     size: Annotated[
         int | None,
-        option("Voxels along the longest side of the grid and truth.", "scanner's or the file's"),
+        option("Voxels along the longest side of the truth.", "scanner's or the file's"),
     ] = None,
     pixel_samples: Annotated[
-        int, option("Rays along each side of a pixel, over whose area they are averaged; 1: its centre.")
+        int, option("Rays along each side of a pixel; 1: its centre.")
     ] = 1,
     time_samples: Annotated[
-        int, option("Times at which every line is projected in its exposure; 0 chooses by the motion.")
+        int, option("Times of a line's exposure; 0: by the motion.")
     ] = 0,
     seed: Annotated[int, option("Seed of phantom, noise and jitter.")] = 0,
     device: Device = None,

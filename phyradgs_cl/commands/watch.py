@@ -8,6 +8,7 @@ import typer
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say, scores
 from phyradgs_cl.commands.files import file_argument, option
+from phyradgs_cl.commands.run_options import GROUPS as GROUPS
 from phyradgs_cl.commands.run_options import RunRequest, with_run_options
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport

@@ -24,7 +24,7 @@ def recognise(path: Path) -> str:
         return found[0]
     if not found and _holds_tiffs(path):
         what, expected = "TIFF images and no TOML that describes them", "geometry and angles in a TOML beside them"
-        remedy = "docs/import.md and docs/tutorial.md have one to start from"
+        remedy = f"'phyradgs import {path if path.is_dir() else path.parent} --template' prints one to fill in"
         raise InputError(str(path), what, expected, remedy)
     what = f"several: {', '.join(found)}" if found else "no known format"
     raise InputError(str(path), what, "one of the formats of docs/import.md", "say which with --format")

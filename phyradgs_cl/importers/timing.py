@@ -8,7 +8,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.options import ImportOptions
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
@@ -17,12 +17,14 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 @dataclass(frozen=True, eq=False)
 class Timing:
     """When frames were taken. ``start_s`` (F,) opening of each first-read line; ``is_fly``: the gantry never stops;
-    ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure."""
+    ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure. ``assumed``: what neither
+    file nor user stated, in the words of ``acquisition/plausible.py``."""
 
     shutter: Shutter
     start_s: np.ndarray
     is_fly: bool
     angle_at: str = "start"
+    assumed: tuple[str, ...] = ()
 
     @property
     def angle_time_s(self) -> np.ndarray:
@@ -39,10 +41,10 @@ class StoredTiming:
     readout_s: float | None = None
     frame_time_s: float | None = None
     start_s: np.ndarray | None = None
-    axis: str = "rows"
-    direction: int = 1
+    axis: str | None = None
+    direction: int | None = None
     pulse: tuple[float, float] | None = None  # in exposures, as the scanner's TOML gives it
-    angle_at: str = "start"
+    angle_at: str | None = None
     written: tuple[str, ...] = ()
 
 
@@ -54,12 +56,21 @@ def make_timing(
     what a user says of a turn in between is refused."""
     stored = stored or StoredTiming()
     exposure_s = _first(options.exposure_s, stored.exposure_s) or 0.0
-    readout_s = _first(options.readout_s, stored.readout_s) or 0.0
-    direction = stored.direction if options.readout_direction is None else options.readout_direction
+    readout_s = _first(options.readout_s, stored.readout_s)
+    axis = options.readout_axis or stored.axis
+    direction = options.readout_direction or stored.direction
+    angle_at = options.angle_at or stored.angle_at
+    unstated = {"readout": readout_s, "axis": axis, "first": direction, "angles": angle_at}
+    assumed = tuple(name for name, value in unstated.items() if value is None)
     start, length = stored.pulse or (0.0, 0.0)
     pulse_s = (start * exposure_s, length * exposure_s) if stored.pulse and exposure_s > 0 else None
-    shutter = Shutter(exposure_s, readout_s, options.readout_axis or stored.axis, direction, pulse_s)
-    angle_at = options.angle_at or stored.angle_at
+    try:
+        shutter = Shutter(exposure_s, readout_s or 0.0, axis or "rows", direction or 1, pulse_s)
+    except InputError as error:
+        if pulse_s is None:
+            raise
+        raise InputError(f"{culprit} [beam] pulse_start", error.found, error.expected, error.remedy) from error
+    angle_at = angle_at or "start"
     frame_time_s = _first(options.frame_time_s, stored.frame_time_s)
     if options.frame_time_s is None and stored.start_s is not None:
         start_s: np.ndarray = np.asarray(stored.start_s, np.float64)
@@ -69,8 +80,8 @@ def make_timing(
     else:
         _check_rest(culprit, shutter, options, stored)
         return Timing(shutter, np.arange(frames) * max(shutter.span_s, 1.0), False, angle_at)
-    _check_flight(culprit, shutter, start_s)
-    return Timing(shutter, start_s, True, angle_at)
+    _check_flight(culprit, shutter, start_s, options)
+    return Timing(shutter, start_s, True, angle_at, assumed)
 
 
 def turning(geometry: ConeGeometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
@@ -92,19 +103,20 @@ def _first(*values: float | None) -> float | None:
 
 def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses what a user says of a turn without the time from frame to frame; warns where a file has an exposure."""
-    asked = [option_name(name) for name in _OF_A_TURN if getattr(options, name) is not None]
-    remedy = f"say {option_name('frame_time_s')}"
+    asked = [options.called(name) for name in options.given(_OF_A_TURN)]
+    frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
     for name in (*asked, *stored.written):
-        raise InputError(name, "no time from frame to frame beside it", "both, or neither for frames taken at rest", remedy)
+        expected = "both, or neither for frames taken at rest"
+        raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")
     if shutter.exposure_s > 0:
-        text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; %s if the gantry did not stop"
-        _log.warning(text, culprit, shutter.exposure_s, option_name("frame_time_s"))
+        text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; say %s if the gantry did not stop"
+        _log.warning(text, culprit, shutter.exposure_s, frame_time)
 
 
-def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray) -> None:
+def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray, options: ImportOptions) -> None:
     if shutter.exposure_s <= 0:
         found = "none, with a gantry that does not stop"
-        remedy = f"say {option_name('exposure_s')}, or leave the frame time out for frames taken at rest"
+        remedy = f"say {options.named('exposure_s')}, or leave the frame time out for frames taken at rest"
         raise InputError(f"{culprit} exposure", found, "a time above 0 s", remedy)
     checks.finite(f"{culprit} start times", start_s)
     if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):

@@ -7,6 +7,7 @@ from pathlib import Path
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.readout import readout_order
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
@@ -16,14 +17,14 @@ from phyradgs_cl.io.hdf5.units import LENGTH
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.text import near_miss
 
-_TABLES: dict[str, tuple[str, ...]] = {
+TABLES: dict[str, tuple[str, ...]] = {
     "source": ("to_axis_mm", "to_detector_mm"),
     "detector": (
         *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"), "lag"
     ),
     "beam": ("pulse_start", "pulse_length"),
     "volume": ("shape", "size_mm", "offset_mm"),
-    "readout": ("axis", "direction", "ratio"),
+    "readout": ("axis", "direction", "first", "ratio", "fps", "readout_ms"),
 }
 _WORDS = ("title",)
 MOST_LINES = 65_536
@@ -33,7 +34,7 @@ MOST_LINES = 65_536
 class Scanner:
     """A scanner: where things stand, what volume it images, and how its panel is read by default. ``readout_ratio``:
     T_ro/T_exp, None is the protocol's. ``pulse``: when the beam is on in a frame (start, length; shares of the
-    exposure), None always. ``lag``: the panel's λ."""
+    exposure), None always. ``lag``: the panel's λ. ``fps`` and ``readout_ms``: the data sheet's frame rate and readout."""
 
     name: str
     geometry: ConeGeometry
@@ -43,6 +44,8 @@ class Scanner:
     readout_ratio: float | None = None
     pulse: tuple[float, float] | None = None
     lag: float = 0.0
+    fps: float | None = None
+    readout_ms: float | None = None
 
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
@@ -81,22 +84,43 @@ def _describes_scanner(path: Path) -> bool:
 
 def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
     """The scanner that a TOML file's content describes; ``path`` names it in messages."""
-    refuse_unknown(str(path), content, (*_TABLES, *_WORDS), "a table")
-    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in _TABLES.items()}
+    refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
     readout = tables["readout"]
-    direction = readout.number("direction", 1)
-    checks.one_of(readout.name("direction"), direction, (1, -1))
+    axis, direction = _order(readout)
+    fps = readout.length("fps") if readout.has("fps") else None
+    readout_ms = readout.number("readout_ms", lowest=0.0) if readout.has("readout_ms") else None
+    if readout.has("ratio") and readout_ms is not None:
+        raise readout.error("readout_ms", f"{readout_ms:g} with ratio", "one of the two", "leave ratio out")
     return Scanner(
         path.stem,
         geometry,
         _grid(tables["volume"]) if "volume" in content else default_grid(geometry),
-        readout.word("axis", AXES, default=AXES[0]),
-        int(direction),
+        axis,
+        direction,
         readout.number("ratio", lowest=0.0, highest=LENGTH.largest) if readout.has("ratio") else None,
         _pulse(tables["beam"]) if "beam" in content else None,
         tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG),
+        fps,
+        readout_ms,
     )
+
+
+def _order(readout: Fields) -> tuple[str, int]:
+    """Readout axis and direction, as ``first`` or as themselves; rows from the lowest up where the table has none."""
+    direction = readout.number("direction", 1)
+    checks.one_of(readout.name("direction"), direction, (1, -1))
+    axis, stated = readout.word("axis", AXES, default=AXES[0]), int(direction)
+    if not readout.has("first"):
+        return axis, stated
+
+    def named(field: str) -> str:
+        return readout.name(field) if field == "first" else field.removeprefix("readout_")
+
+    given = axis if readout.has("axis") else None, stated if readout.has("direction") else None
+    order = readout_order(readout.word("first"), *given, named)
+    return order[0] or axis, order[1] or stated
 
 
 def _geometry(source: Fields, detector: Fields) -> ConeGeometry:

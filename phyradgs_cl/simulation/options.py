@@ -5,6 +5,7 @@ from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Protocol, make_protocol
+from phyradgs_cl.acquisition.readout import readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
@@ -17,6 +18,7 @@ _LARGEST_PEAK, _LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
 _LARGEST_DETECTOR = 32_000
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
+_DATA_SHEET = ("first", "fps", "readout_ms")
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class SimulationOptions:
             checks.within("--kvp (kV)", self.kvp, LOWEST_KVP, HIGHEST_KVP)
 
 
-OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING)
+OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING, _DATA_SHEET)
 """What ``scanner_options`` takes."""
 
 
@@ -90,12 +92,31 @@ def scanner_for(
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
     """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the
-    default. InputError: no such option; a value out of range."""
-    usual = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse")
+    default. InputError: no such option; a value out of range; words that contradict each other."""
+    given = {key: value for key, value in given.items() if value is not None}
+    order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
+    usual = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
     own = {key: getattr(scanner, key) for key in usual}
-    chosen = {**own, **{key: value for key, value in given.items() if value is not None}}
+    if "readout_ratio" in given or "readout_ms" in given:  # either wins over what the scanner has
+        del own["readout_ratio"], own["readout_ms"]
+    chosen = {**own, **given}
+    chosen.update({key: value for key, value in zip(usual, order, strict=False) if value is not None})
+
+    def named(name: str) -> str:
+        is_scanner_s = name not in given and own.get(name) is not None
+        return f"{scanner.name} [readout] {name}" if is_scanner_s else _flag(name)
+
+    readout_ratio_of(chosen.get("readout_ms"), chosen.get("readout_ratio"), chosen.get("fps"), None, named)
     if unknown := sorted(set(chosen) - OPTION_NAMES):
         expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
     timing = {key: chosen.pop(key) for key in _TIMING if key in chosen}
-    return SimulationOptions(protocol=make_protocol(protocol, **timing), **chosen)
+    sheet = {key: chosen.pop(key, None) for key in _DATA_SHEET}
+    made = make_protocol(protocol, **timing)
+    if sheet["fps"] is not None:
+        made = made.at_rate(sheet["fps"], sheet["readout_ms"], named)
+    return SimulationOptions(protocol=made, **chosen)
+
+
+def _flag(name: str) -> str:
+    return {"readout_axis": "--readout"}.get(name, "--" + name.replace("_", "-"))

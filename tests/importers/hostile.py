@@ -347,9 +347,9 @@ EXCHANGE: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "an angle that is NaN": (in_hdf5(lambda f: replaced(f, "exchange/theta", np.full(6, np.nan))), ("/exchange/theta",)),
     "an unknown unit": (in_hdf5(lambda f: f["exchange/theta"].attrs.update(units="gon")), ("gon",)),
     "flats of another size": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.ones((1, 2, 3)))), ("data_white",)),
-    "no flats": (in_hdf5(lambda f: f.pop("exchange/data_white")), ("--quantity",)),
+    "no flats": (in_hdf5(lambda f: f.pop("exchange/data_white")), ("what the pixels hold",)),
     "dead flats": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.zeros((1, 10, 14)))), ("no usable value",)),
-    "no pixel size": (in_hdf5(lambda f: f.pop("measurement")), ("--pixel-size-mm",)),
+    "no pixel size": (in_hdf5(lambda f: f.pop("measurement")), ("found nothing; expected a length; say",)),
 }  # fmt: skip
 
 DETECTOR = "entry0000/instrument/detector"
@@ -358,15 +358,15 @@ NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "truncated": (truncated(""), ("HDF5",)),
     "no data": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/data")), ("detector/data",)),
     "data elsewhere": (in_hdf5(lambda f: linked(f, f"{DETECTOR}/data")), ("passwd",)),
-    "no distance": (in_hdf5(lambda f: f.pop("entry0000/instrument/source/distance")), ("--source-to-axis-mm",)),
-    "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("--source-to-detector-mm",)),
+    "no distance": (in_hdf5(lambda f: f.pop("entry0000/instrument/source/distance")), ("source/distance", "in mm")),
+    "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("detector/distance", "in mm")),
     "no projections": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.ones(9, int))), ("image_key",)),
     "a key short": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.zeros(3, int))), ("image_key",)),
     "exposures that differ": (in_hdf5(lambda f: replaced(f, COUNT_TIME, np.arange(9.0), units="s")), ("count_time",)),
     "a tilted detector": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/transformations/rx", 12.0, units="deg")), ("rx", "12")),
     "a sample that moves": (in_hdf5(lambda f: f.create_dataset(MOVES, data=np.arange(9.0))), ("x_translation",)),
     "a scan of this package": (in_hdf5(lambda f: f.create_group("entry0000/phyradgs")), ("as it is",)),
-    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("--quantity",)),
+    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("what the pixels",)),
 }  # fmt: skip
 
 TOML = "scan.toml"
@@ -410,6 +410,7 @@ def behind_the_directory(path: Path) -> None:
 
 TURNED = [(274, 3, 1, 6, True)]
 STANDING = "[timing]\nexposure_s = 1\nstart_s = [0, 0, 0, 0, 0, 0]\n[frames]"
+SAY = "say [timing] frame_time_s or [readout] fps"
 TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "not TOML": (filled(TOML, b"= = ="), ("TOML",)),
     "not text": (filled(TOML, b"\xff\xfe\xff"), ("TOML",)),
@@ -441,11 +442,11 @@ TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a line that is no number": (angles_in("0\n1\n2\nnan\n4\n5"), ("angles.txt line 4",)),
     "a unit that is none": (in_text(TOML, "values_deg", "unit = 'gon'\nfile = 'a' #"), ("gon",)),
     "images behind the directory": (behind_the_directory, ("100 images and 1 of them",)),
-    "an exposure without a frame time": (timed("exposure_s = 1"), ("[timing] exposure_s", "--frame-time-s")),
-    "a readout without a frame time": (timed("readout_s = 1"), ("[timing] readout_s", "--frame-time-s")),
-    "the middle of no exposure": (in_text(TOML, "[angles]", "[angles]\nat = 'middle'"), ("[angles] at", "--frame-time-s")),
+    "an exposure without a frame time": (timed("exposure_s = 1"), ("[timing] exposure_s", SAY)),
+    "a readout without a frame time": (timed("readout_s = 1"), ("[timing] readout_s", SAY)),
+    "the middle of no exposure": (in_text(TOML, "[angles]", "[angles]\nat = 'middle'"), ("[angles] at", SAY)),
     "exposure without end": (in_text(TOML, "[frames]", "[timing]\nexposure_s = -1\n[frames]"), ("exposure_s",)),
-    "motion without exposure": (in_text(TOML, "[frames]", "[timing]\nframe_time_s = 1\n[frames]"), ("--exposure-s",)),
+    "motion without exposure": (in_text(TOML, "[frames]", "[timing]\nframe_time_s = 1\n[frames]"), ("[timing] exposure",)),
     "times that stand still": (in_text(TOML, "[frames]", STANDING), ("start times",)),
 }  # fmt: skip
 

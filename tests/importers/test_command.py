@@ -3,7 +3,6 @@
 import os
 import re
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import h5py
@@ -17,8 +16,8 @@ from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.commands.import_scan import EXAMPLE, import_command
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan
-from phyradgs_cl.importers.options import option_name
+from phyradgs_cl.importers import FORMATS, import_scan
+from phyradgs_cl.importers.options import FIELDS, option_name
 from phyradgs_cl.io import read_scan
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "import.md"
@@ -85,7 +84,7 @@ def test_an_existing_output_survives_an_error(run, tmp_path, make_truth) -> None
 def test_formats_and_options_are_described() -> None:
     text = DOCS.read_text(encoding="utf-8")
     missing = [form for form in FORMATS if f"`{form}`" not in text]
-    missing += [f.name for f in fields(ImportOptions) if f"`{option_name(f.name)}" not in text]
+    missing += [name for name in FIELDS if f"`{option_name(name)}" not in text]
     assert not missing
 
 
@@ -153,5 +152,5 @@ def test_frames_without_a_pixel_are_named_and_do_not_count(run, tmp_path) -> Non
         file["exchange/data_dark"] = np.zeros((1, 4, 5), np.float32)
     where = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--pixel-size-mm", "1,1")
     done = run(tmp_path / "dx.h5", *where)
-    assert "largest line integral 0.693, 20 pixels masked" in done.output
+    assert all(text in done.output for text in ("20 pixels masked", "largest line integral 0.693"))
     assert "no pixel can be used in 1 frames (from 0): 1" in done.output

@@ -20,9 +20,9 @@ def test_flats_one_value_none_or_of_another_panel() -> None:
     found = line_integrals("f", FRAMES, ImportOptions(flat_value=100.0))
     np.testing.assert_allclose(found.values, -np.log(FRAMES / 100), rtol=0, atol=FLOAT32)
     assert found.mask is None and found.saturation == Saturation(100.0, 0.0)
-    with pytest.raises(InputError, match="quantity: found nothing that says it.*--quantity"):
+    with pytest.raises(InputError, match="quantity: found nothing that says it.*say quantity"):
         line_integrals("f", FRAMES, ImportOptions())
-    with pytest.raises(InputError, match="f flats: found none.*--flat-value"):
+    with pytest.raises(InputError, match="f flats: found none.*say flat_value"):
         line_integrals("f", FRAMES, ImportOptions(quantity="counts"))
     for name in ("flats", "darks"):
         stacks = {"flats": np.full((1, 2, 2), 100.0, np.float32), name: np.ones((1, 3, 2), np.float32)}

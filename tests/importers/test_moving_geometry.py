@@ -91,7 +91,7 @@ def test_one_scan_of_several_in_a_file(tmp_path, real_truth, assert_same) -> Non
     meta = json.loads(file.read_text())
     meta["views"] = meta["views"][::-1] + meta["views"]
     file.write_text(json.dumps(meta))
-    with pytest.raises(InputError, match="--first-view"):
+    with pytest.raises(InputError, match="say first_view"):
         import_scan(path, REAL)
     assert_same(import_scan(path, replace(REAL, first_view=6)), real_truth, grid=False, pixels=1e-4)
 

@@ -114,8 +114,8 @@ def test_nxtomo(tmp_path, make_truth, assert_same, caplog, flips) -> None:
     scan = import_scan(path)
     assert_same(scan, truth, grid=False, timing=False)
     assert scan.shutter.exposure_s == pytest.approx(0.4) and scan.title == "theirs"
-    assert "row 0 is taken as the lowest" in caplog.text and "--row-0 top" in caplog.text
-    assert "an exposure of 0.4 s and no time from frame to frame: taken at rest; --frame-time-s" in caplog.text
+    assert "row 0 is taken as the lowest" in caplog.text and "say row_0 top" in caplog.text
+    assert "an exposure of 0.4 s and no time from frame to frame: taken at rest; say frame_time_s or fps" in caplog.text
     caplog.clear()
     with h5py.File(path, "r+") as file:
         frames = file["entry0000/instrument/detector/data"]

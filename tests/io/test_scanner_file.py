@@ -8,6 +8,7 @@ from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import default_grid, load_scanner, with_detector_count
+from phyradgs_cl.simulation import scanner_options
 
 DATA = Path(__file__).parents[2] / "data"
 GOOD = """
@@ -126,3 +127,25 @@ def test_another_count_keeps_the_panel() -> None:
     assert coarse_mm == pytest.approx(fine_mm.mean((1, 3)), abs=1e-9)
     with pytest.raises(InputError):
         with_detector_count(geometry, 0, 5)
+
+
+def test_a_data_sheet_s_words(write) -> None:
+    """In place of axis, direction and ratio; a readout in ms needs a rate where nothing else states a frame's time."""
+    plain = GOOD.split("[readout]")[0]
+    scanner = load_scanner(write(f'{plain}[readout]\nfirst = "top"\nfps = 15\nreadout_ms = 62\n'), DATA)
+    assert (scanner.readout_axis, scanner.readout_direction, scanner.fps, scanner.readout_ms) == ("rows", -1, 15, 62)
+    protocol = scanner_options(scanner, "rapid").protocol
+    assert (protocol.exposure_s, protocol.readout_ratio) == pytest.approx((1 / 15, 0.93))
+    assert scanner_options(scanner, "rapid", readout_ratio=0.5).protocol.readout_ratio == 0.5
+    slow = load_scanner(write(f"{plain}[readout]\nreadout_ms = 62\n"), DATA)
+    with pytest.raises(InputError, match=r"^mine \[readout\] readout_ms: found 62 without a frame rate"):
+        scanner_options(slow, "rapid")
+    for lines, words in {
+        'first = "top"\naxis = "columns"': r"\[readout\] first: found 'top' with axis 'columns'; expected 'rows'",
+        'first = "top"\ndirection = 1': r"\[readout\] first: found 'top' with direction 1; expected -1",
+        'first = "above"': r"\[readout\] first: found 'above'",
+        "readout_ms = 62\nratio = 0.5": r"\[readout\] readout_ms: found 62 with ratio",
+        "fps = 0": r"\[readout\] fps: found 0",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            load_scanner(write(f"{plain}[readout]\n{lines}\n"), DATA)

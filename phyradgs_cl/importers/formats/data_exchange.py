@@ -10,7 +10,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import checked, put_together
+from phyradgs_cl.importers.scan_parts import cone, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import read_array, read_title
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -45,10 +45,10 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:
     where = f"{_INSTRUMENT}/source/distance"
     to_axis = options.source_to_axis_mm or hdf5_frames.optional_length(source, where)
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
+    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where), options.named)
     to_detector = hdf5_frames.distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
     pitch = options.pixel_size_mm or (
-        hdf5_frames.stored_pitch(source, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
-        hdf5_frames.stored_pitch(source, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
+        hdf5_frames.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
+        hdf5_frames.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
     )
-    return checked(ConeGeometry(to_axis, to_detector, panel, pitch, options.detector_offset_mm or (0.0, 0.0)))
+    return cone(options, to_axis, to_detector, panel, pitch, (0.0, 0.0))

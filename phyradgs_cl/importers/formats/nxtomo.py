@@ -12,10 +12,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
 from phyradgs_cl.importers.formats.moving_poses import Turned
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed, option_name
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import checked, put_together
+from phyradgs_cl.importers.scan_parts import cone, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -49,8 +49,8 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
         _refuse_moves(source, entry, used)
         title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
-        text = "%s: row 0 is taken as the lowest, after flips that the file declares; %s top if the volume is mirrored"
-        _log.warning(text, path, option_name("row_0"))
+        text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
+        _log.warning(text, path, options.named("row_0"))
     frames = oriented(turn.frames(frames), options, "bottom")
     flats, darks = (frames[key == kind] for kind in (schema.FLAT, schema.DARK))
     where = f"{path}:{detector}/data"
@@ -106,13 +106,13 @@ def _geometry(
     to_axis = options.source_to_axis_mm
     if to_axis is None and source.find(where) is not None:
         to_axis = abs(h5.read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where))
+    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where), options.named)
     to_detector = hdf5_frames.distance_to_detector(source, f"{detector}/distance", to_axis, options)
     v, u = f"{detector}/y_pixel_size", f"{detector}/x_pixel_size"
     stored = hdf5_frames.stored_pitch
-    pitch = options.pixel_size_mm or (stored(source, v), stored(source, u))
+    pitch = options.pixel_size_mm or (stored(source, options, v), stored(source, options, u))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
-    return checked(ConeGeometry(to_axis, to_detector, panel, pitch, offset))
+    return cone(options, to_axis, to_detector, panel, pitch, offset)
 
 
 def _axis_offset(
@@ -145,6 +145,7 @@ def _motion(
         exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
         readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
         start_s=start_s,
+        angle_at="start" if sweeps else None,
     )
     timing = make_timing(source.name(entry), int(used.sum()), options, stored)
     if not sweeps:

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
 from phyradgs_cl.importers.formats.moving_poses import turn_of
-from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_json
 from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering
@@ -25,7 +26,7 @@ from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io.tables import Fields
 
 OPTIONS = (
-    *("exposure_s", "readout_direction", "pixel_size_mm", "quantity", "flat_value", "detector_model"),
+    *("exposure_s", "readout_axis", "readout_direction", "pixel_size_mm", "quantity", "flat_value", "detector_model"),
     "first_view",
 )
 PROJECTIONS = "projections"
@@ -66,6 +67,7 @@ class Circle:
 def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     """A folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON itself."""
     options.refuse_unused("phyradgs-real", OPTIONS)
+    checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
     meta = Fields(f"{description}:", read_json(description))
     frames, views = _frames_and_views(description, list(meta.tables("views")), options)
@@ -77,7 +79,8 @@ def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     turn = turn_of(poses[0, 0])
     direction = options.readout_direction or (-1 if turn.rows else 1)
     shutter = Shutter(timing.shutter.exposure_s, timing.shutter.readout_s, "rows", direction)
-    timing = Timing(shutter, timing.start_s, True)
+    assumed = () if options.exposure_s is not None else ("exposure",)
+    timing = Timing(shutter, timing.start_s, True, assumed=assumed)
     poses = turn.poses(poses, panel)
     times = timing.start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
     integrals = line_integrals(
@@ -101,7 +104,7 @@ def _frames_and_views(
         check_numbering(paths, "complete the frames")  # each takes the view of its place
         views = views[options.first_view : options.first_view + len(paths)]
     if not paths or len(paths) != len(views):
-        remedy = f"say {option_name('first_view')} if the JSON holds several scans"
+        remedy = f"say {options.named('first_view')} if the JSON holds several scans"
         found = f"{len(paths)} TIFF files for {len(views)} views"
         raise InputError(str(folder.root), found, "one frame per view", remedy)
     frames = tiff.read_tiffs(paths)
@@ -122,7 +125,7 @@ def _with_flat(options: ImportOptions, frames: np.ndarray) -> ImportOptions:
 
 def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
     if options.pixel_size_mm is None:
-        remedy = f"say {option_name('pixel_size_mm')} V,U"
+        remedy = f"say {options.named('pixel_size_mm')}"
         raise InputError(f"{culprit} pixel size", "nothing", "a length in mm along v and along u", remedy)
     return options.pixel_size_mm
 

@@ -42,14 +42,17 @@ def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptio
     custom = 1 if axis == "columns" else -1
     direction = custom if options.readout_direction is None else options.readout_direction
     shutter = Shutter(exposure_s, ratio * exposure_s, axis, direction)
-    return Timing(shutter, start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s), True)
+    unstated = {"exposure": options.exposure_s, "axis": options.readout_axis, "first": options.readout_direction}
+    assumed = tuple(name for name, value in unstated.items() if value is None)
+    start_s = start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s)
+    return Timing(shutter, start_s, True, assumed=assumed)
 
 
 def exposure_of_blurred_s(options: ImportOptions) -> float:
     """The exposure in s, which the files do not state: 1 s unless it is given."""
     exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
     if exposure_s <= 0:
-        raise InputError("--exposure-s", f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
+        raise InputError(options.named("exposure_s"), f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
     return exposure_s
 
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, WORDS, ImportOptions
+from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.bounded import read_numbers
 from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
@@ -20,16 +21,24 @@ from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign
 from phyradgs_cl.importers.scan_parts import put_together, with_options
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.scan.reader import united
-from phyradgs_cl.io.scanner import Scanner, scanner_from
+from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
-_OWN = {
+OWN_TABLES = {
     "frames": ("projections", "flats", "darks", "mask", "quantity", "flat_value", "row_0", "column_0"),
     "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s"),
 }
 _TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
+_KEYS = {  # where the file has what an option states
+    **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
+    **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
+    **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},
+    **{"readout_axis": "[readout] axis", "readout_direction": "[readout] direction"},
+    **{"angle_at": "[angles] at", "rotates": "[angles] rotates"},
+    "pixel_size_mm": "[detector] pixel_size_v_mm, pixel_size_u_mm",
+}
 _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
 
 
@@ -39,12 +48,13 @@ def import_tiff(path: Path, options: ImportOptions) -> Scan:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
+    options = in_words_of_file(options)
     said = _with_file(options, tables["frames"], tables["angles"])
     stacks = _stacks(folder, tables["frames"], tables["angles"])
     frames, rows, columns = stacks["projections"].shape
     scanner = _scanner(description, tables[""], (rows, columns))
     geometry = with_options(scanner.geometry, options)
-    stored = _stored_timing(tables["timing"], tables["angles"], scanner)
+    stored = _stored_timing(tables, scanner)
     timing = make_timing(str(description), frames, options, stored)
     angle_rad = gantry_sign(said, "gantry") * _angles_rad(folder, tables["angles"], frames)
     integrals = _line_integrals(stacks, said, tables["frames"], str(description))
@@ -58,15 +68,35 @@ def import_tiff(path: Path, options: ImportOptions) -> Scan:
         source=str(path),
         grid=scanner.grid if tables[""].has("volume") else None,
         lag=scanner.lag,
+        names=_subjects(tables),
     )
+
+
+def _subjects(tables: dict[str, Fields]) -> dict[str, str]:
+    """How messages call what the file states, where that is no option of an import."""
+    subjects = {"grid": tables[""].name("[volume]"), "angles": tables["angles"].culprit}
+    if tables["readout"].has("readout_ms"):
+        subjects["readout_s"] = tables["readout"].name("readout_ms")
+    return subjects
 
 
 def _tables(path: Path) -> dict[str, Fields]:
     """The file's own tables by name, and under "" what a scanner file has; unknown names are refused."""
     content = read_toml(path)
-    refuse_unknown(str(path), content, (*_SCANNER, *_OWN), "a name")
-    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), _OWN[name]) for name in _OWN}
-    return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in _OWN}), **tables}
+    refuse_unknown(str(path), content, (*_SCANNER, *OWN_TABLES), "a name")
+    tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in OWN_TABLES.items()}
+    tables["readout"] = Fields(f"{path} [readout]", content.get("readout", {}), TABLES["readout"])
+    return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in OWN_TABLES}), **tables}
+
+
+def in_words_of_file(options: ImportOptions) -> ImportOptions:
+    """The options, whose messages name keys of the TOML for what the user did not give as an option."""
+    given = options.given(FIELDS)
+
+    def named(field: str) -> str:
+        return options.named(field) if field in given else _KEYS.get(field) or options.named(field)
+
+    return replace(options, named=named)
 
 
 def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
@@ -126,21 +156,32 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
     return described
 
 
-def _stored_timing(timing: Fields, angles: Fields, scanner: Scanner) -> StoredTiming:
+def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
+    timing, angles, readout = tables["timing"], tables["angles"], tables["readout"]
     names = ("exposure_s", "readout_s")
-    exposure_s, readout_s = (timing.number(name) if timing.has(name) else None for name in names)
+    exposure_s, readout_s = (timing.number(name, lowest=0.0) if timing.has(name) else None for name in names)
+
+    def named(field: str) -> str:
+        return _KEYS[field] if field in OWN_TABLES["timing"] else readout.name(field)
+
+    readout_s = readout_of(scanner.readout_ms, readout_s, named)
     if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
         readout_s = scanner.readout_ratio * exposure_s
+    frame_time_s = frame_time_of(scanner.fps, timing.length("frame_time_s") if timing.has("frame_time_s") else None, named)
+    if scanner.fps is not None and timing.has("start_s"):
+        found = f"{scanner.fps:g} with [timing] start_s"
+        raise readout.error("fps", found, "one of the two", "leave fps out")
     written = [timing.name(key) for key in names if timing.has(key)]
+    written += [readout.name("readout_ms")] if readout.has("readout_ms") else []
     return StoredTiming(
         exposure_s=exposure_s,
         readout_s=readout_s,
-        frame_time_s=timing.length("frame_time_s") if timing.has("frame_time_s") else None,
+        frame_time_s=frame_time_s,
         start_s=timing.numbers("start_s") if timing.has("start_s") else None,
-        axis=scanner.readout_axis,
-        direction=scanner.readout_direction,
+        axis=scanner.readout_axis if readout.has("first") or readout.has("axis") else None,
+        direction=scanner.readout_direction if readout.has("first") or readout.has("direction") else None,
         pulse=scanner.pulse,
-        angle_at=angles.word("at", WORDS["angle_at"], default="start"),
+        angle_at=angles.word("at", WORDS["angle_at"]) if angles.has("at") else None,
         written=(*written, *([angles.name("at")] if angles.has("at") else [])),
     )
 

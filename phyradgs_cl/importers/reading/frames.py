@@ -8,7 +8,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.detector import find_saturation, frames_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, option_name
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ def line_integrals(
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
     quantity = options.quantity or custom or ("counts" if has_flats else None)
     if quantity is None:
-        remedy = f"say {option_name('quantity')} attenuation, transmission or counts"
+        remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
         raise InputError(f"{culprit} quantity", "nothing that says it", "what the pixels hold", remedy)
     saturation = flat = None
     if quantity == "counts":
@@ -98,6 +98,6 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
 
 def _constant_flat(culprit: str, frames: np.ndarray, options: ImportOptions) -> np.ndarray:
     if options.flat_value is None:
-        remedy = f"add flat frames, or say {option_name('flat_value')}"
+        remedy = f"add flat frames, or say {options.named('flat_value')}"
         raise InputError(f"{culprit} flats", "none", "flat frames to divide counts by", remedy)
     return np.full((1, *frames.shape[1:]), options.flat_value, np.float32)

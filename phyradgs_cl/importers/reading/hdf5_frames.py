@@ -3,7 +3,7 @@
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, needed, option_name
+from phyradgs_cl.importers.options import ImportOptions, needed
 from phyradgs_cl.io.hdf5.datasets import read_length, read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
@@ -32,11 +32,11 @@ def optional_length(source: Hdf5Source, *addresses: str, quantity: Quantity = LE
     return None
 
 
-def stored_pitch(source: Hdf5Source, *addresses: str) -> float:
-    """The size of a pixel in mm at the first of some addresses, which somebody has to give."""
+def stored_pitch(source: Hdf5Source, options: ImportOptions, *addresses: str) -> float:
+    """The size of a pixel in mm at the first of some addresses; InputError where none has it."""
     size = optional_length(source, *addresses)
     if size is None:
-        raise source.error(addresses[0], "nothing", "a length", f"say {option_name('pixel_size_mm')} V,U")
+        raise source.error(addresses[0], "nothing", "a length", f"say {options.named('pixel_size_mm')}")
     return size
 
 
@@ -44,7 +44,7 @@ def distance_to_detector(source: Hdf5Source, address: str, to_axis_mm: float, op
     """From the source, mm: the option's, else behind the axis by what is stored at ``address``."""
     behind_mm = None if options.source_to_detector_mm else optional_length(source, address)
     to_detector_mm = options.source_to_detector_mm if behind_mm is None else to_axis_mm + behind_mm
-    return needed(to_detector_mm, "source_to_detector_mm", source.name(address))
+    return needed(to_detector_mm, "source_to_detector_mm", source.name(address), options.named)
 
 
 def gantry_sign(options: ImportOptions, custom: str) -> float:

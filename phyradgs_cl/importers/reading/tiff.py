@@ -56,6 +56,13 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
     return stack
 
 
+def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
+    """(frames, rows, columns) of what ``read_tiffs`` would read, by headers alone; rows and columns of the first file."""
+    headers = [_header(path) for path in paths]
+    rows, columns = headers[0].shape
+    return sum(header.images for header in headers), rows, columns
+
+
 def _header(path: Path) -> _Header:
     """What one file holds, with every page checked against the bytes that there are."""
     with _opened(path) as tiff:

@@ -1,0 +1,112 @@
+"""A data sheet's words: the first line, frames per second, readout in ms; and numbers that no scanner has."""
+
+import logging
+import re
+
+import numpy as np
+import pytest
+from refusals import assert_refused
+
+from phyradgs_cl.acquisition import make_protocol
+from phyradgs_cl.acquisition.readout import FIRST_LINES
+from phyradgs_cl.api import ConeGeometry, Grid, fly_scan, simulate, static_scan
+from phyradgs_cl.simulation import scanner_for, scanner_options
+
+CONE = ConeGeometry(500.0, 800.0, (6, 8), (0.4, 0.4))
+FRAMES, TURN_DEG = np.full((12, 6, 8), 0.5, np.float32), 30.0 * np.arange(12)
+
+
+def test_the_first_line_states_axis_and_direction() -> None:
+    """Seen from the source: row 0 is the lowest, column 0 the left one; the first line opens without a delay."""
+    for first, line in {"bottom": 0, "top": 5, "left": 0, "right": 7}.items():
+        shutter = fly_scan(FRAMES, CONE, TURN_DEG, exposure_deg=30.0, readout_ratio=0.9, first=first).shutter
+        assert (shutter.axis, shutter.direction) == FIRST_LINES[first] and shutter.first == first
+        assert shutter.delay_s(shutter.lines(CONE.detector_shape))[line] == 0
+
+
+def test_rate_and_readout_state_the_times_of_a_fly_scan() -> None:
+    sheet = {"fps": 15, "readout_ms": 62, "first": "top"}
+    by_arc = fly_scan(FRAMES, CONE, TURN_DEG, exposure_deg=27.0, **sheet)
+    by_time = fly_scan(FRAMES, CONE, TURN_DEG, exposure_s=0.06, **sheet)
+    for scan in (by_arc, by_time):
+        assert np.allclose(np.diff(scan.frame_start_s), 1 / 15) and scan.shutter.readout_s == 0.062
+        assert scan.shutter.exposure_s == pytest.approx(0.06)
+        ends = [scan.trajectory.angle_rad(3, scan.frame_start_s[3] + t) for t in (0.0, 0.06)]
+        assert np.rad2deg(np.diff(ends)) == pytest.approx(27.0)
+    words = "timing: rows read in 62 ms, top first; 15 fps; exposure 27° in 60 ms; averages line integrals"
+    assert by_time.summary().splitlines()[0] == words
+
+
+def test_a_simulation_takes_a_data_sheet() -> None:
+    scanner = scanner_for("r2", 16)
+    options = scanner_options(scanner, "rapid", first="left", fps=15, readout_ms=62)
+    shutter = options.protocol.shutter(options.readout_axis, options.readout_direction)
+    assert (shutter.exposure_s, shutter.readout_s) == pytest.approx((1 / 15, 0.062)) and shutter.first == "left"
+    assert np.allclose(np.diff(options.protocol.frame_start_s()), 1 / 15)
+    assert options.protocol.angle_start_rad()[1] == make_protocol("rapid").angle_start_rad()[1]
+
+
+def test_words_that_contradict_each_other_are_refused_in_one_line() -> None:
+    scanner = scanner_for("r2", 16)
+
+    def fly(**how: object):
+        return lambda: fly_scan(FRAMES, CONE, TURN_DEG, **{"exposure_deg": 30.0, **how})
+
+    def options(**how: object):
+        return lambda: scanner_options(scanner, "rapid", **how)
+
+    assert_refused({
+        "^first: found 'left' with readout 'rows'; expected 'columns'": fly(first="left", readout="rows"),
+        "^first: found 'top' with readout_direction 1; expected -1": fly(first="top", readout_direction=1),
+        "^first: found 'topp'.*did you mean 'top'": fly(first="topp"),
+        "^readout_ms: found 62 with readout_ratio": fly(fps=15, readout_ms=62, readout_ratio=0.9),
+        "^readout_ms: found 62 without a frame rate.*give fps": fly(readout_ms=62),
+        "^fps: found 15 with both": fly(fps=15, exposure_s=0.06),
+        "^fps: found 15 with neither": fly(fps=15, exposure_deg=None),
+        "^exposure_deg: found nothing": fly(exposure_deg=None),
+        "^--first: found 'left' with --readout 'rows'": options(first="left", readout_axis="rows"),
+        "^--readout-ms: found 62 with --readout-ratio": options(fps=15, readout_ms=62, readout_ratio=0.9),
+        "^--readout-ms: found 62 without .*--fps": options(readout_ms=62),
+        "^first: found 'left' with readout_axis 'rows'": lambda: simulate(first="left", readout_axis="rows"),
+        "^exposure_deg: found 5000": lambda: simulate(exposure_deg=5000.0),
+        "^--readout-ms: found 62000; expected at most the 66.67 ms": options(fps=15, readout_ms=62000),
+    })  # fmt: skip
+
+
+def test_numbers_that_no_scanner_has_are_refused() -> None:
+    wide = ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0))
+    assert_refused({
+        "^pixel_size_mm: found pixels of 1560 × 1560 mm.*µm": lambda: static_scan(FRAMES, wide, TURN_DEG),
+        "^grid: found 1×1×1 voxels of 585 mm; expected voxels of about 0.25": lambda: static_scan(
+            FRAMES, CONE, TURN_DEG, grid=Grid((1, 1, 1), (585.0,) * 3)
+        ),
+        "^readout_ms: found readout of 62 s, 930 times the 0.0667 s from frame to frame": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62000
+        ),
+    })  # fmt: skip
+
+
+def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
+    opaque = np.full_like(FRAMES, 60.0)
+    for words, make in {
+        "^angles_deg: 12 frames within 5.76°: are they radians": lambda: static_scan(FRAMES, CONE, np.deg2rad(TURN_DEG)),
+        "line integrals of up to 60: .* counts": lambda: static_scan(opaque, CONE, TURN_DEG, quantity="attenuation"),
+        "^readout_ms: readout of 0.1 s, 1.5 times": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=100
+        ),
+        "": lambda: fly_scan(FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62),
+    }.items():
+        caplog.clear()
+        make()
+        said = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+        assert len(said) == bool(words) and re.search(words, "".join(said)), (words, said)
+
+
+def test_a_summary_shows_what_a_wrong_length_changes(rt) -> None:
+    scan = simulate("spheres", size=8, detector=16, views=6, exposure_deg=60.0, device=rt)
+    timing, sizes = scan.summary().splitlines()
+    assert timing == "timing: rows read in 860 ms, bottom first; 1 fps; exposure 60° in 1000 ms; averages line integrals"
+    numbers = [float(n) for n in re.findall(r"[\d.]+", sizes)]
+    largest = float(scan.projections.max())
+    assert numbers == pytest.approx([3.642, 2.747, 2.747, 31.9, 31.9, 0.25, largest], rel=1e-3)
+    assert static_scan(FRAMES, CONE, TURN_DEG).summary().startswith("timing: every frame at rest\nsizes: ")

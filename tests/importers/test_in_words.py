@@ -1,0 +1,203 @@
+"""What a user says in a data sheet's words, at each door in the words of that door; and the TOML to fill in."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import tomllib
+import writers_of_importers as w
+
+from phyradgs_cl.acquisition import Shutter
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import ImportOptions, import_scan
+from phyradgs_cl.importers.formats.tiff_folder import OWN_TABLES
+from phyradgs_cl.io import read_scan
+from phyradgs_cl.io.scanner import TABLES
+
+SHEET = {"first": "left", "fps": 0.8, "readout_ms": 300.0}
+SHEET_TOML = '[timing]\nexposure_s = 0.4\n[readout]\nfirst = "left"\nfps = 0.8\nreadout_ms = 300.0'
+SHEET_WORDS = ("--exposure-s", "0.4", "--first", "left", "--fps", "0.8", "--readout-ms", "300")
+
+
+@pytest.fixture
+def run(cli, capsys, tmp_path):
+    """(words...) → (status, standard output, standard error) of `phyradgs import` to scan.h5."""
+
+    def command(*words: object, out: tuple[str, ...] = ("-o", str(tmp_path / "scan.h5"))) -> tuple[int, str, str]:
+        status = cli.run(["import", *map(str, words), *out])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return command
+
+
+def test_three_doors_take_a_data_sheet(run, tmp_path, make_truth) -> None:
+    truth = make_truth(fly=True, axis="columns")
+    plain, stated = w.write_tiff(tmp_path / "a", truth), w.write_tiff(tmp_path / "b", truth, SHEET_TOML)
+    assert run(plain, *SHEET_WORDS)[0] == 0
+    scans = [import_scan(plain, ImportOptions(exposure_s=0.4, **SHEET)), import_scan(stated)]
+    for scan in (*scans, read_scan(tmp_path / "scan.h5", counts_to_attenuation)):
+        assert scan.shutter == Shutter(0.4, 0.3, "columns", 1)
+        np.testing.assert_allclose(scan.frame_start_s, 1.25 * np.arange(6))
+
+
+def test_import_prints_what_it_took_and_what_it_assumed(run, tmp_path, make_truth) -> None:
+    blurred = w.write_phyradgs(tmp_path / "p", make_truth(fly=True, axis="columns"))
+    arc = "exposure 8° in 1000 ms (assumed)"
+    _, out, _ = run(blurred)
+    assert f"timing: columns read in 750 ms, left first (assumed); {arc}; averages line integrals (assumed)\n" in out
+    stated = w.write_tiff(tmp_path / "s", make_truth(fly=True), SHEET_TOML)
+    order = "columns read in 300 ms, left first; 0.8 fps; exposure 8° in 400 ms"
+    assumed = "angles as each frame opens (assumed); averages line integrals (assumed)"
+    assert f"timing: {order}; {assumed}\n" in run(stated)[1]
+    _, out, _ = run(stated, "--angle-at", "start", "--detector-model", "intensity")
+    assert f"timing: {order}; averages intensity\n" in out
+    assert re.search(r"^sizes: field of view .* mm \(z, y, x\), fan .*°, cone .*°, voxels .* mm, largest", out, re.M)
+    assert "timing: every frame at rest\n" in run(w.write_r2(tmp_path / "r", make_truth()))[1]
+
+
+def test_contradictions_are_refused_in_the_words_of_the_door(run, tmp_path, make_truth) -> None:
+    truth = make_truth()
+    path = w.write_rtk(tmp_path / "rtk", truth)
+    for words, said in {
+        ("--first", "left", "--readout", "rows"): "--first: found 'left' with --readout 'rows'; expected 'columns'",
+        ("--fps", "15", "--frame-time-s", "0.1"): "--fps: found 15 (every 0.06667 s) with --frame-time-s 0.1",
+        ("--readout-ms", "62", "--readout-s", "62"): "--readout-ms: found 62 with --readout-s 62",
+        ("--fps", "15"): "say --exposure-s",
+        ("--first", "top"): "--first: found no time from frame to frame",
+        ("--fps", "15", "--exposure-s", "0.06", "--readout-ms", "62000"): "--readout-ms: found readout of 62 s, 930 times",
+    }.items():
+        status, _, error = run(path, *words)
+        assert status == 2 and error.count("\n") == 1 and said in error, (words, error)
+    for number, (lines, said) in enumerate({
+        '[readout]\nfirst = "left"\naxis = "rows"': "[readout] first: found 'left' with",
+        "[timing]\nexposure_s = 0.1\nframe_time_s = 2.0\n[readout]\nfps = 15": "[readout] fps: found 15",
+        "[timing]\nexposure_s = 0.1\nstart_s = [0, 1, 2, 3, 4, 5]\n[readout]\nfps = 15": "[readout] fps: found 15 with",
+        "[timing]\nexposure_s = 0.1\nreadout_s = 2.0\n[readout]\nreadout_ms = 62": "[readout] readout_ms: found 62 with",
+        "[readout]\nreadout_ms = 62\nratio = 0.9": "[readout] readout_ms: found 62 with ratio",
+        "[readout]\nfps = 15": "say [timing] exposure_s",
+        "[readout]\nreadout_ms = 62": "[readout] readout_ms: found no time",
+        "[timing]\nexposure_s = 0.06\n[readout]\nfps = 15\nreadout_ms = 62e3": "[readout] readout_ms: found readout of 62 s",
+    }.items()):  # fmt: skip
+        status, _, error = run(w.write_tiff(tmp_path / f"t{number}", truth, lines))
+        assert status == 2 and error.count("\n") == 1 and said in error and "--" not in error, (lines, error)
+
+
+def test_what_a_file_lacks_is_asked_for_in_the_words_of_the_door(run, tmp_path, make_truth) -> None:
+    """The TOML's keys where there is one; an option that the user gave is named as an option; Python by its arguments."""
+    folder = w.write_tiff(tmp_path / "tiff", make_truth(), "[timing]\nexposure_s = 0.4")
+    assert "[timing] frame_time_s or [readout] fps" in run(folder)[2]
+    text = (folder / "scan.toml").read_text().replace("[timing]\nexposure_s = 0.4", "").replace('flats = "flat_*.tif"', "")
+    (folder / "scan.toml").write_text(text.replace('darks = "dark_*.tif"', ""))
+    assert "say [frames] quantity attenuation" in run(folder)[2]
+    assert "or say [frames] flat_value" in run(folder, "--quantity", "counts")[2]
+    error = run(folder, "--quantity", "counts", "--flat-value", "5e4", "--angle-at", "middle")[2]
+    assert "--angle-at: found no time" in error and "say [timing] frame_time_s" in error
+    with pytest.raises(InputError, match=r"^exposure_s: .* say frame_time_s or fps$"):
+        import_scan(w.write_rtk(tmp_path / "rtk", make_truth()), ImportOptions(exposure_s=0.4))
+
+
+def test_absurd_sizes_are_refused_at_import(run, tmp_path, make_truth, caplog) -> None:
+    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
+    cone = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800")
+    assert "--pixel-size-mm: found pixels of 1560 × 1560 mm" in run(data, *cone, "--pixel-size-mm", "1560")[2]
+    folder = w.write_tiff(tmp_path / "tiff", make_truth())
+    good = (folder / "scan.toml").read_text()
+    for pattern, replacement, said in (
+        (r"pixel_size_u_mm = .*", "pixel_size_u_mm = 1560", "[detector] pixel_size_v_mm, pixel_size_u_mm: found"),
+        (r"shape = .*\nsize_mm = .*", "shape = [1, 1, 1]\nsize_mm = [585, 585, 585]", "[volume]: found 1×1×1 voxels"),
+    ):
+        (folder / "scan.toml").write_text(re.sub(pattern, replacement, good))
+        assert said in run(folder)[2]
+    many = w.write_tiff(tmp_path / "many", make_truth(), angles=f"values_deg = {np.linspace(0, 5.8, 12).tolist()}")
+    for i in range(6, 12):
+        tifffile.imwrite(many / f"proj_{i}.tif", tifffile.imread(many / "proj_0.tif"))
+    run(many)
+    assert "[angles]: 12 frames within 5.8°: are they radians?" in caplog.text
+
+
+def test_distances_and_pulses_are_named_by_the_door(run, tmp_path, make_truth) -> None:
+    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
+    words = ("--source-to-axis-mm", "800", "--source-to-detector-mm", "500")
+    assert "--source-to-detector-mm: found 500; expected more than --source-to-axis-mm (800)" in run(data, *words)[2]
+    beam = SHEET_TOML + "\n[beam]\npulse_start = 5\npulse_length = 1"
+    assert "[beam] pulse_start: found 2 to 2.4 s" in run(w.write_tiff(tmp_path / "tiff", make_truth(), beam))[2]
+    negative = SHEET_TOML.replace("0.4", "-0.4")
+    assert "[timing] exposure_s: found -0.4" in run(w.write_tiff(tmp_path / "other", make_truth(), negative))[2]
+
+
+def test_one_pixel_size_means_square_pixels(run, tmp_path, make_truth) -> None:
+    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
+    cone = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800")
+    assert run(data, *cone, "--pixel-size-mm", "2.5")[0] == 0
+    assert read_scan(tmp_path / "scan.h5", counts_to_attenuation).geometry.pixel_size_mm == (2.5, 2.5)
+    assert "one of square pixels; write for example 0.148" in run(data, *cone, "--pixel-size-mm", "2.5,")[2]
+
+
+# --- the TOML to fill in ------------------------------------------------------------------------------------------------
+
+
+def filled_in(text: str, **values: object) -> str:
+    """The template with values for some of its keys, where they stand or after the # is removed."""
+    for key, value in values.items():
+        text, count = re.subn(rf"^(# )?{key} = [^#]*", f"{key} = {value} ", text, flags=re.M)
+        assert count == 1, key
+    return text
+
+
+def test_a_template_that_is_filled_in_is_the_same_scan(run, tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns")
+    folder = w.write_tiff(tmp_path / "tiffs", truth)
+    (folder / "scan.toml").unlink()
+    assert f"phyradgs import {folder} --template" in run(folder)[2]
+    np.savetxt(folder / "angles.txt", np.rad2deg(truth.angle_rad))
+    status, text, error = run(folder, "--template", out=())
+    assert (status, error) == (0, "") and not (tmp_path / "scan.h5").exists()
+    stated = tomllib.loads(text)
+    assert stated["frames"] == {"projections": "proj_*.tif", "flats": "flat_*.tif", "darks": "dark_*.tif"}
+    assert (stated["detector"]["rows"], stated["detector"]["columns"]) == (10, 14) and "# 6 frames of 10 × 14" in text
+    assert stated["angles"] == {"file": "angles.txt", "unit": "deg"}
+    (folder / "scan.toml").write_text(text, encoding="utf-8")
+    assert "[source] to_axis_mm: found 0" in run(folder)[2]
+    cone = {"to_axis_mm": 500, "to_detector_mm": 800, "pixel_size_v_mm": 3.0, "pixel_size_u_mm": 2.5}
+    moved = {"offset_v_mm": 4.0, "offset_u_mm": -6.0, "exposure_s": 0.4, **SHEET, "first": '"left"'}
+    (folder / "scan.toml").write_text(filled_in(text, **cone, **moved), encoding="utf-8")
+    assert_same(import_scan(folder), truth, grid=False)
+
+
+def test_a_template_has_every_key_with_what_it_means(run, tmp_path, make_truth) -> None:
+    folder = w.write_tiff(tmp_path / "tiffs", make_truth())
+    text = run(folder, "--template", out=())[1]
+    bare = re.sub(r"^# (?=\[|[a-z_0-9]+ = )", "", text, flags=re.M)
+    tables = tomllib.loads(bare)
+    assert tables.pop("title") == "tiffs"
+    known = {**TABLES, **OWN_TABLES}
+    assert {name: set(table) for name, table in tables.items()} == {name: set(keys) for name, keys in known.items()}
+    for line in bare.splitlines():
+        key = line.partition(" = ")[0]
+        if key != line and key != "title":
+            meaning = line.rpartition(" # ")[2]
+            unit = re.search(r"_(mm|deg|ms|s)$", key)
+            assert len(meaning) > 5 and (unit is None or {"deg": "degrees"}.get(unit[1], unit[1]) in meaning), line
+
+
+def test_a_template_is_for_tiffs(run, tmp_path, make_truth) -> None:
+    folder = w.write_r2(tmp_path / "r2", make_truth())
+    for path, said in ((folder, "no TIFF images"), (folder / "meta_data.json", "expected a folder")):
+        status, out, error = run(path, "--template", out=())
+        assert (status, out) == (2, "") and said in error
+    assert "--output: found nothing" in run(folder, out=())[2]
+
+
+def test_names_that_are_no_series_and_angles_in_radians(run, tmp_path) -> None:
+    folder = Path(tmp_path / "odd 😀")
+    folder.mkdir()
+    for name in ("White.tif", "DARK.tif", "stack.tif"):
+        tifffile.imwrite(folder / name, np.ones((3, 4, 5) if name == "stack.tif" else (4, 5), np.float32))
+    np.savetxt(folder / "theta.txt", [0.0, 2.0, 4.0])
+    stated = tomllib.loads(run(folder, "--template", out=())[1])
+    assert stated["title"] == "odd 😀" and stated["angles"] == {"file": "theta.txt", "unit": "rad"}
+    assert stated["frames"] == {"projections": "stack.tif", "flats": "White.tif", "darks": "DARK.tif"}
