@@ -64,7 +64,7 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
         facts["residual_of_the_shown_frames"] = float(np.sqrt(np.mean([view.rms**2 for view in views])))
     if not facts:
         return None
-    told = "Against the reference that the scan carries. " if run.reference is not None else ""
+    told = f"Against the reference that the scan carries, {run.compared}. " if run.compared else ""
     if "holdout_rms" in facts:
         told += "Holdout: of line integrals that the method did not see, and what their noise makes of it."
     return _section("metrics", "Metrics", told and element("p", told, class_="note"), facts_table(facts))
