@@ -1,7 +1,6 @@
 """calibrate: a scan's true geometry and timing from its own frames."""
 
 import json
-import math
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +21,7 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
+from phyradgs_cl.text import to_digits_of
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
@@ -109,8 +109,7 @@ def _as_text(found: Calibration) -> str:
 
 
 def _value(one: Found) -> str:
-    """What was found to two digits of its deviation; a dash where nothing was."""
+    """The estimate to two digits of its deviation; a dash where there is none."""
     if one.found is None or one.deviation is None:
         return "-"
-    digits = max(0, 1 - math.floor(math.log10(max(one.deviation, 1e-12))))
-    return f"{one.found:.{digits}f} ± {one.deviation:.{digits}f}"
+    return f"{to_digits_of(one.found, one.deviation)} ± {to_digits_of(one.deviation, one.deviation)}"

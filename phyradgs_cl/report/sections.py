@@ -19,9 +19,11 @@ from phyradgs_cl.report.pictures.slices import Plane, planes_of, stills_of, wind
 from phyradgs_cl.report.pictures.steps import Change
 from phyradgs_cl.report.pictures.viewer import stills, viewer
 from phyradgs_cl.report.run import Run
+from phyradgs_cl.text import to_digits_of
 
 _MOST_ROWS = 400  # of provenance
 _MOST_CHARTS, _MOST_ALIKE = 6, 20  # of a calibration
+_ABSURD = 1e9  # a value of a parameter that no file of ours has
 _DISAGREEMENT = (
     "Half the RMS of their difference over 3³ voxels, in the middle slices: where the volume leans on its method. It is no "
     "confidence interval: both are estimates from the same frames, errors that they share are not in it, and the volume's "
@@ -170,6 +172,8 @@ def _found(line: Mapping[str, object]) -> list[str]:
     )
     of = scale if isinstance(scale, str) else ""
     value = "–" if found is None else f"{shown(found)} ± {_or_dash(deviation, of)}"
+    if isinstance(found, float) and isinstance(deviation, float) and abs(found) + deviation < _ABSURD:
+        value = f"{to_digits_of(found, deviation)} ± {shown(to_digits_of(deviation, deviation), of)}"
     return [_or_dash(name), _or_dash(stated, of), value, _or_dash(verdict)]
 
 
