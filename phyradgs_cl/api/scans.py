@@ -189,7 +189,8 @@ def _scan(
     if "pixel_mask" in others:
         raise InputError("pixel_mask", "an option of Scan itself", "mask", "write mask=")
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly
-    return Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
+    facts = {**pixels.applied, **others.pop("provenance", {})}
+    return Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, provenance=facts, **others)
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:

@@ -40,7 +40,7 @@ def put_together(
         pixel_mask=integrals.mask,
         reference=reference,
         title=title,
-        provenance={"imported_from": source},
+        provenance={"imported_from": source, **integrals.applied},
         lag=lag,
         saturation=integrals.saturation,
     )

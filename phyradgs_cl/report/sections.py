@@ -94,13 +94,19 @@ def geometry_section(scan: Scan) -> Markup:
     return _section("geometry", "Geometry", _charts([(above, orbit_drawing(scan)), (side, side_drawing(scan))]))
 
 
-def shutter_section(run: Run, scan: Scan) -> Markup:
+def shutter_section(run: Run, scan: Scan) -> Markup | None:
+    """Times of a frame, and of frames after each other where the gantry moves; None of a scan that stops for exposures of no
+    stated length."""
+    if not scan.is_fly and scan.shutter.exposure_s == 0:
+        return None
     words = shutter_words(scan)
     one = words[0].upper() + words[1:] + "."
     if run.motion is not None:
         one += f" {_motion_words(run.motion)}"
     several = "The first frames on one axis of time."
-    charts = [(one, shutter_drawing(scan, run.motion)), (several, frames_drawing(scan))]
+    charts = [(one, shutter_drawing(scan, run.motion))]
+    if scan.is_fly:
+        charts.append((several, frames_drawing(scan)))
     return _section("shutter", "Shutter in space and time", _charts(charts))
 
 
