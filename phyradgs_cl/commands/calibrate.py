@@ -59,13 +59,13 @@ def calibrate_command(
         if target is not None:
             refuse_overwriting(flag, target, scan, *(path for path in (other, phantom) if path is not None))
             check_writable(target)
-    with Ticker("stage") as ticker:
+    with Ticker("pass") as ticker:
         ticker.stage(f"reading {scan}")
         shape = None if phantom is None else load_beads(phantom)
         loaded, others = load_scan(scan), [] if other is None else [load_scan(other)]
         if output is not None:
             _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
-        report = lambda done, total, at: ticker.show(done, total, f"  {at}")  # noqa: E731
+        report = lambda done, total, at, share: ticker.show(done, total, f"  {at}", share)  # noqa: E731
         found = calibrate(loaded, Runtime(wish), what, others, report, shape, splines)
     if output is not None:
         with only_run(output), finish_despite_interrupt():
