@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.hdf5.units import LENGTH
-from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
+from phyradgs_cl.io.tables import Fields, described, read_toml, refuse_unknown
 from phyradgs_cl.text import near_miss
 
 _TABLES: dict[str, tuple[str, ...]] = {
@@ -85,14 +85,15 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in _TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
     readout = tables["readout"]
-    direction = readout.number("direction", 1)
-    checks.one_of(readout.name("direction"), direction, (1, -1))
+    direction = readout.get("direction") if readout.has("direction") else 1
+    if isinstance(direction, bool) or direction not in (1, -1):
+        raise readout.error("direction", described(direction), "1 (index 0 first) or -1 (index 0 last)")
     return Scanner(
         path.stem,
         geometry,
         _grid(tables["volume"]) if "volume" in content else default_grid(geometry),
         readout.word("axis", AXES, default=AXES[0]),
-        int(direction),
+        1 if direction == 1 else -1,
         readout.number("ratio", lowest=0.0, highest=LENGTH.largest) if readout.has("ratio") else None,
         _pulse(tables["beam"]) if "beam" in content else None,
         tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG),
