@@ -30,6 +30,7 @@ class Ticker:
         self._width = 0  # of the line in a notebook, which knows no sequence that clears one
         self.started = self.last = time.monotonic()
         self.first: int | None = None
+        self.first_share = 0.0
         self.is_open = self.is_counting = False
 
     def __enter__(self) -> "Ticker":
@@ -55,16 +56,18 @@ class Ticker:
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
-    def show(self, done: int, total: int, more: str = "") -> None:
-        """Says ``done`` of ``total`` and ``more``, unless it has just said something."""
+    def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
+        """Says ``done`` of ``total`` and ``more``, unless it has just said something. ``share`` of the work that is done,
+        where some of what is counted takes longer."""
         now = time.monotonic()
+        share = done / total if share is None and total else share or 0.0
         if self.first is None:
-            self.first, self.started = done, now
+            self.first, self.started, self.first_share = done, now, share
         every_s = _TERMINAL_EVERY_S if self.is_terminal else _ELSEWHERE_EVERY_S
         if done < total and now - self.last < every_s:
             return
         self.last = now
-        line = f"{self.noun} {done}/{total}{more}{self._rate(done, total, now)}"
+        line = f"{self.noun} {done}/{total}{more}{self._rate(done, share, now)}"
         _say(self._over(line) if self.is_terminal else line, ends_line=not self.is_terminal)
         self.is_open = self.is_counting = self.is_terminal
 
@@ -75,12 +78,12 @@ class Ticker:
         before, self._width = self._width, len(line)
         return f"\r{line.ljust(before)}"
 
-    def _rate(self, done: int, total: int, now: float) -> str:
-        since_first = done - (self.first or 0)
-        if now <= self.started or since_first <= 0:
+    def _rate(self, done: int, share: float, now: float) -> str:
+        since_first, seconds = done - (self.first or 0), now - self.started
+        if seconds <= 0 or since_first <= 0 or share <= self.first_share:
             return ""
-        per_second = since_first / (now - self.started)
-        return f"  {per_second:.1f}/s  ETA {clock((total - done) / per_second)}"
+        left_s = seconds * (1 - share) / (share - self.first_share)
+        return f"  {since_first / seconds:.1f}/s  ETA {clock(left_s)}"
 
 
 def clock(seconds: float) -> str:

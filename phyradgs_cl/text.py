@@ -1,6 +1,7 @@
-"""Text from strangers: made fit for terminals, pages and files, and compared with what is known."""
+"""Text from strangers: made fit for terminals, pages and files, and compared with what is known. Numbers as text."""
 
 import difflib
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import fields
@@ -34,3 +35,8 @@ def short_repr(thing: Any) -> str:
         elif value != field.default:
             shown.append(f"{field.name}={value!r}")
     return f"{type(thing).__name__}({', '.join(shown)})"
+
+
+def to_digits_of(value: float, deviation: float) -> str:
+    """A value with the decimals that two digits of its deviation have."""
+    return f"{value:.{max(0, 1 - math.floor(math.log10(max(deviation, 1e-12))))}f}"

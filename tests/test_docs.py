@@ -9,7 +9,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import h5py
 import numpy as np
+import pytest
 import typer
 import yaml
 
@@ -41,6 +43,28 @@ def test_every_option_and_preset_is_described() -> None:
         names = (method, *entry.presets, *option_names(method_options(method)))
         missing = [name for name in names if f"`{name}`" not in text]
         assert not missing, f"docs/methods.md does not describe {missing} of {method}"
+
+
+def test_pages_and_docstrings_agree_on_integers_and_angles(cli, tmp_path) -> None:
+    """What they say is what happens, and no other page says something else."""
+    volume = np.full((4, 4, 4), 255, np.uint8)
+    with h5py.File(tmp_path / "bare.h5", "w") as file:
+        file["volume"] = volume
+    page, tutorial, conventions = ((DOCS / f"{name}.md").read_text() for name in ("formats", "tutorial", "mathematics"))
+    for scanner, words in {"r2": "1/mm with `r2`", "carm": "0.01/mm with `carm`"}.items():
+        command = ["simulate", "--volume", str(tmp_path / "bare.h5"), "--scanner", scanner, "--size", "4"]
+        assert cli.run([*command, "--detector", "6", "--views", "3", "-o", str(tmp_path / "scan.h5")]) == 0
+        assert api.load_scan(tmp_path / "scan.h5").reference.max() == pytest.approx(float(words.partition("/")[0]))
+        assert f" {words}" in " ".join(page.split())
+    assert "(formats.md#volumes-of-other-programs)" in tutorial and "stands for 1 per mm" not in tutorial
+
+    cone = ConeGeometry(5.0, 7.0, (2, 2), (0.2, 0.2))
+    scan = api.fly_scan(np.zeros((2, 2, 2)), cone, [0.0, 90.0], exposure_deg=1.0)
+    sources = [scan.trajectory.pose(frame, scan.frame_start_s[frame : frame + 1])[0, :3] for frame in (0, 1)]
+    np.testing.assert_allclose(sources, [[5, 0, 0], [0, 5, 0]], atol=1e-12)
+    assert "0 with the source on +x, counterclockwise" in " ".join(api.fly_scan.__doc__.split())
+    (row,) = [line for line in conventions.splitlines() if line.startswith("| angles |")]
+    assert "counterclockwise seen from $+z$; 0 with the source on $+x$" in row and "`_deg`" in row and "Python" not in row
 
 
 def test_the_worked_example_of_a_method_works(rt, monkeypatch) -> None:

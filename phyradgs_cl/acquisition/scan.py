@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 DETECTOR_MODELS = ("log", "intensity")
+APPLIED = ("flats_applied", "darks_applied")
+"""Where a scan's provenance counts the flats and darks by which its counts became line integrals."""
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 _OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels that may be broken
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
@@ -265,6 +267,11 @@ class Scan:
         box_mm = np.round(self.grid.box_mm, 3).tolist()
         found = f"a box in {box_mm} mm (z, y, x) that no ray meets in any frame"
         raise InputError("grid", found, "one that the panel sees", "correct its offset or unit, or the poses")
+
+
+def applied_facts(flats: int, darks: int) -> dict[str, object]:
+    """Provenance of line integrals that so many flats and darks were applied to."""
+    return {name: count for name, count in zip(APPLIED, (flats, darks), strict=True) if count}
 
 
 def check_others(others: Iterable[str]) -> None:

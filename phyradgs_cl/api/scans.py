@@ -55,7 +55,8 @@ def fly_scan(
 
     frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given.
     geometry: distances and pixels in mm.
-    angles_deg: (F,) the gantry's, as each frame's first line opens, counterclockwise seen from above.
+    angles_deg: (F,) the gantry's in degrees, as each frame's first line opens; 0 with the source on +x, counterclockwise
+    seen from above (+z). A sample that turns has the opposite sign.
     exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise; by fps and exposure_s when None.
     readout_ratio: readout over exposure time, from the first line's opening to the last's; 0, when None: a global shutter.
     readout: what is read out at one time, "rows" or "columns". readout_direction: 1 index 0 first, -1 last.
@@ -120,8 +121,8 @@ def static_scan(
 ) -> Scan:
     """A scan whose gantry stops for every frame, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's,
-    counterclockwise seen from above. flats, darks, mask, quantity, grid, others: as of ``fly_scan``.
+    frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's, from
+    +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: as of ``fly_scan``.
 
     Raises InputError for shapes that do not fit and numbers out of range.
     """
@@ -188,7 +189,8 @@ def _scan(
     if "pixel_mask" in others:
         raise InputError("pixel_mask", "an option of Scan itself", "mask", "write mask=")
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly
-    scan = Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, **others)
+    facts = {**pixels.applied, **others.pop("provenance", {})}
+    scan = Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, provenance=facts, **others)
     check_plausible(scan, lambda name: called.get(name, name))
     return scan
 

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -157,6 +157,7 @@ class BeadLevel:
     phantom: EllipsoidPhantom
     start: np.ndarray
     cut: float
+    count_pass: Callable[[], None] = lambda: None
 
     @classmethod
     def of(
@@ -221,6 +222,7 @@ class BeadLevel:
             step = self.compared(self.residual(operator, placement)) @ inverse
             step *= min(1.0, _MOST_PX / max(np.abs(step[:DENSITY]).max(), 1e-30))
             placement = _further(placement, step * self._units())
+            self.count_pass()
             if np.abs(step).max() < _SETTLED_PX:
                 break
             if np.abs(step).max() > _STRAIGHT_PX:

@@ -32,7 +32,8 @@ _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 class Level:
     """``scans`` as they are stated, with at most 60 frames each; measured (F, rows, columns): the frames of all of them in
     blocks of ``block`` pixels, 0 where ``valid`` is not; ``grid``: the volume's. ``before`` likewise: transmission of the
-    frame before each, of scans whose lag is looked for; ``course`` (F,): of a drift."""
+    frame before each, of scans whose lag is looked for; ``course`` (F,): of a drift. ``count_pass`` is called once per
+    iteration, which passes through the frames forward and back."""
 
     rt: Runtime
     scans: Sequence[Scan]
@@ -42,6 +43,7 @@ class Level:
     valid: np.ndarray | None
     course: np.ndarray
     before: np.ndarray | None = None
+    count_pass: Callable[[], None] = lambda: None
 
     @classmethod
     def of(
@@ -112,6 +114,7 @@ class Level:
         method.restore({**method.state(), **there})
         for _ in range(iterations):
             method.step()
+            self.count_pass()
         return method.volume
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
@@ -138,6 +141,7 @@ class Level:
             if method.finished:
                 break
             method.step()
+            self.count_pass()
         return method.residual
 
 

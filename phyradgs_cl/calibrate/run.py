@@ -25,7 +25,8 @@ from phyradgs_cl.calibrate.parameters import (
 )
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.reduced import Reduced, alike, gauge_share, identifiable, least_share, reduced
-from phyradgs_cl.calibrate.views import Wobble, find_sway, find_wobble
+from phyradgs_cl.calibrate.views import KINDS_OF, Wobble, find_sway, find_wobble, passes_of
+from phyradgs_cl.calibrate.work import Passes, Report, Work, cost_of
 from phyradgs_cl.check.coarse import QUICK, coarse
 from phyradgs_cl.check.questions.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.questions.offset import best_offset, rough_offset
@@ -39,8 +40,7 @@ from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
 Maker = Callable[..., Level | BeadLevel]
-Report = Callable[[int, int, str], None]
-Finder = Callable[[Runtime, Scan, Sequence[tuple[int, int, int]], Change], Wobble]
+Finder = Callable[[Runtime, Scan, Sequence[tuple[int, int, int]], Change, Work], Wobble]
 DEVIATIONS = 3.0  # by which a parameter has to differ from what is stated
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _MOST_PX = 2.0  # of a level, per step: signals are straight lines no further
@@ -62,6 +62,11 @@ class Stage:
     project: int
     first: int
     again: int
+
+    def passes(self, parameters: int, steps: int, asks: bool) -> int:
+        """Passes through the frames of so many last ``steps``, at most; ``asks``: what the frames tell, too."""
+        first = self.first - self.again if steps == self.steps else 0
+        return first + steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 BEAD_STAGES = (Stage(48, 6, 0, 8, 4), Stage(128, 6, 0, 6, 4))
@@ -97,7 +102,7 @@ def calibrate(
     rt: Runtime,
     what: str | None = None,
     others: Sequence[Scan] = (),
-    report: Report = lambda done, total, text: None,
+    report: Report = lambda done, total, text, share: None,
     phantom: EllipsoidPhantom | None = None,
     splines: int = 0,
 ) -> Calibration:
@@ -117,38 +122,45 @@ def calibrate(
         checks.whole("--splines", splines, _FEWEST_SPLINES, scan.frames)
     _warn_of_truncation(ready[0], phantom)
     _warn_of_same_turn(ready)
-    search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     stages = STAGES if phantom is None else BEAD_STAGES
     levels = [stage for k, stage in enumerate(stages) if k == 0 or _blocks(scan, stage) < _blocks(scan, stages[k - 1])]
     make: Maker = partial(Level.of, rt, asks_lag)
+    of_views = [(stage.columns, stage.first, stage.again) for stage in levels]
+    work = Work(report, _plan(ready, levels, parameters, per_view, asks_direction))
+    work.begin("start", "where the axis is")
+    search = _Search(at=_start(rt, ready[0]) if any(one.name == "offset-u" for one in parameters) else {})
     if phantom is not None:
-        report(0, len(levels), "where the beads are")
+        work.begin("start", "where the beads are")
         make = partial(BeadLevel.of, phantom, _placement(rt, ready, phantom, search))
-    order = _order(make, ready, levels[min(1, len(levels) - 1)], search) if asks_direction else None
+    work.begin("order", "which line is read first")
+    order = _order(make, work, ready, levels[min(1, len(levels) - 1)], search) if asks_direction else None
     if order is not None and order.verdict == CORRECTED:
         scan, ready = reversed_readout(scan), [reversed_readout(one) for one in ready]
     find: Finder = partial(find_wobble, splines=int(splines)) if per_view == WOBBLE else find_sway
-    of_views = [(stage.columns, stage.first, stage.again) for stage in levels]
     steady, wobbles = ready, {}
     if per_view and parameters:
-        report(0, len(levels), "views, before the rest")
+        work.begin("views before", "views, before the rest")
         first = change_of(search.at)
-        wobbles[first] = find(rt, ready[0], of_views, first)
+        wobbles[first] = find(rt, ready[0], of_views, first, work)
         steady = [_steady(ready[0], wobbles[first].views, search)]
     for number, stage in enumerate(levels if parameters else ()):
-        report(number, len(levels), f"at most {stage.columns} columns")
-        level = make(steady, stage.columns)
-        _descend(level, stage, parameters, search)
+        work.begin(f"stage {number}", f"at most {stage.columns} columns")
+        cost = cost_of(steady, stage.columns, MOST_FRAMES)
+        level = replace(make(steady, stage.columns), count_pass=work.counts(cost))
+        _descend(level, stage, parameters, search, partial(work.expect_at, cost))
         if not search.known:
             break
+        work.plan |= _plan_of_stages(steady, levels, len(search.known), number + 1)
     kept = _corrections(search)
     change, views, table_of_views = change_of(kept), None, []
     if per_view:
-        report(len(levels), len(levels), "views")
-        wobble = wobbles[change] if change in wobbles else find(rt, ready[0], of_views, change)
+        work.begin("views", "views")
+        wobble = wobbles[change] if change in wobbles else find(rt, ready[0], of_views, change, work)
         views, table_of_views = wobble.views, wobble.table
-    report(len(levels), len(levels), "residuals")
-    level = make(ready, levels[-1].columns, MOST_FRAMES if views is None else scan.frames)
+    work.begin("residuals", "residuals")
+    most_frames = MOST_FRAMES if views is None else scan.frames
+    level = make(ready, levels[-1].columns, most_frames)
+    level = replace(level, count_pass=work.counts(cost_of(ready, levels[-1].columns, most_frames)))
     before = _residual(level, levels[-1], Change(), None)
     after = _residual(level, levels[-1], change, views)
     if views is None and _rms(after) > _rms(before):  # what explains the frames worse is not what was wrong
@@ -158,6 +170,33 @@ def calibrate(
     corrected = evenly_lit(corrected, change.drift) if change.drift else corrected
     calibration = Calibration(corrected, table, search.alike, (_rms(before), _rms(after)), before, after, views)
     return replace(calibration, scan=replace(corrected, provenance=_told(scan, calibration)))
+
+
+def _plan(
+    scans: Sequence[Scan], levels: Sequence[Stage], parameters: Sequence[Parameter], per_view: str, asks_direction: bool
+) -> dict[str, Passes]:
+    """Passes through the frames of all phases, at most."""
+    of_views = [(stage.columns, stage.first, stage.again) for stage in levels]
+    views = passes_of(scans[0], of_views, KINDS_OF[per_view]) if per_view else []
+    second, last = levels[min(1, len(levels) - 1)], levels[-1]
+    most_frames = scans[0].frames if per_view else MOST_FRAMES
+    return {
+        "start": [],
+        "order": [(cost_of(scans, second.columns, MOST_FRAMES), 2 * second.first)] if asks_direction else [],
+        "views before": views if parameters else [],
+        **(_plan_of_stages(scans, levels, len(parameters), 0) if parameters else {}),
+        "views": views,
+        "residuals": [(cost_of(scans, last.columns, most_frames), 2 * last.first)],
+    }
+
+
+def _plan_of_stages(scans: Sequence[Scan], levels: Sequence[Stage], parameters: int, start: int) -> dict[str, Passes]:
+    """Those of the stages from ``start`` on."""
+    return {
+        f"stage {k}": [(cost_of(scans, stage.columns, MOST_FRAMES), stage.passes(parameters, stage.steps, k == 0))]
+        for k, stage in enumerate(levels)
+        if k >= start
+    }
 
 
 def _told(scan: Scan, calibration: Calibration) -> dict[str, Any]:
@@ -225,12 +264,15 @@ def _placement(rt: Runtime, scans: Sequence[Scan], phantom: EllipsoidPhantom, se
     return placement
 
 
-def _order(make: Maker, scans: Sequence[Scan], stage: Stage, search: _Search) -> Found:
+def _order(make: Maker, work: Work, scans: Sequence[Scan], stage: Stage, search: _Search) -> Found:
     """Are lines read from the stated end? Told by four standard errors of the frames' residuals, and a share; the deviation
     is that by which 1 and −1 differ as they do."""
+    counts = work.counts(cost_of(scans, stage.columns, MOST_FRAMES))
+    levels = [
+        replace(make(some, stage.columns), count_pass=counts) for some in (scans, [reversed_readout(scan) for scan in scans])
+    ]
     stated, other = (
-        np.mean(np.square(_residual(make(some, stage.columns), stage, change_of(search.at), None), dtype=np.float64), (1, 2))
-        for some in (scans, [reversed_readout(scan) for scan in scans])
+        np.mean(np.square(_residual(level, stage, change_of(search.at), None), dtype=np.float64), (1, 2)) for level in levels
     )
     errors, ratio = t_statistic(stated, other), residual_ratio(stated, other)
     direction, share = float(scans[0].shutter.direction), abs(1 - min(ratio, 1 / ratio))
@@ -268,13 +310,20 @@ def _check(scans: Sequence[Scan], names: Sequence[str], per_view: str, phantom: 
             raise InputError("--with: readout axis", other.shutter.axis, f"the first scan's, {first.shutter.axis}")
 
 
-def _descend(level: Level | BeadLevel, stage: Stage, parameters: Sequence[Parameter], search: _Search) -> None:
+def _descend(
+    level: Level | BeadLevel,
+    stage: Stage,
+    parameters: Sequence[Parameter],
+    search: _Search,
+    expect: Callable[[int], None],
+) -> None:
     """Steps on one level until they are small; which parameters the frames tell is asked at each step of the first one."""
     volume: np.ndarray | None = None
     asks = search.problem is None
     search.former = {} if asks or isinstance(level, BeadLevel) else dict(search.at)
     for number in range(stage.steps):
         asked = parameters if asks else [PARAMETERS[name] for name in search.known]
+        expect(stage.passes(len(asked), stage.steps - number, asks))
         operator: Any = level.operator(change_of(search.at))
         here = level.at(change_of(search.at))
         volume = here.reconstruct(operator, volume, stage.again if number else stage.first)

@@ -10,6 +10,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.finding import AGREES, CORRECTED, Found
 from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.moved import Change, Sway, Views
+from phyradgs_cl.calibrate.parameters import MOTION, WOBBLE
 from phyradgs_cl.calibrate.wobble import (
     KINDS,
     SHIFT_U,
@@ -24,6 +25,7 @@ from phyradgs_cl.calibrate.wobble import (
     without_smooth_gauges,
     without_sway_gauges,
 )
+from phyradgs_cl.calibrate.work import Work, cost_of
 from phyradgs_cl.runtime import Runtime
 
 SPLINES = 7  # of a motion: one for every seventh of the scan, about
@@ -38,6 +40,7 @@ _OF_OBJECT = tuple(
     for kind, unit, scale in (("turn about", "deg", _DEG), ("shift along", "mm", 1.0))
     for axis in "xyz"
 )
+KINDS_OF = {WOBBLE: len(_OF_VIEWS), MOTION: len(_OF_OBJECT)}
 Stages = Sequence[tuple[int, int, int]]
 
 
@@ -49,7 +52,14 @@ class Wobble:
     table: list[Found]
 
 
-def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change, splines: int = 0) -> Wobble:
+def passes_of(scan: Scan, stages: Stages, kinds: int) -> list[tuple[float, int]]:
+    """Passes through the frames of looking for so many ``kinds`` of numbers, with their costs."""
+    costs = [cost_of([scan], columns, scan.frames) for columns, *_ in stages]
+    steps = [first + (_STEPS - 1) * again + _STEPS * _ITERATIONS for _, first, again in stages]
+    return [*zip(costs, steps, strict=True), (costs[-1], kinds * _ITERATIONS)]
+
+
+def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change, work: Work, splines: int = 0) -> Wobble:
     """Turns and shifts of all views of a scan after ``change``, each by itself or by so many ``splines`` of time; stages:
     columns, iterations of a first and next volume.
 
@@ -58,15 +68,15 @@ def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change, splines
     kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 2) + [KINDS] * min(len(stages), 2)
     numbers = numbers_of_views(scan, splines)
     without = partial(without_smooth_gauges, scan, numbers) if splines else partial(without_gauges, scan)
-    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_VIEWS, (TURN,))
+    return _found(rt, scan, stages, change, work, numbers, kinds, without, _OF_VIEWS, (TURN,))
 
 
-def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change) -> Wobble:
+def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change, work: Work) -> Wobble:
     """As ``find_wobble``, a rigid motion of the object."""
     kinds = [range(len(_OF_OBJECT))] * len(stages)
     numbers = numbers_of_sway(scan, SPLINES)
     without = partial(without_sway_gauges, scan, numbers)
-    return _found(rt, scan, stages, change, numbers, kinds, without, _OF_OBJECT)
+    return _found(rt, scan, stages, change, work, numbers, kinds, without, _OF_OBJECT)
 
 
 def _found(
@@ -74,6 +84,7 @@ def _found(
     scan: Scan,
     stages: Stages,
     change: Change,
+    work: Work,
     numbers: Numbers,
     kinds: Sequence[Sequence[int]],
     without: Callable[[np.ndarray], np.ndarray],
@@ -84,6 +95,7 @@ def _found(
     former = numbers.values
     for (columns, first, again), asked in zip(stages, kinds, strict=True):
         level, volume, former = Level.of(rt, False, [scan], columns, scan.frames), None, numbers.values
+        level = replace(level, count_pass=work.counts(cost_of([scan], columns, scan.frames)))
         numbers = replace(numbers, values=former * ~np.isin(np.arange(len(names)), anew))
         for _ in range(_STEPS):
             operator = numbers.operator(level, change)

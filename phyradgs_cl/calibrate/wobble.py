@@ -165,6 +165,7 @@ def view_step(
     method = Cgls(System(both, residual, level.valid))
     for _ in range(iterations):
         method.step()
+        level.count_pass()
     step = np.zeros(numbers.values.shape)
     step[:, kinds] = both.parts(method.volume)[1] * scale * numbers.units[list(kinds)]
     return Step(step, signals)

@@ -1,7 +1,6 @@
 """calibrate: a scan's true geometry and timing from its own frames."""
 
 import json
-import math
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +21,7 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
+from phyradgs_cl.text import to_digits_of
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
@@ -59,13 +59,13 @@ def calibrate_command(
         if target is not None:
             refuse_overwriting(flag, target, scan, *(path for path in (other, phantom) if path is not None))
             check_writable(target)
-    with Ticker("stage") as ticker:
+    with Ticker("pass") as ticker:
         ticker.stage(f"reading {scan}")
         shape = None if phantom is None else load_beads(phantom)
         loaded, others = load_scan(scan), [] if other is None else [load_scan(other)]
         if output is not None:
             _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
-        report = lambda done, total, at: ticker.show(done, total, f"  {at}")  # noqa: E731
+        report = lambda done, total, at, share: ticker.show(done, total, f"  {at}", share)  # noqa: E731
         found = calibrate(loaded, Runtime(wish), what, others, report, shape, splines)
     if output is not None:
         with only_run(output), finish_despite_interrupt():
@@ -109,8 +109,7 @@ def _as_text(found: Calibration) -> str:
 
 
 def _value(one: Found) -> str:
-    """What was found to two digits of its deviation; a dash where nothing was."""
+    """The estimate to two digits of its deviation; a dash where there is none."""
     if one.found is None or one.deviation is None:
         return "-"
-    digits = max(0, 1 - math.floor(math.log10(max(one.deviation, 1e-12))))
-    return f"{one.found:.{digits}f} ± {one.deviation:.{digits}f}"
+    return f"{to_digits_of(one.found, one.deviation)} ± {to_digits_of(one.deviation, one.deviation)}"

@@ -3,20 +3,26 @@
 import json
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, say
-from phyradgs_cl.commands.files import file_argument, file_option
+from phyradgs_cl.commands.files import file_argument, file_option, option
+from phyradgs_cl.settings import numbers
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"
-_REFERENCE = "Scan with a known truth, or a volume; VOLUME is resampled onto its grid (linear)."
+_REFERENCE = (
+    "Scan with a known truth, or a volume. One with voxels an integer multiple finer is averaged onto VOLUME's grid; else "
+    "VOLUME is resampled onto the reference's (linear)."
+)
+_VOXEL = "Sides of the voxels of a reference without a scale, mm; it is centred on the axis."
 
 
 def evaluate_command(
     volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
     reference: Annotated[Path, file_option(_REFERENCE, "--reference")],
     as_json: AsJson = False,
+    reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
     picture: Annotated[
         Path | None,
         file_option("PNG of slices: result, truth, difference.", "--picture", default="v.evaluated.png of v.h5"),
@@ -25,9 +31,9 @@ def evaluate_command(
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
     stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may stand beside each other
     usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the preview of the run
-    facts = run_evaluation(volume, reference, picture or usual)
+    facts = run_evaluation(volume, reference, picture or usual, reference_voxel_mm)
     if as_json:
         numbers = {key: None if value == math.inf else value for key, value in facts.items()}  # JSON has no infinity
         say(json.dumps(numbers))
     else:
-        say(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   picture {facts['picture']}")
+        say(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   {facts['compared']}   picture {facts['picture']}")

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_argument
@@ -22,5 +22,19 @@ def info_command(
         say(json.dumps(facts, default=str))
         return
     for key, value in facts.items():
-        text = str(value)
+        text = _shown(value)
         say(f"{key.replace('_', ' '):24s} {text[:_LONGEST]}{'…' if len(text) > _LONGEST else ''}")
+
+
+def _shown(value: Any, is_inside: bool = False) -> str:
+    """A value in words, its numbers to six digits."""
+    match value:
+        case float():
+            return f"{value:.6g}"
+        case tuple():
+            return f"({', '.join(_shown(part, True) for part in value)})"
+        case list():
+            return f"[{', '.join(_shown(part, True) for part in value)}]"
+        case dict():
+            return f"{{{', '.join(f'{key!r}: {_shown(part, True)}' for key, part in value.items())}}}"
+    return repr(value) if is_inside else str(value)

@@ -17,6 +17,7 @@ from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.reconstructors.result import COMPARED
 from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
@@ -69,7 +70,8 @@ def reconstruct_command(
                 report.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
     how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s"
-    say(f"{written}: {how}{scores(metrics)}")
+    compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
+    say(f"{written}: {how}{scores(metrics)}{compared}")
     if TUNED in result.facts:
         say(tuned_words(result.facts[TUNED]))
     if profile:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.exporters.dicom import write_dicom
+from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
 from phyradgs_cl.exporters.gaussians import gaussians_of, write_npz, write_ply
 from phyradgs_cl.exporters.meta_image import write_meta_image
 from phyradgs_cl.exporters.nifti import write_nifti
@@ -16,8 +16,8 @@ from phyradgs_cl.exporters.tiff import write_tiff
 from phyradgs_cl.io import StoredVolume, read_volume
 
 __all__ = [
-    "CLOUDS", "EXPORTS", "Placed", "default_output", "export_stored", "export_volume", "foreign_suffix", "format_of",
-    "hounsfield", "placed",
+    "CLOUDS", "EXPORTS", "DicomLabels", "Placed", "default_output", "export_stored", "export_volume", "foreign_suffix",
+    "format_of", "hounsfield", "placed",
 ]  # fmt: skip
 
 VOXELS: dict[str, Callable[[Path, Placed], None]] = {
@@ -34,14 +34,15 @@ _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": ()}
 
 
 def export_volume(
-    path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None
-) -> Path:
+    path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
+    labels: DicomLabels | None = None,
+) -> Path:  # fmt: skip
     """Write a volume file in another format, whole or not at all; returns what was written.
 
     ``to``: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: file, or folder for dicom;
-    None puts it beside ``path``. ``mu_water_per_mm``: water's attenuation; the values are then Hounsfield units.
-    InputError: no such format, a volume that is damaged or has no Gaussians, a name that does not fit. OutputError: it
-    cannot be written.
+    None puts it beside ``path``. ``mu_water_per_mm``: water's attenuation; the values are then Hounsfield units. ``labels``:
+    patient, study and series, which dicom alone takes. InputError: no such format, a volume that is damaged or has no
+    Gaussians, a name that does not fit, labels with another format. OutputError: it cannot be written.
     """
     checks.one_of("--to", to, EXPORTS)
     path = Path(path)
@@ -49,16 +50,21 @@ def export_volume(
     _check_name(target, to, path)
     if to in CLOUDS and mu_water_per_mm is not None:
         raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
-    export_stored(read_volume(path), to, target, str(path), mu_water_per_mm)
+    if to != "dicom" and labels is not None and labels.given:
+        raise InputError(f"--{next(iter(labels.given))}", f"with --to {to}", "--to dicom", "leave it out")
+    export_stored(read_volume(path), to, target, str(path), mu_water_per_mm, labels)
     return target
 
 
 def export_stored(
-    stored: StoredVolume, to: str, target: Path, culprit: str, mu_water_per_mm: float | None = None
-) -> None:
+    stored: StoredVolume, to: str, target: Path, culprit: str, mu_water_per_mm: float | None = None,
+    labels: DicomLabels | None = None,
+) -> None:  # fmt: skip
     """Write a volume as ``export_volume`` does; ``culprit``: where it comes from."""
     if to in CLOUDS:
         CLOUDS[to](target, gaussians_of(stored, culprit))
+    elif to == "dicom":
+        write_dicom(target, placed(stored, mu_water_per_mm), labels)
     else:
         VOXELS[to](target, placed(stored, mu_water_per_mm))
 

@@ -1,35 +1,85 @@
 """A DICOM series, an image per slice: PS3.3's CT Image module (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
 
+import datetime
 import hashlib
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks, signals
-from phyradgs_cl.errors import OutputError
+from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.exporters.placed import Placed
 from phyradgs_cl.io.output import temporary_name
 
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
 _LARGEST = 32_767
+_LONGEST = 64  # characters, of the value representations PN and LO
 
 
-def write_dicom(path: Path, volume: Placed) -> None:
+@dataclass(frozen=True)
+class DicomLabels:
+    """What viewers and archives list a series by, None where not stated. patient: its name, as Family^Given, and ID; title:
+    of the study; description: of the series; date: of the study, YYYY-MM-DD. InputError: a text that DICOM cannot hold."""
+
+    patient: str | None = None
+    title: str | None = None
+    description: str | None = None
+    date: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.given.items():
+            option = f"--{name}"
+            if not (isinstance(value, str) and value.strip() and value.isprintable() and len(value) <= _LONGEST):
+                raise InputError(option, checks.shown(value), f"a line of 1 to {_LONGEST} characters")
+            if "\\" in value:
+                raise InputError(option, checks.shown(value), "text without \\, which separates values in DICOM")
+        if self.date is not None and self._day is None:
+            raise InputError("--date", checks.shown(self.date), "a day as YYYY-MM-DD, such as 2026-03-31")
+
+    @property
+    def given(self) -> dict[str, object]:
+        """The labels that are stated, by name."""
+        return {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
+
+    @property
+    def _day(self) -> datetime.date | None:
+        try:
+            return datetime.date.fromisoformat(self.date or "")
+        except ValueError:
+            return None
+
+    def write(self, image: Any) -> None:
+        """Puts them into a DICOM data set."""
+        if self.patient is not None:
+            image.PatientName = image.PatientID = self.patient
+        if self.title is not None:
+            image.StudyDescription = self.title
+        if self.description is not None:
+            image.SeriesDescription = self.description
+        if self._day is not None:
+            image.StudyDate = image.SeriesDate = self._day.strftime("%Y%m%d")
+
+
+def write_dicom(path: Path, volume: Placed, labels: DicomLabels | None = None) -> None:
     """A new folder with 0001.dcm from the lowest slice up."""
+    labels = labels or DicomLabels()
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     slope = rescale_slope(volume)
     content = volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
+    content += repr(labels.given).encode() if labels.given else b""  # another patient's is another study
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
     uid = {n: generate(entropy_srcs=[seed, volume.unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:
         for index, plane in enumerate(volume.values):
             image = _common(pydicom, volume, slope, uid)
+            labels.write(image)
             instance = generate(entropy_srcs=[seed, volume.unit, str(index)])
             image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = instance
             _place(image, volume, index)
@@ -50,6 +100,7 @@ def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> An
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE
     image.file_meta.TransferSyntaxUID = _EXPLICIT_LITTLE
+    image.SpecificCharacterSet = "ISO_IR 192"  # UTF-8
     image.StudyInstanceUID, image.SeriesInstanceUID = uid["study"], uid["series"]
     image.FrameOfReferenceUID = uid["frame"]
     for name in ("PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "AccessionNumber"):
@@ -58,7 +109,7 @@ def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> An
     for name in ("ReferringPhysicianName", "PositionReferenceIndicator", "KVP", "AcquisitionNumber"):
         setattr(image, name, None)
     image.Modality, image.Manufacturer, image.SeriesNumber = "CT", "phyradgs-cl", 1
-    image.SeriesDescription = f"values in {volume.unit}"
+    image.SeriesDescription = image.ImageComments = f"values in {volume.unit}"
     image.ImageType, image.PatientPosition = ["DERIVED", "PRIMARY", "AXIAL"], "HFS"
     image.Columns, image.Rows, _ = volume.shape_xyz
     image.SamplesPerPixel, image.PhotometricInterpretation = 1, "MONOCHROME2"

@@ -41,10 +41,7 @@ class GridChoice:
             whole = tuple(int(n) for n in counts)
             object.__setattr__(self, "size", whole if len(whole) == 3 else whole[0])
         if self.voxel_mm is not None:
-            sides_mm = _numbers("--voxel-mm", self.voxel_mm, (1, 3), "0.5 or 1,0.5,0.5")
-            for side_mm in sides_mm:
-                checks.within("--voxel-mm", side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
-            object.__setattr__(self, "voxel_mm", sides_mm if len(sides_mm) == 3 else sides_mm * 3)
+            object.__setattr__(self, "voxel_mm", voxel_sides_mm("--voxel-mm", self.voxel_mm))
         if self.roi_mm is not None:
             ends_mm = _numbers("--roi-mm", self.roi_mm, (1, 3, 6), "40 (a cube) or -10,10,-20,20,-20,20 (Z0,Z1,Y0,Y1,X0,X1)")
             ends_mm = ends_mm * 3 if len(ends_mm) == 1 else ends_mm
@@ -124,6 +121,15 @@ class GridChoice:
             found = " × ".join(f"{n:.6g}" for n in shape)
             raise InputError(culprit, f"a grid of {found}", f"at most {MOST_VOXELS:.3g} voxels")
         return triple(int(n) for n in shape)
+
+
+def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
+    """Sides of a voxel (z, y, x) in mm from one length, or three. Raises InputError, which names ``option``, for any other
+    value."""
+    sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
+    for side_mm in sides_mm:
+        checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
+    return triple(sides_mm if len(sides_mm) == 3 else sides_mm * 3)
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:

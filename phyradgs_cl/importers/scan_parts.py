@@ -43,7 +43,7 @@ def put_together(
         pixel_mask=integrals.mask,
         reference=reference,
         title=title,
-        provenance={"imported_from": source, **({"assumed": assumed} if assumed else {})},
+        provenance={"imported_from": source, **integrals.applied, **({"assumed": assumed} if assumed else {})},
         lag=lag,
         saturation=integrals.saturation,
     )

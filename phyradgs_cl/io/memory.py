@@ -3,7 +3,8 @@
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 
@@ -24,6 +25,15 @@ def host_bytes() -> float:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
         return float("inf")
+
+
+def free_bytes() -> float:
+    """Memory that this process may still take without others losing theirs; infinite where the system does not say."""
+    free = host_bytes()
+    with suppress(OSError, ValueError, IndexError):
+        free = 1024.0 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
+    limit = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]
+    return free if limit < 0 else min(free, limit - in_use_bytes("VmSize:"))
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.hdf5.units import LENGTH
-from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
+from phyradgs_cl.io.tables import Fields, described, read_toml, refuse_unknown
 from phyradgs_cl.text import near_miss
 
 TABLES: dict[str, tuple[str, ...]] = {
@@ -109,9 +109,10 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
 
 def _order(readout: Fields) -> tuple[str, int]:
     """Readout axis and direction, as ``first`` or as themselves; rows from the lowest up where the table has none."""
-    direction = readout.number("direction", 1)
-    checks.one_of(readout.name("direction"), direction, (1, -1))
-    axis, stated = readout.word("axis", AXES, default=AXES[0]), int(direction)
+    direction = readout.get("direction") if readout.has("direction") else 1
+    if isinstance(direction, bool) or direction not in (1, -1):
+        raise readout.error("direction", described(direction), "1 (index 0 first) or -1 (index 0 last)")
+    axis, stated = readout.word("axis", AXES, default=AXES[0]), 1 if direction == 1 else -1
     if not readout.has("first"):
         return axis, stated
 

@@ -6,6 +6,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.drawing import CURVE, draw_image, new_figure
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.metrics import reference_on
 from phyradgs_cl.metrics.slices import draw_slices
 from phyradgs_cl.reconstructors.frames.pairs import FramePair, frame_pairs
 from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
@@ -33,7 +34,7 @@ def plot_result(
         checks.whole("frame", frame, 0, scan.frames - 1)
         rt = device if isinstance(device, Runtime) else Runtime(device)
         (pair,) = frame_pairs(rt, prepared(scan, InputOptions()), result.volume, result.grid, [frame])
-        truth = scan.on_grid(result.grid).reference
+        truth = None if scan.reference is None else reference_on(result.grid, scan.reference, scan.grid)
     columns = 1 if truth is None else 3
     side = _SIDE_INCH if len(result.record) > 1 or pair is not None else 0.0
     figure = new_figure(columns * _SLICE_INCH + side, 3 * _ROW_INCH)

@@ -22,6 +22,8 @@ State = Mapping[str, np.ndarray]
 """What an interrupted run needs to go on, as named arrays: each method knows its own names."""
 HELD_OUT = "held_out"
 """Where a result's facts have its error on pixels that its method did not see."""
+COMPARED = "compared"
+"""Where they say how the volume was compared with the scan's reference, where not voxel by voxel."""
 MARGIN_MM = "margin_mm"
 """Where they have the width (z, y, x) of what the method filled around the volume and discarded."""
 

@@ -27,6 +27,7 @@ from phyradgs_cl.reconstructors.result import (
     Reconstruction,
     ignore_progress,
 )
+from phyradgs_cl.reconstructors.room import naming_size_that_fits
 from phyradgs_cl.reconstructors.tune.trials import tuned
 from phyradgs_cl.runtime import Runtime
 
@@ -64,7 +65,8 @@ def reconstruct(
     run = partial(method_of(method).run, rt=rt, seed=seed)
     if asked.margin_mm is not None:
         report = _showing(asked.of(scan.grid), report)
-    with _naming_margin(asked, ready.grid), naming_host_memory():
+    fitting = naming_size_that_fits(rt, ready, method_name(method), chosen)
+    with fitting, _naming_margin(asked, ready.grid), naming_host_memory():
         if asked.tune:
             result = tuned(asked.tune, run, seen, chosen, rt, report, **extra)
         else:

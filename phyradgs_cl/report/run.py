@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.io.hdf5.facts import NUMBER
-from phyradgs_cl.metrics import compare
+from phyradgs_cl.metrics import aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import InputOptions, input_options
 from phyradgs_cl.reconstructors.tune.trials import TUNED
@@ -27,7 +27,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class Run:
     """A reconstruction and what is known of it. scan, scan_path, scan_facts: its scan, on the volume's grid, where found.
-    reference (nz, ny, nx) 1/mm: the truth on that. metrics: by name. notes: what to know about the page itself."""
+    reference (nz, ny, nx) 1/mm: the truth on that. metrics: by name. notes: what to know about the page itself. compared:
+    how the metrics compare volume and truth; empty without a truth."""
 
     path: Path
     stored: StoredVolume
@@ -37,6 +38,7 @@ class Run:
     reference: np.ndarray | None = None
     metrics: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    compared: str = ""
 
     @property
     def motion(self) -> Motion | None:
@@ -109,11 +111,19 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
     whole = read_scan(found, flat_correction(before.flats))
     whole = replace(whole, provenance={**whole.provenance, "flats": before.flats})
     scan = whole.on_grid(stored.grid)
-    if whole.reference is not None and scan.reference is None:
-        notes.append("The scan's reference is on another grid than the volume and is not shown.")
-    reference = scan.reference if scan.reference is not None and float(scan.reference.max()) > 0 else None
-    metrics = dict(stored.metrics or (compare(stored.volume, reference) if reference is not None else {}))
-    return Run(path, stored, scan, found, facts, reference, metrics, tuple(notes))
+    metrics: dict[str, object] = dict(stored.metrics or {})
+    pair = None if whole.reference is None else aligned(stored.volume, stored.grid, whole.reference, whole.grid)
+    if whole.reference is not None and (pair is None or not pair.reference.max() > 0):
+        notes.append("Nothing of the scan's reference lies in the volume's box: there is no PSNR.")
+        pair = None
+    if pair is None:
+        return Run(path, stored, scan, found, facts, None, metrics, tuple(notes))
+    if "psnr_db" not in metrics:
+        metrics = {**compare(pair.volume, pair.reference), **metrics}
+    reference = pair.reference if pair.grid is stored.grid else None
+    if reference is None:
+        notes.append("The scan's reference is on another grid than the volume: its slices are not shown.")
+    return Run(path, stored, scan, found, facts, reference, metrics, tuple(notes), pair.how)
 
 
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:

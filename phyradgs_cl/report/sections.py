@@ -19,9 +19,11 @@ from phyradgs_cl.report.pictures.slices import Plane, planes_of, stills_of, wind
 from phyradgs_cl.report.pictures.steps import Change
 from phyradgs_cl.report.pictures.viewer import stills, viewer
 from phyradgs_cl.report.run import Run
+from phyradgs_cl.text import to_digits_of
 
 _MOST_ROWS = 400  # of provenance
 _MOST_CHARTS, _MOST_ALIKE = 6, 20  # of a calibration
+_ABSURD = 1e9  # a value of a parameter that no file of ours has
 _DISAGREEMENT = (
     "Half the RMS of their difference over 3³ voxels, in the middle slices: where the volume leans on its method. It is no "
     "confidence interval: both are estimates from the same frames, errors that they share are not in it, and the volume's "
@@ -64,7 +66,7 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
         facts["residual_of_the_shown_frames"] = float(np.sqrt(np.mean([view.rms**2 for view in views])))
     if not facts:
         return None
-    told = "Against the reference that the scan carries. " if run.reference is not None else ""
+    told = f"Against the reference that the scan carries, {run.compared}. " if run.compared else ""
     if "holdout_rms" in facts:
         told += "Holdout: of line integrals that the method did not see, and what their noise makes of it."
     return _section("metrics", "Metrics", told and element("p", told, class_="note"), facts_table(facts))
@@ -92,13 +94,19 @@ def geometry_section(scan: Scan) -> Markup:
     return _section("geometry", "Geometry", _charts([(above, orbit_drawing(scan)), (side, side_drawing(scan))]))
 
 
-def shutter_section(run: Run, scan: Scan) -> Markup:
+def shutter_section(run: Run, scan: Scan) -> Markup | None:
+    """Times of a frame, and of frames after each other where the gantry moves; None of a scan that stops for exposures of no
+    stated length."""
+    if not scan.is_fly and scan.shutter.exposure_s == 0:
+        return None
     words = shutter_words(scan)
     one = words[0].upper() + words[1:] + "."
     if run.motion is not None:
         one += f" {_motion_words(run.motion)}"
     several = "The first frames on one axis of time."
-    charts = [(one, shutter_drawing(scan, run.motion)), (several, frames_drawing(scan))]
+    charts = [(one, shutter_drawing(scan, run.motion))]
+    if scan.is_fly:
+        charts.append((several, frames_drawing(scan)))
     return _section("shutter", "Shutter in space and time", _charts(charts))
 
 
@@ -170,6 +178,8 @@ def _found(line: Mapping[str, object]) -> list[str]:
     )
     of = scale if isinstance(scale, str) else ""
     value = "–" if found is None else f"{shown(found)} ± {_or_dash(deviation, of)}"
+    if isinstance(found, float) and isinstance(deviation, float) and abs(found) + deviation < _ABSURD:
+        value = f"{to_digits_of(found, deviation)} ± {shown(to_digits_of(deviation, deviation), of)}"
     return [_or_dash(name), _or_dash(stated, of), value, _or_dash(verdict)]
 
 

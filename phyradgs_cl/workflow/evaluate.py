@@ -1,36 +1,39 @@
 """From two volumes to numbers and a picture."""
 
-import logging
-import math
 from pathlib import Path
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.io.volume import interruption
-from phyradgs_cl.metrics import compare, resampled, shared_slices, slices_png
+from phyradgs_cl.metrics import VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, slices_png
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
 
-log = logging.getLogger(__name__)
-
 
 @np.errstate(all="ignore")
-def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> dict[str, object]:
-    """Compares a volume with a scan's reference or another volume, onto whose voxels within its box it is resampled, and
-    writes the picture of slices; values without a grid are compared voxel by voxel."""
+def run_evaluation(
+    volume_path: Path, reference_path: Path, picture: Path, reference_voxel_mm: object = None
+) -> dict[str, object]:
+    """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
+    picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
+    reference without a scale, one length or (z, y, x). InputError: no such sides; files that do not fit each other."""
     refuse_overwriting("--picture", picture, volume_path, reference_path)
     if picture.suffix.lower() != ".png":
         raise InputError("--picture", str(picture), "a file name that ends in .png")
     check_writable(picture)
     volume, grid, provenance = load_result(volume_path)
-    reference, wanted = load_reference(reference_path)
-    told: dict[str, object] = {}
-    if grid is not None and wanted is not None and not grid.is_close(wanted):
-        volume, reference, told = _on_shared_voxels(volume_path, reference_path, (volume, grid), (reference, wanted))
+    reference, stored_grid = load_reference(reference_path)
+    how, share = f"{VOXEL_BY_VOXEL}, as {plain_text(volume_path.name)} has no scale", 1.0
+    if grid is not None:
+        truth = reference, _grid_of(reference_path, reference, stored_grid, reference_voxel_mm, volume_path)
+        pair = _on_one_grid(volume_path, reference_path, (volume, grid), truth)
+        volume, reference, how, share = pair.volume, pair.reference, pair.how, pair.share
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
     metrics = compare(volume, reference)
@@ -42,38 +45,33 @@ def run_evaluation(volume_path: Path, reference_path: Path, picture: Path) -> di
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
-    return {**metrics, **known, **interruption(provenance), **told, **files}
+    compared: dict[str, object] = {"compared": how, "share_of_reference_covered": share}
+    return {**metrics, **known, **interruption(provenance), **compared, **files}
 
 
-def _on_shared_voxels(
+def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:
+    """Where the reference lies: its own grid, or voxels of ``voxel_mm`` centred on the axis."""
+    if voxel_mm is not None:
+        if grid is not None:
+            expected = f"a reference without a scale; {path} has {in_words(grid)}"
+            raise InputError("--reference-voxel-mm", checks.shown(voxel_mm), expected, "leave it out")
+        return Grid(triple(reference.shape), voxel_sides_mm("--reference-voxel-mm", voxel_mm))
+    if grid is None:
+        found, expected = "voxels without a scale", f"a reference that says where they lie, as {volume_path} does"
+        remedy = "give the sides of its voxels by --reference-voxel-mm, for a volume that is centred on the axis"
+        raise InputError(str(path), found, expected, remedy)
+    return grid
+
+
+def _on_one_grid(
     volume_path: Path, reference_path: Path, result: tuple[np.ndarray, Grid], truth: tuple[np.ndarray, Grid]
-) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
-    """The result and the truth on those voxels of the truth's that lie in the result's box, and what to say of that."""
-    (volume, grid), (reference, wanted) = result, truth
-    shared = shared_slices(wanted, grid)
-    if shared is None:
-        found = f"{_place(grid)}, which has no voxel of the reference, {_place(wanted)}"
+) -> Aligned:
+    """Both on one grid; InputError where they have nothing in common that can be compared."""
+    pair = aligned(*result, *truth)
+    if pair is None:
+        found = f"{in_words(result[1])}, which has no voxel of the reference, {in_words(truth[1])}"
         raise InputError(str(volume_path), found, "volumes in one place")
-    part = reference[shared]
-    share = part.size / reference.size
-    if not part.max() > 0:
-        found = f"nothing in the {100 * share:.3g} % of it that lie in {volume_path}"
+    if not pair.reference.max() > 0:
+        found = f"nothing in the {100 * pair.share:.3g} % of it that lie in {volume_path}"
         raise InputError(str(reference_path), found, "an object in the part that is compared")
-    told: dict[str, object] = {"share_of_reference_covered": share}
-    if grid.slices_in(wanted) == shared:
-        found = "%s: compared with its part of the reference, %.3g %% of the voxels"
-        log.warning(found, plain_text(str(volume_path)), 100 * share)
-        return volume, part, told
-    volume, _ = resampled(volume, grid, wanted.part(triple(one.start for one in shared), triple(part.shape)))
-    where = f"from {_place(grid)} onto the reference's {_place(wanted)}"
-    rest = "" if share == 1 else f"; compared on the {100 * share:.3g} % of those that lie in the volume"
-    log.warning("%s: resampled (linear) %s%s", plain_text(str(volume_path)), where, rest)
-    return volume, part, {"resampled": where, **told}
-
-
-def _place(grid: Grid) -> str:
-    """A grid in a few words, x y z as everywhere where people read of sizes."""
-    counts, sizes, offsets = (v[::-1] for v in (grid.shape, grid.voxel_size_mm, grid.offset_mm))
-    digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
-    words = f"{'×'.join(map(str, counts))} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
-    return f"{words} about ({', '.join(f'{round(o, digits) + 0.0:g}' for o in offsets)}) mm"
+    return pair

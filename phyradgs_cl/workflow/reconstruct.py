@@ -29,7 +29,7 @@ from phyradgs_cl.io import (
     write_checkpoint,
     write_volume,
 )
-from phyradgs_cl.metrics import compare
+from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
@@ -44,7 +44,7 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
-from phyradgs_cl.reconstructors.result import HELD_OUT, option_facts
+from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT, option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
@@ -176,12 +176,18 @@ def _reconstructed(
 
 
 def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
-    """Against the scan's reference, where the volume is on its grid or a part of that, and against held-out pixels."""
-    reference = scan.on_grid(result.grid).reference
-    if scan.reference is not None and reference is None:
-        log.warning("no PSNR: the scan's reference is on another grid")
+    """Against the scan's reference, by the rule of ``metrics.aligned``, and against held-out pixels. The result's facts say
+    how they were compared where that is not voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
-    return held_out if reference is None else {**compare(result.volume, reference), **held_out}
+    if scan.reference is None:
+        return held_out
+    pair = aligned(result.volume, result.grid, scan.reference, scan.grid)
+    if pair is None or not pair.reference.max() > 0:
+        log.warning("no PSNR: nothing of the scan's reference lies in the volume's box")
+        return held_out
+    if pair.how != VOXEL_BY_VOXEL:
+        result.facts[COMPARED] = pair.how
+    return {**compare(pair.volume, pair.reference), **held_out}
 
 
 def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:

@@ -138,6 +138,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: fly(readout="lines"), "readout: found 'lines'; expected one of 'rows', 'columns'"),
         (lambda: fly(readout_ratio=-1), "readout_ratio: found -1"),
         (lambda: fly(readout_direction=0), "readout direction: found 0"),
+        (lambda: fly(readout_direction="top"), r"direction: found 'top'; expected 1 \(index 0 first\) or -1"),
         (lambda: fly(exposure_s=0.0), "exposure_s: found 0.0"),
         (lambda: fly(FRAMES.astype(np.uint16)), "frames: found whole numbers .*give flats="),
         (lambda: fly(quantity="counts"), "flats: found None beside counts"),

@@ -91,7 +91,7 @@ def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, 
     copy_with_motion(path, copy, replace(changed, provenance={"why": "a test"}))
     read = load_scan(copy)
     np.testing.assert_allclose(poses(read), poses(changed), atol=1e-5)
-    assert read.provenance == {"why": "a test"} and read.is_fly
+    assert read.provenance == {"why": "a test", "flats_applied": 1, "darks_applied": 1} and read.is_fly
     before, after = datasets(path), datasets(copy)
     differ = {name for name in after if name not in before or not np.array_equal(before[name], after[name])}
     ends = {name for name in differ if name.endswith(tuple(touched))}

@@ -3,12 +3,15 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+
+from phyradgs_cl.api import load_scan, save_scan
 
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "16", "--detector", "24", "--views", "6", "--time-samples", "4"]
 
@@ -49,6 +52,17 @@ def test_each_method_writes_a_volume_that_evaluates(cli, scan, reconstructed, ca
     told = capsys.readouterr().out
     assert "voxel size mm" in told and re.search(r"^motion +\w", told, re.M)
     assert ("iterations asked" in told) == ("--iterations" in options)
+
+
+def test_info_has_no_more_digits_than_anybody_stated(cli, scan, tmp_path, capsys):
+    loaded = load_scan(scan)
+    geometry = replace(loaded.geometry, pixel_size_mm=(3 * 0.1, 3 * 0.1))
+    save_scan(tmp_path / "s.h5", replace(loaded, geometry=geometry))
+    capsys.readouterr()
+    assert cli.run(["info", str(tmp_path / "s.h5")]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"^pixel size mm +\(0\.3, 0\.3\)$", told, re.M)
+    assert not re.search(r"\d\.\d{7}", told)
 
 
 def test_the_error_on_held_out_pixels_is_said_and_kept(scan, reconstructed, capsys):

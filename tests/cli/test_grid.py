@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import read_volume
+from phyradgs_cl.io import read_volume, write_volume
+from phyradgs_cl.metrics import compare
 from phyradgs_cl.report.run import load_run
 from phyradgs_cl.workflow import load_scan
 
@@ -19,15 +20,39 @@ def test_what_is_chosen_is_in_the_result_and_told(cli, scan, tmp_path, capsys, c
     output = tmp_path / "v.h5"
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "FDK", "--size", "10,11,12"]) == 0
     stored = read_volume(output)
-    assert stored.grid == Grid((10, 11, 12), (0.2, 2 / 11, 2 / 12)) and stored.metrics is None
+    assert stored.grid == Grid((10, 11, 12), (0.2, 2 / 11, 2 / 12))
     assert stored.provenance["input"]["size"] == [10, 11, 12] and stored.provenance["method"] == "fdk"
     with h5py.File(output) as file:
         assert file["entry/reconstruction/x"][()] == pytest.approx(stored.grid.axes_mm()[2])
-    assert [record.getMessage() for record in caplog.records] == ["no PSNR: the scan's reference is on another grid"]
+    assert not caplog.records
+    line = capsys.readouterr().out
+    assert f"PSNR {stored.metrics['psnr_db']:.2f} dB" in line and "resampled (linear) from 12×11×10 voxels" in line
     assert cli.run(["info", str(output)]) == 0
     assert "{'size': [10, 11, 12], " in capsys.readouterr().out
     run = load_run(output, scan)
-    assert run.reference is None and "another grid" in run.notes[-1]
+    assert run.reference is None and "its slices are not shown" in run.notes[-1]
+    assert run.metrics == stored.metrics and "resampled" in run.compared
+
+
+def test_a_coarser_volume_is_compared_with_means_of_the_truth(cli, scan, tmp_path, capsys) -> None:
+    output = tmp_path / "v.h5"
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "fdk", "--size", "4"]) == 0
+    stored, truth = read_volume(output), load_scan(scan).reference.reshape(4, 2, 4, 2, 4, 2).mean((1, 3, 5))
+    assert stored.metrics["psnr_db"] == pytest.approx(compare(stored.volume, truth)["psnr_db"], abs=1e-4)
+    assert f"PSNR {stored.metrics['psnr_db']:.2f} dB" in (line := capsys.readouterr().out)
+    assert "with means of the reference over 2×2×2 voxels" in line
+    run = load_run(output, scan)
+    np.testing.assert_allclose(run.reference, truth, rtol=1e-5)
+    assert run.compared == stored.provenance["compared"]
+    write_volume(output, stored.volume, stored.grid, stored.provenance)  # as written before there was a score
+    assert load_run(output, scan).metrics["psnr_db"] == pytest.approx(stored.metrics["psnr_db"])
+
+
+def test_a_box_without_the_object_is_reconstructed_without_a_score(cli, scan, tmp_path, caplog) -> None:
+    output, corner = tmp_path / "v.h5", "-1,-0.75,-1,-0.75,-1,-0.75"
+    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "fdk", "--roi-mm", corner]) == 0
+    assert "nothing of the scan's reference lies in the volume's box" in caplog.text
+    assert read_volume(output).metrics is None and "no PSNR" in load_run(output, scan).notes[-1]
 
 
 def test_a_part_of_the_grid_has_the_same_voxels_and_a_score(cli, scan, tmp_path, caplog) -> None:

@@ -1,11 +1,13 @@
 """--memory: the same results within a limit, and one line where it does not suffice."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from phyradgs_cl.io import read_volume
+from phyradgs_cl.reconstructors import room
 from phyradgs_cl.runtime import MEMORY_VARIABLE, context
 from phyradgs_cl.workflow import load_scan
 
@@ -42,6 +44,25 @@ def test_reconstruction_in_bricks(cli, scan, tmp_path, method, monkeypatch) -> N
     assert ledgers[0].peak_bytes > ledgers[1].limit_bytes >= ledgers[1].peak_bytes
     np.testing.assert_allclose(volumes[1], volumes[0], rtol=0, atol=1e-5 * volumes[0].max())
     assert cli.run(["estimate", str(scan), "--method", *method.split(), "--memory", "100KiB"]) == 0
+
+
+@pytest.mark.parametrize("method", ["fista", "asd-pocs"])
+def test_a_size_that_does_not_fit_is_refused_with_one_that_does(cli, refused, scan, tmp_path, method) -> None:
+    run = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method", method, "--iterations", "1", "--memory", "3MiB"]
+    line = refused([*run, "--size", "200"], "fits", status=6)
+    size = int(re.search(r"--size (\d+) fits", line)[1])
+    assert 12 <= size < 200
+    assert cli.run([str(word) for word in [*run, "--size", size]]) == 0
+
+
+def test_a_volume_larger_than_the_machine_is_refused_before_the_run(cli, refused, scan, tmp_path, monkeypatch) -> None:
+    """Not after it, when the volume is made; of a machine with 8 MiB."""
+    for name in ("host_bytes", "free_bytes"):
+        monkeypatch.setattr(room, name, lambda: 8 * 2.0**20)
+    run = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method", "fdk"]
+    line = refused([*run, "--size", "200"], "200×200×200 voxels", "in one volume", status=6)
+    size = int(re.search(r"--size (\d+) fits", line)[1])
+    assert 48 <= size <= 80 and cli.run([str(word) for word in [*run, "--size", size]]) == 0
 
 
 def test_too_little_and_a_wrong_size_are_named_where_they_stand(refused, scan, tmp_path, monkeypatch) -> None:

@@ -33,7 +33,7 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
     for path in (volume, *(export_volume(volume, to, tmp_path / name) for name, to in FORMATS.items())):
         assert cli.run(["evaluate", str(path), "--reference", str(scan), "--json"]) == 0
         facts = json.loads(capsys.readouterr().out)
-        assert "resampled" not in facts
+        assert facts["compared"] == "voxel by voxel"
         answers[path.name] = {key: facts[key] for key in ("psnr_db", "ssim", "method") if key in facts}
         picture = "v.evaluated.png" if path == volume else f"{path.name}.evaluated.png"  # one each, for volumes of one name
         assert facts["picture"] == str(tmp_path / picture) and (tmp_path / picture).exists()
@@ -43,38 +43,41 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
     assert json.loads(capsys.readouterr().out)["ssim"] == 1
 
 
-def test_another_grid_is_resampled_and_said_in_one_line(cli, files, tmp_path, capsys, caplog) -> None:
+def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, files, tmp_path, capsys) -> None:
+    def said(name: str) -> str:
+        assert cli.run(["evaluate", str(tmp_path / name), "--reference", str(scan)]) == 0
+        told = capsys.readouterr()
+        assert told.out.count("\n") == 1 and not told.err
+        return told.out
+
+    def facts_of(name: str) -> dict:
+        assert cli.run(["evaluate", str(tmp_path / name), "--reference", str(scan), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
     scan, _, volume, grid = files
     dz, dy, dx = grid.voxel_size_mm
     fine = Grid((24, 24, 24), (dz / 2, dy / 2, dx / 2), grid.offset_mm)
     write_volume(tmp_path / "fine.h5", np.kron(volume, np.ones((2, 2, 2))), fine, {})
-    assert cli.run(["evaluate", str(tmp_path / "fine.h5"), "--reference", str(scan), "--json"]) == 0
-    (line,) = caplog.messages
+    line, facts = said("fine.h5"), facts_of("fine.h5")
     assert "24×24×24 voxels" in line and "12×12×12 voxels" in line and "about (0, 0, 0) mm" in line
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["share_of_reference_covered"] == 1 and "24×24×24" in facts["resampled"]
-    assert cli.run(["evaluate", str(files[1]), "--reference", str(scan), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["psnr_db"] == pytest.approx(facts["psnr_db"], abs=1e-3)
+    assert facts["share_of_reference_covered"] == 1 and "24×24×24" in facts["compared"]
+    assert facts_of("v.h5")["psnr_db"] == pytest.approx(facts["psnr_db"], abs=1e-3)
 
     half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
     write_volume(tmp_path / "half.h5", volume[:6], half, {})
-    assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan)]) == 0
-    assert "compared with its part of the reference, 50 % of the voxels" in caplog.messages[-1]
-    assert cli.run(["evaluate", str(tmp_path / "half.h5"), "--reference", str(scan), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert facts["share_of_reference_covered"] == 0.5
+    facts = facts_of("half.h5")
+    assert "voxel by voxel, on 50 % of the reference" in said("half.h5") and facts["share_of_reference_covered"] == 0.5
     truth = load_scan(scan).reference
-    assert facts["psnr_db"] == pytest.approx(compare(volume[:6], truth[:6])["psnr_db"]) and "resampled" not in facts
+    assert facts["psnr_db"] == pytest.approx(compare(volume[:6], truth[:6])["psnr_db"])
     coarse = Grid((3, 6, 6), (2 * dz, 2 * dy, 2 * dx), half.offset_mm)
-    write_volume(tmp_path / "coarse.h5", volume[:6:2, ::2, ::2], coarse, {})
-    assert cli.run(["evaluate", str(tmp_path / "coarse.h5"), "--reference", str(scan)]) == 0
-    assert "compared on the 50 % of those that lie in the volume" in caplog.messages[-1]
+    write_volume(tmp_path / "coarse.h5", truth[:6].reshape(3, 2, 6, 2, 6, 2).mean((1, 3, 5)), coarse, {})
+    assert facts_of("coarse.h5")["psnr_db"] > 120  # but for rounding
+    assert "with means of the reference over 2×2×2 voxels (x y z), on 50 % of the reference" in said("coarse.h5")
     write_volume(tmp_path / "air.h5", volume[:1, :1, :1], grid.part((0, 0, 0), (1, 1, 1)), {})
     assert truth[0, 0, 0] == 0 and cli.run(["evaluate", str(tmp_path / "air.h5"), "--reference", str(scan)]) == 2
     assert "nothing in the 0.0579 % of it that lie in" in capsys.readouterr().err
     write_volume(tmp_path / "true.h5", truth, grid, {})
-    assert cli.run(["evaluate", str(tmp_path / "true.h5"), "--reference", str(scan), "--json"]) == 0
-    assert '"psnr_db": null' in capsys.readouterr().out
+    assert facts_of("true.h5")["psnr_db"] is None
 
     away = replace(grid, offset_mm=(0.0, 0.0, 1e3))
     write_volume(tmp_path / "away.h5", volume, away, {})
@@ -82,6 +85,33 @@ def test_another_grid_is_resampled_and_said_in_one_line(cli, files, tmp_path, ca
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and "no voxel of the reference" in told and "(1000, 0, 0)" in told
     assert not (tmp_path / "away.evaluated.png").exists()
+
+
+def test_a_reference_without_a_scale_is_placed_or_refused(cli, refused, files, tmp_path, capfd) -> None:
+    """As many voxels do not make it the same box."""
+    scan, volume_file, volume, grid = files
+    truth, side_mm = load_scan(scan).reference, grid.voxel_size_mm[0]
+    write_volume(tmp_path / "inner.h5", volume[3:9, 3:9, 3:9], grid.part((3, 3, 3), (6, 6, 6)), {})
+    with h5py.File(tmp_path / "bare.h5", "w") as file:
+        file["volume"] = truth
+    with h5py.File(tmp_path / "same_count.h5", "w") as file:
+        file["volume"] = truth[::2, ::2, ::2]
+
+    command = ["evaluate", tmp_path / "inner.h5", "--reference"]
+    refused([*command, tmp_path / "same_count.h5"], "same_count.h5: found voxels without a scale", "--reference-voxel-mm")
+    sides = ["--reference-voxel-mm", f"{side_mm!r}"]
+    assert cli.run([str(word) for word in [*command, tmp_path / "bare.h5", *sides, "--json"]]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert cli.run([str(word) for word in [*command, scan, "--json"]]) == 0
+    assert found["psnr_db"] == pytest.approx(json.loads(capfd.readouterr().out)["psnr_db"], abs=1e-6)
+    refused([*command, scan, *sides], "--reference-voxel-mm", "expected a reference without a scale")
+    for wrong in ("-1", "1,2", "fine"):
+        refused([*command, tmp_path / "bare.h5", "--reference-voxel-mm", wrong], "--reference-voxel-mm: found")
+
+    export_volume(volume_file, "npy", tmp_path / "plain.npy")
+    (tmp_path / "plain.json").unlink()
+    assert cli.run(["evaluate", str(tmp_path / "plain.npy"), "--reference", str(scan)]) == 0
+    assert "voxel by voxel, as plain.npy has no scale" in capfd.readouterr().out
 
 
 def test_an_export_is_scanned_like_the_volume_itself(cli, files, tmp_path, capsys) -> None:

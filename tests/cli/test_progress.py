@@ -31,6 +31,13 @@ def test_rate_and_time_left_count_from_the_first_report(capsys, now) -> None:
     assert {seconds: clock(seconds) for seconds in times} == times
 
 
+def test_time_left_follows_the_work_where_later_passes_take_longer(capsys, now) -> None:
+    ticker = Ticker("pass")
+    for now[0], done, share in ((0.0, 0, 0.0), (20.0, 80, 0.25)):
+        ticker.show(done, 100, share=share)
+    assert capsys.readouterr().err.splitlines()[-1] == "pass 80/100  4.0/s  ETA 1:00"
+
+
 def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypatch) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with Ticker("frame") as ticker:

@@ -1,8 +1,10 @@
 """phyradgs export, as the command line runs it."""
 
 import re
+import shlex
 from pathlib import Path
 
+import pydicom
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -41,6 +43,27 @@ def test_the_output_s_suffix_says_the_format(run, volume_file, tmp_path) -> None
     assert done.exit_code == 0 and "HU" in done.output and (tmp_path / "hu.nii.gz").exists()
 
 
+def test_a_series_says_whose_it_is(run, volume_file, tmp_path) -> None:
+    """As pydicom reads it; without a word of it nothing is claimed. Another patient's is another study."""
+    labels = {"patient": "Müller^Änne", "title": "Foot, fly-scan", "description": "fista", "date": "2026-03-31"}
+    words = [word for name, value in labels.items() for word in (f"--{name}", value)]
+    assert run(volume_file, "--to", "dicom", "-o", tmp_path / "plain").exit_code == 0
+    assert run(volume_file, "--to", "dicom", "-o", tmp_path / "named", *words).exit_code == 0
+    plain, named = (pydicom.dcmread(tmp_path / folder / "0001.dcm") for folder in ("plain", "named"))
+    assert named.PatientName.family_name == "Müller" and named.PatientName == named.PatientID == labels["patient"]
+    assert (named.StudyDescription, named.SeriesDescription, named.StudyDate) == ("Foot, fly-scan", "fista", "20260331")
+    assert named.ImageComments == plain.ImageComments == plain.SeriesDescription == "values in 1/mm"
+    assert not plain.StudyDate and not plain.PatientID and "StudyDescription" not in plain
+    assert named.StudyInstanceUID != plain.StudyInstanceUID and named.SOPInstanceUID != plain.SOPInstanceUID
+    for name, value in labels.items():
+        with pytest.raises(InputError, match=f"^--{name}: found with --to nii; expected --to dicom"):
+            raise run(volume_file, "--to", "nii", f"--{name}", value).exception
+    for name, value in {"patient": "x" * 65, "title": "a\\b", "description": "two\nlines", "date": "31.3.2026"}.items():
+        with pytest.raises(InputError, match=f"^--{name}: found"):
+            raise run(volume_file, "--to", "dicom", "-o", tmp_path / "wrong", f"--{name}", value).exception
+    assert not (tmp_path / "wrong").exists() and not volume_file.with_suffix(".nii").exists()
+
+
 def test_wrong_input_is_our_error(run, rt, tmp_path) -> None:
     assert isinstance(run(tmp_path / "none.h5", "--to", "nii").exception, InputError)
     assert run(tmp_path / "none.h5", "--to", "obj").exit_code == 2
@@ -59,6 +82,6 @@ def test_the_documentation_s_examples_run(run, volume_file, monkeypatch) -> None
     for block in re.findall(r"```python\n(.*?)```", text, re.S):
         exec(compile(block, str(DOCS), "exec"), {})
     for line in re.findall(r"^phyradgs export (.*)$", text, re.M):
-        assert run(*line.split()).exit_code == 0
+        assert run(*shlex.split(line)).exit_code == 0
     found = {path.name for path in volume_file.parent.iterdir()}
     assert {"volume.nii", "volume.nii.gz", "volume.ply"} <= found

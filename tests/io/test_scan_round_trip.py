@@ -350,9 +350,27 @@ def test_summary_tells_shape_timing_and_hash(path, make_scan) -> None:
     assert {name: facts[name] for name in expected} == expected
     assert facts["exposure_arc_deg"] == pytest.approx(3.0)
     assert facts["span_arc_deg"] == pytest.approx(3.0 * 1.1 / 0.8)
-    assert facts["last_angle_deg"] == pytest.approx(58.0)
+    assert facts["last_gantry_angle_deg"] == pytest.approx(58.0)
     assert facts["sha256"] == sha256_of(path) and len(sha256_of(path)) == 64
     assert file_kind(path) == "scan"
+
+
+def test_a_summary_has_no_times_of_a_scan_that_stops_and_counts_the_flats_that_were_applied(path, make_scan) -> None:
+    """Where frames start that stand still is their order alone, in units of a second."""
+    made, key, data = counts_scan(make_scan)
+    write_scan(path, made, data=data, image_key=key, quantity="counts")
+    write_scan(path, read_scan(path, counts_to_attenuation))  # as `prepare` does
+    facts = scan_summary(path)
+    assert (facts["flats"], facts["flats_applied"], facts["darks_applied"]) == (0, 2, 2) and "scan_s" in facts
+    angle_rad = np.deg2rad([10.0, 25.0, 40.0, 58.0])
+    for exposure_s in (0.0, 0.2):
+        start_s, shutter = np.arange(4.0), Shutter(exposure_s)
+        orbit = CircularOrbit(made.geometry, FrameSweeps(start_s, 0.0, angle_rad, angle_rad))
+        write_scan(path, make_scan(trajectory=orbit, shutter=shutter, frame_start_s=start_s, is_fly=False))
+        facts = scan_summary(path)
+        expected = {"exposure_s", "readout_s"} if exposure_s else set()
+        assert {name for name in facts if name.endswith("_s") or name.startswith("readout")} == expected
+        assert facts["last_gantry_angle_deg"] == pytest.approx(58.0)
 
 
 def test_arguments_that_do_not_fit_are_refused(path, make_scan) -> None:

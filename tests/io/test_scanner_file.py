@@ -98,6 +98,9 @@ WRONG = {
     "flat volume": ("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]", "[volume] size_mm", "above 0"),
     "axis": ('axis = "columns"', 'axis = "cols"', "[readout] axis", "'rows'"),
     "direction": ("direction = -1", "direction = 0", "[readout] direction", "-1"),
+    "direction in words": (
+        "direction = -1", 'direction = "top"', "[readout] direction: found 'top'", "expected 1 (index 0 first) or -1",
+    ),
     "direction true": ("direction = -1", "direction = true", "[readout] direction", "True"),
     "ratio": ("ratio = 0.5", "ratio = -0.5", "[readout] ratio", "at least 0"),
     "not TOML": ("[source]", "[source", "", "not TOML"),

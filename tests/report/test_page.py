@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from skimage import io
 
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
 from phyradgs_cl.reconstructors import input_options
@@ -190,6 +191,18 @@ def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, c
     assert not [i for i in page.ids if i.startswith("layer-")]
 
 
+def test_a_scan_that_stops_has_no_times(rt, files, small_scan, tmp_path, parse) -> None:
+    orbit = CircularOrbit(small_scan.geometry, FrameSweeps(np.arange(8.0), 0.0, *2 * [np.linspace(0, 5, 8)]))
+    stops = {"trajectory": orbit, "frame_start_s": np.arange(8.0), "is_fly": False}
+    for exposure_s in (0.0, 0.25):
+        write_scan(tmp_path / "s.h5", replace(small_scan, **stops, shutter=Shutter(exposure_s)))
+        write_report(files[1], tmp_path / "p.html", lambda: rt, scan=tmp_path / "s.h5", views=0)
+        page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
+        assert ("shutter" in page.ids) == ("exposure 0.25 s" in page.words) == (exposure_s > 0)
+        assert "exposure 0 s" not in page.words and "first frames on one axis of time" not in page.words
+        assert "first gantry angle" in page.words
+
+
 def test_a_scan_that_has_changed_is_not_taken_for_the_run_scan(files, small_scan, tmp_path, parse) -> None:
     volume, stored = tmp_path / "volume.h5", read_volume(files[1])
     facts = {**stored.provenance, "scan": str(tmp_path / "other.h5")}
@@ -284,5 +297,5 @@ def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_p
         text = (tmp_path / "page.html").read_text(encoding="utf-8")
         section = text.split('id="calibration"')[1].split("</section>")[0] if rows else ""
         assert (section.count("<tr>") - section.count("<thead>"), section.count("<svg")) == (rows, charts)
-        assert ("0.5 ± 0.1" in section) == ("a against b" in section) == bool(rows) and "<i>" not in section + text
+        assert ("0.50 ± 0.10" in section) == ("a against b" in section) == bool(rows) and "<i>" not in section + text
         assert not parse(text).open

@@ -1,11 +1,13 @@
 """Raw frames of any origin to line integrals with row 0 the lowest, with bad pixels masked."""
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Saturation
+from phyradgs_cl.acquisition.scan import applied_facts
 from phyradgs_cl.detector import find_saturation, frames_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
@@ -18,11 +20,13 @@ _SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32, the pixels not to be used, and what raw counts said of the panel's ceiling."""
+    """Line integrals (P, v, u) float32, the pixels not to be used, what raw counts said of the panel's ceiling, and how many
+    flats and darks were applied to them, as provenance."""
 
     values: np.ndarray
     mask: Mask
     saturation: Saturation | None = None
+    applied: Mapping[str, object] = field(default_factory=dict)
 
 
 def line_integrals(
@@ -59,7 +63,9 @@ def line_integrals(
         _log.warning(text, culprit, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if flat is not None and saturation is not None and saturation.share > 0:
         _mask_clipped(culprit, frames, flat, saturation, unusable)
-    return LineIntegrals(integrals, compact(unusable), saturation)
+    is_divided = quantity == "counts" and options.flat_value is None
+    counts = [len(stack) if is_divided and stack is not None else 0 for stack in (flats, darks)]
+    return LineIntegrals(integrals, compact(unusable), saturation, applied_facts(*counts))
 
 
 def _mask_clipped(

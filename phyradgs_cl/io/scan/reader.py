@@ -8,6 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
+from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5.datasets import in_unit, read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -40,7 +41,12 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
     kept = mask[used] if mask is not None and mask.ndim == 3 else mask
-    return replace(header.scan, projections=projections, pixel_mask=united(kept, bad), reference=reference)
+    provenance = header.scan.provenance
+    if header.quantity == "counts":
+        stored = (int(np.count_nonzero(header.image_key == kind)) for kind in (schema.FLAT, schema.DARK))
+        provenance = {**provenance, **applied_facts(*stored)}
+    mask = united(kept, bad)
+    return replace(header.scan, projections=projections, pixel_mask=mask, reference=reference, provenance=provenance)
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
@@ -50,6 +56,9 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
     scan, key = header.scan, header.image_key
     kinds = ("projections", "flats", "darks", "invalid")
     counts = {name: int(np.count_nonzero(key == number)) for number, name in enumerate(kinds)}
+    if header.quantity == "attenuation":  # flats and darks that went into the line integrals are no longer in the file
+        known = {name: scan.provenance.get(name) for name in APPLIED}
+        counts |= {name: count for name, count in known.items() if isinstance(count, int)}
     return {
         "title": scan.title,
         **counts,
@@ -70,19 +79,19 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
 
 
 def _timing_facts(scan: Scan) -> dict[str, object]:
-    """Exposure, readout, and the arcs of the first frame where the gantry has an angle."""
+    """Exposure, readout, and the arcs of the first frame where the gantry has an angle. Times of a scan that stops are no
+    facts unless its exposure is stated: where its frames start is only their order."""
     shutter = scan.shutter
-    facts: dict[str, object] = {
-        "exposure_s": shutter.exposure_s,
-        "readout_s": shutter.readout_s,
-        "readout_axis": shutter.axis,
-        "readout_direction": shutter.direction,
-        "scan_s": float(np.ptp(scan.frame_start_s)) + shutter.span_s,
-    }
+    facts: dict[str, object] = {}
+    if scan.is_fly or shutter.exposure_s > 0:
+        facts |= {"exposure_s": shutter.exposure_s, "readout_s": shutter.readout_s}
+    if scan.is_fly:
+        facts |= {"readout_axis": shutter.axis, "readout_direction": shutter.direction}
+        facts["scan_s"] = float(np.ptp(scan.frame_start_s)) + shutter.span_s
     if isinstance(scan.trajectory, CircularOrbit):
         orbit, last = scan.trajectory, scan.frames - 1
         ends = [float(orbit.angle_rad(f, scan.frame_start_s[f : f + 1])[0]) for f in (0, last)]
-        facts["first_angle_deg"], facts["last_angle_deg"] = np.rad2deg(ends).tolist()
+        facts["first_gantry_angle_deg"], facts["last_gantry_angle_deg"] = np.rad2deg(ends).tolist()
     if scan.is_fly and isinstance(scan.trajectory, CircularOrbit):
         marks_s = scan.frame_start_s[0] + np.array([0.0, shutter.exposure_s, shutter.span_s])
         first, closed, done = np.rad2deg(scan.trajectory.angle_rad(0, marks_s)).tolist()

@@ -93,13 +93,23 @@ def check_orbit(pose: np.ndarray) -> None:
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
     off = max(float(np.linalg.norm(at - of, axis=-1).max()) for at, of in ((source, usual[0]), (corner, usual[1])))
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
-    found = f"source and panel up to {100 * off / length_mm:.0f} % of their distance off a circle about z"
-    found += f", {above_deg:.0f}° above its middle"
-    if off > _NO_CIRCLE * length_mm or above_deg > _NO_PLANE_DEG:
-        expected = f"at most {100 * _NO_CIRCLE:.0f} % and {_NO_PLANE_DEG:.0f}°"
-        raise InputError("--method fdk", found, expected, "take an iterative or splatting method: they take any orbit")
-    if off > _CIRCLE * length_mm or above_deg > _PLANE_DEG:
-        log.warning("FDK: %s: the volume is an approximation; iterative and splatting methods take any orbit", found)
+    parts = (
+        f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
+        f"{above_deg:.0f}° above the middle of their circle",
+    )
+
+    def beyond(most: float, most_deg: float) -> str:
+        """Those of the two that are too far."""
+        wrong = (off > most * length_mm, above_deg > most_deg)
+        return " and ".join(part for part, is_wrong in zip(parts, wrong, strict=True) if is_wrong)
+
+    if found := beyond(_NO_CIRCLE, _NO_PLANE_DEG):
+        expected = f"at most {100 * _NO_CIRCLE:.0f} % off it and {_NO_PLANE_DEG:.0f}° above"
+        remedy = "take an iterative or splatting method: they take any orbit"
+        raise InputError("--method fdk", f"source and panel up to {found}", expected, remedy)
+    if found := beyond(_CIRCLE, _PLANE_DEG):
+        text = "FDK: source and panel up to %s: the volume is an approximation; %s"
+        log.warning(text, found, "iterative and splatting methods take any orbit")
 
 
 def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid) -> None:

@@ -1,0 +1,75 @@
+"""The rule by which a volume and its truth are put on one grid before they are compared."""
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics import aligned, compare, psnr, reference_on, resampled
+
+
+def _truth(shape: tuple[int, int, int]) -> np.ndarray:
+    return np.random.default_rng(0).random(shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("factors", [(2, 2, 2), (3, 1, 2)])
+def test_a_finer_truth_is_averaged_over_the_volumes_voxels(factors) -> None:
+    """The mean of what a voxel holds has no error; a gain in noise shows in full, as no interpolation can."""
+    grid = Grid((4, 6, 5), (0.6, 0.4, 0.5), (1.0, -2.0, 0.5))
+    counts = tuple(n * f for n, f in zip(grid.shape, factors, strict=True))
+    fine = Grid(counts, tuple(d / f for d, f in zip(grid.voxel_size_mm, factors, strict=True)), grid.offset_mm)
+    truth = _truth(fine.shape)
+    means = truth.reshape(4, factors[0], 6, factors[1], 5, factors[2]).mean((1, 3, 5))
+    noise = np.random.default_rng(1).normal(0, 0.05, means.shape).astype(np.float32)
+    scores = []
+    for part in (noise, noise / np.float32(np.sqrt(2))):  # 3.01 dB apart
+        pair = aligned(means + part, grid, truth, fine)
+        assert pair is not None and pair.grid == grid and pair.share == 1
+        assert "means of the reference over " + "×".join(map(str, factors[::-1])) in pair.how
+        scores.append(compare(pair.volume, pair.reference)["psnr_db"])
+    assert scores[1] - scores[0] == pytest.approx(10 * np.log10(2), abs=1e-3)
+    np.testing.assert_allclose(reference_on(grid, truth, fine), means, rtol=1e-6)
+
+
+def test_a_part_of_a_finer_truth_is_averaged_too() -> None:
+    fine = Grid((8, 8, 8), (0.5,) * 3)
+    truth, part = _truth(fine.shape), Grid((2, 3, 4), (1.0,) * 3, (-1.0, 0.5, 0.0))
+    pair = aligned(np.zeros(part.shape, np.float32), part, truth, fine)
+    assert pair is not None and pair.share == 24 / 64 and "37.5 % of the reference" in pair.how
+    np.testing.assert_allclose(pair.reference, truth[:4, 2:8].reshape(2, 2, 3, 2, 4, 2).mean((1, 3, 5)), rtol=1e-6)
+
+
+def test_the_same_voxels_are_compared_one_by_one() -> None:
+    grid = Grid((6, 5, 4), (0.5, 0.4, 0.3), (1.0, 0.0, 2.0))
+    truth = _truth(grid.shape)
+    rounded = Grid(grid.shape, tuple(float(np.float32(d)) for d in grid.voxel_size_mm), grid.offset_mm)
+    pair = aligned(truth, rounded, truth, grid)
+    assert pair is not None and pair.how == "voxel by voxel" and pair.reference is truth
+    part = grid.part((1, 0, 2), (3, 5, 2))
+    pair = aligned(truth[1:4, :, 2:], part, truth, grid)
+    assert pair is not None and pair.how == "voxel by voxel, on 25 % of the reference"
+    assert psnr(pair.volume, pair.reference) == np.inf
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        Grid((12, 12, 12), (0.5,) * 3),  # finer than the truth
+        Grid((4, 4, 4), (1.5,) * 3),  # one and a half times coarser
+        Grid((3, 3, 3), (2.0,) * 3, (0.25, 0.0, 0.0)),  # twice coarser, but the faces do not meet
+        Grid((4, 4, 4), (2.0,) * 3),  # twice coarser, but beyond the truth
+    ],
+)
+def test_any_other_volume_is_resampled_onto_the_truth(grid) -> None:
+    truth_grid = Grid((6, 6, 6), (1.0,) * 3)
+    truth, volume = _truth(truth_grid.shape), _truth(grid.shape)
+    pair = aligned(volume, grid, truth, truth_grid)
+    assert pair is not None and "resampled (linear) from" in pair.how
+    np.testing.assert_array_equal(pair.volume, resampled(volume, grid, pair.grid)[0])
+    np.testing.assert_array_equal(pair.reference, truth[pair.grid.slices_in(truth_grid)])
+    assert reference_on(grid, truth, truth_grid) is None
+
+
+def test_volumes_in_two_places_are_no_pair() -> None:
+    grid = Grid.cube(4, 4.0)
+    away = Grid(grid.shape, grid.voxel_size_mm, (0.0, 9.0, 0.0))
+    assert aligned(_truth(grid.shape), grid, _truth(grid.shape), away) is None
