@@ -6,9 +6,9 @@
 Scans are those of benchmarks/scans.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. Some
 faults need scans of their own: `short exposure` one that exposes half of the time between frames, so that twice the
 exposure fits the timing and only the frames can tell; `narrow cone` one with the source 100 times as far, where a wrong
-sign of rotation leaves no trace and `cannot tell` is the right answer; `..., offset` one with a panel 8 % of its width
-beside the axis, correctly stated; `half turn` one of 180° and the fan. `all` scans with wrong sizes, distances or images
-have the grid that an import would give them.
+sign of rotation leaves no trace and `cannot tell` is the right answer; `... aside` one with a panel 8 % of its width
+beside the axis, correctly stated; `half turn` one of 180° and the fan. Scans with wrong sizes, distances or images have the
+grid that an import would give them.
 """
 
 import argparse
@@ -157,7 +157,7 @@ FAULTS: dict[str, Fault] = {
     "narrow cone": Fault(rotation, (SIGN,), (CANNOT_TELL,), away=100.0),
     "half turn none": Fault(lambda scan, rng: of_half_turn(scan), protocol=DENSE),
     "half turn offset": Fault(half_turn_offset, (CENTRE,), protocol=DENSE),
-    "none, offset": Fault(aside=ASIDE),
+    "none aside": Fault(aside=ASIDE),
 }
 WHOLE = {
     "pixels x 0.1": Fault(pixels(0.1), (SAME,), says="pixel sizes 10 times"),
@@ -171,7 +171,7 @@ WHOLE = {
     "mirrored in v": Fault(images(lambda p: p[:, ::-1]), (SAME, READOUT), EITHER, "mirrored in v"),
 }
 for name, fault in WHOLE.items():
-    FAULTS |= {name: fault, f"{name}, offset": replace(fault, aside=ASIDE)}
+    FAULTS |= {name: fault, f"{name} aside": replace(fault, aside=ASIDE)}
 
 
 def run_all(arguments: argparse.Namespace) -> None:
