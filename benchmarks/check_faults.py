@@ -131,8 +131,8 @@ EITHER = (SUSPICIOUS, CANNOT_TELL)  # a narrow cone does not show it
 
 @dataclass(frozen=True)
 class Fault:
-    """What is planted in which scan; ``right``: verdicts of which one of ``questions`` should have one; ``says``: words of the
-    first suspicious answer, if there is one; aside: a true offset of the panel, in shares of its width."""
+    """What is planted in which scan. One of ``questions`` should have one of the ``right`` verdicts, and the first
+    suspicious answer should say ``says``. aside: a true offset of the panel, in shares of its width."""
 
     plant: Plant = as_it_is
     questions: tuple[str, ...] = ()

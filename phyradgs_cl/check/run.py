@@ -10,7 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.coarse import FINE, QUICK, coarse, some_frames
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
-from phyradgs_cl.check.questions.angles import check_angles, is_full_turn
+from phyradgs_cl.check.questions.angles import check_angles
 from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
 from phyradgs_cl.check.questions.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
@@ -142,7 +142,7 @@ def _turning(
     offset = other if is_reversed else stated
     if was_clear:
         offset = best_offset(rt, turned if is_reversed else quick, offset)
-    offset = with_coarseness(offset, block, is_full_turn(as_stated))
+    offset = with_coarseness(offset, block, as_stated)
     pitch_mm = quick.geometry.pixel_size_mm[1] / block
     stated_px = as_stated.geometry.detector_offset_mm[1] / pitch_mm
     centre = check_offset(offset, block, pitch_mm, stated_px)

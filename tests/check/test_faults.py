@@ -10,6 +10,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
 from phyradgs_cl.check.questions.exposure import check_exposure
+from phyradgs_cl.check.questions.offset import OTHER_CAUSE, Offset, check_offset
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan, write_scan
@@ -130,6 +131,17 @@ def test_frames_that_are_transposed_or_mirrored(rt, aside) -> None:
     assert set(suspected(found)) <= {"sign of readout"}
 
 
+def test_a_beam_without_a_fan_leaves_sizes_and_offset_open() -> None:
+    """Stated 20 pixels beside the middle, found at 2, the panel may have larger pixels; at -20 it may be a mirror image."""
+
+    def found(pixels):
+        return check_offset(Offset(pixels, 0.05, np.empty(0)), 2, 0.1, 20.0)
+
+    assert found(-18.0).unit == OTHER_CAUSE and "pixel sizes were 10 times as large" in found(-18.0).text
+    assert "--fix-offset" not in found(-18.0).advice and "--fix-offset" in found(-15.0).advice
+    assert "mirrored in u" in found(-40.0).text and "mirrored" not in found(-15.0).text
+
+
 @pytest.mark.parametrize("pixels", [-0.5, 0.5])
 def test_the_deviation_of_an_offset_covers_its_error_in_half_a_turn(rt, scan_of, pixels) -> None:
     """Most rays are then measured once, and coarse volumes pull the offset to one side."""
@@ -221,9 +233,12 @@ def test_an_object_that_looks_the_same_from_every_angle_raises_no_alarm(rt, clea
     assert found.suspicious == [] and verdicts(found)["sign of rotation"] == CANNOT_TELL
 
 
-def test_an_offset_is_not_corrected_where_the_frames_do_not_fit(cli, clean, tmp_path, capsys) -> None:
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_an_offset_is_not_corrected_where_the_frames_do_not_fit(cli, clean, tmp_path, capsys, is_turned) -> None:
+    """Nor where the gantry turns the other way: of mirrored frames the offset would have the wrong sign."""
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
-    write_scan(path, replace(clean, projections=clean.projections[np.random.default_rng(3).permutation(15)]))
+    mixed = replace(clean, projections=clean.projections[np.random.default_rng(3).permutation(15)])
+    write_scan(path, negative(stated(clean, detector_offset_mm=(0.0, 0.25))) if is_turned else mixed)
     assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == 2
     streams = capsys.readouterr()
     assert "frames that do not fit together" in streams.err and not fixed.exists()

@@ -1,6 +1,6 @@
 """Do the frames fit together under what the file says of their order, angles and geometry?"""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -11,12 +11,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.coarse import some_frames
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.frames import alike, odd_ones
-from phyradgs_cl.check.hypotheses import REDUNDANT, Cause, stated_redundancy, whole_scans
+from phyradgs_cl.check.hypotheses import (
+    REDUNDANT,
+    Cause,
+    causes_of_frames,
+    frame_number,
+    stated_redundancy,
+    whole_scans,
+)
 from phyradgs_cl.check.questions.offset import best_offset, block_of, rough_offset
-from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped
 from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
 from phyradgs_cl.check.statistics import t_statistic
-from phyradgs_cl.check.variants import Path, path_of, reversed_rotation, shifted, stretched, turned, with_path
+from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.runtime import Runtime
 
 _LARGEST = 0.35  # residual over that of the frames in a random order: right scans of every kind leave 0.02 to 0.23
@@ -79,7 +85,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         text = "detector_offset puts the axis of rotation beside the panel, where frames fit under any geometry"
         advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log"
         return Consistency(_finding(SUSPICIOUS, share, "; ".join([*notes, text]), advice), kept, False, True)
-    causes = chain(whole, _causes(unshifted, part, looks_closely=share > _NEEDS_LOOK))
+    causes = chain(whole, causes_of_frames(unshifted, part, looks_closely=share > _NEEDS_LOOK))
     cause = _cause(rt, causes, stated, most)
     if cause is not None:
         finding = _finding(SUSPICIOUS, share, "; ".join([*notes, cause.text]), cause.advice)
@@ -105,15 +111,9 @@ def _about(notes: list[str]) -> str:
 def _without_odd(scan: Scan) -> tuple[np.ndarray, list[str]]:
     """(frames that do not stand out by themselves, what was said of the others)."""
     odd, twice = odd_ones(scan.projections, scan.pixel_mask), alike(scan)
-    notes = [f"frame {_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
-    notes += [f"frame {_number(scan, f)} is frame {_number(scan, f - 1)} recorded twice" for f in twice]
+    notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
+    notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in twice]
     return np.setdiff1d(np.arange(scan.frames), [*odd, *twice]), notes
-
-
-def _number(scan: Scan, frame: int) -> int:
-    """A frame's number in the file, from 0."""
-    path = scan.trajectory
-    return int(path.frames[frame]) if isinstance(path, Path) and path.frames is not None else int(frame)
 
 
 def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
@@ -159,10 +159,10 @@ def _random(rt: Runtime, scan: Scan) -> float:
 
 
 def _fitting(rt: Runtime, causes: Iterable[Cause]) -> Cause | None:
-    """The first under which frames fit together by themselves, whatever they leave as stated."""
+    """The first other size under which frames fit together by themselves, whatever they leave as stated."""
     for cause in causes:
         scan = cause.scan()
-        if fitted(rt, scan).sum() < _LARGEST**2 * _random(rt, scan):
+        if cause.factor != 1 and fitted(rt, scan).sum() < _LARGEST**2 * _random(rt, scan):
             return cause
     return None
 
@@ -184,7 +184,7 @@ def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray,
     if not out or len(out) >= _MOST_OUTLIERS * scan.frames:
         return everything, scan, stated, []
     part = some_frames(scan, left)
-    names = [_number(scan, f) for f in out]
+    names = [frame_number(scan, f) for f in out]
     note = f"frame{'s' if len(out) > 1 else ''} {', '.join(map(str, sorted(names)))} (from 0) do not fit the others"
     order = np.arange(scan.frames)
     order[out] = order[out[::-1]]
@@ -202,89 +202,3 @@ def _cause(rt: Runtime, causes: Iterable[Cause], stated: Fit, most: float) -> Ca
         if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
             best, least = cause, float(squares.sum())
     return best
-
-
-def _causes(scan: Scan, shifted_scan: Scan, looks_closely: bool) -> Iterator[Cause]:
-    yield from _arcs(scan)
-    yield from _sizes(shifted_scan)
-    if looks_closely:
-        yield from _orders(scan)
-        yield from _missing(scan)
-
-
-def _orders(scan: Scan) -> Iterator[Cause]:
-    path = path_of(scan)
-    numbers = np.arange(scan.frames) if path.frames is None else path.frames
-    count = int(numbers[-1]) + 1
-    starts = np.interp(np.arange(count), numbers, scan.frame_start_s)
-    for first in (0, 1):
-        lexical = np.array(sorted(range(first, count + first), key=str)) - first
-        if (lexical == np.arange(count)).all():
-            continue
-        true = lexical[numbers]
-
-        def ordered(true: np.ndarray = true) -> Scan:
-            return replace(with_path(scan, frames=true), frame_start_s=starts[true])
-
-        text = "frames fit in another order: that of names without leading zeros (1, 10, 11, ... 2)"
-        yield Cause(text, "sort the frames by number, not by name, and import them again", ordered)
-
-
-def _azimuths(scan: Scan) -> np.ndarray:
-    """Angle of each frame's start from the first one's (F,), as the trajectory counts it where it does."""
-    base = path_of(scan).base
-    if hasattr(base, "angle_rad"):
-        path = path_of(scan)
-        numbers = np.arange(scan.frames) if path.frames is None else path.frames
-        at = [float(base.angle_rad(int(n), np.array([scan.frame_start_s[f]]))[0]) for f, n in enumerate(numbers)]
-        return np.array(at) - at[0]
-    angles = start_azimuths_rad(scan)
-    return np.unwrap(angles) - angles[:1]
-
-
-def _arcs(scan: Scan) -> Iterator[Cause]:
-    from_first = _azimuths(scan)
-    path = path_of(scan)
-    sense = -1.0 if path.is_reversed else 1.0
-    total_deg = float(np.rad2deg(abs(from_first[-1])))
-    radian = float(np.degrees(1.0))
-    named = {
-        radian: "angles in radians were taken for degrees",
-        1 / radian: "angles in degrees were taken for radians",
-        0.5: "the step of the angles is half of what is stated",
-        2.0: "the step of the angles is twice what is stated",
-    }
-    for percent in (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5):
-        than_stated = f"{abs(percent)} % {'smaller' if percent < 0 else 'larger'} than stated"
-        named[1 + percent / 100] = f"the step of the angles is about {than_stated}"
-    for factor, text in named.items():
-        span = f"the frames span {factor * total_deg:.4g}°, not {total_deg:.4g}°"
-        advice = f"{span}: correct rotation_angle, its unit or its step"
-        turn = sense * (factor - 1) * from_first
-        yield Cause(text, advice, partial(turned, scan, turn, factor))
-
-
-def _sizes(scan: Scan) -> Iterator[Cause]:
-    v, u = scan.geometry.pixel_size_mm
-    if abs(v / u - 1) > 0.02:
-        text, advice = "pixel sizes fit if v and u are exchanged", "exchange x_pixel_size and y_pixel_size"
-        yield Cause(text, advice, partial(stretched, scan, u / v, v / u))
-    for factor in (0.5, 0.8, 0.9, 1.1, 1.25, 2.0):
-        text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
-        advice = "correct pixel sizes (binning? unit?) or distances (unit? source to panel?)"
-        yield Cause(text, advice, partial(stretched, scan, factor, factor))
-
-
-def _missing(scan: Scan) -> Iterator[Cause]:
-    """Frames that are missing, or there twice, with later ones moved up or back by a step."""
-    steps = wrapped(np.diff(_azimuths(scan)))
-    step = float(np.median(steps)) * (-1.0 if path_of(scan).is_reversed else 1.0)
-    for at in np.unique(np.linspace(1, scan.frames - 1, 15).round().astype(int)):
-        later = (np.arange(scan.frames) >= at) * step
-        number = _number(scan, int(at))
-        text = f"a frame is missing near frame {number} (from 0): later ones fit one step further on"
-        advice = "find the missing frame, or shift the angles behind it by a step"
-        yield Cause(text, advice, partial(turned, scan, later))
-        text = f"a frame is there twice near frame {number} (from 0): later ones fit one step before"
-        advice = "take the frame out, so that later ones get their own angles"
-        yield Cause(text, advice, partial(turned, scan, -later))

@@ -7,7 +7,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.hypotheses import FACTORS
+from phyradgs_cl.check.hypotheses import FACTORS, stated_redundancy
+from phyradgs_cl.check.questions.angles import is_full_turn
 from phyradgs_cl.check.residual import fitted
 from phyradgs_cl.check.statistics import vertex
 from phyradgs_cl.check.variants import Path, path_of, shifted
@@ -21,6 +22,7 @@ _TOLERATED = 0.2  # coarse pixels
 _LEAST_TOLERATED = 0.5  # pixels
 _DEVIATIONS = 4.0
 _COARSE, _COARSE_SHORT = 0.003, 0.04  # coarse pixels: errors of volumes' scans, of full turns and of half ones
+_LEAST_TWICE = 0.1  # of the panel: a displaced panel that sees the axis at its edge
 CENTRE = "centre of rotation"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit: sizes are as likely wrong
 
@@ -64,10 +66,12 @@ def best_offset(rt: Runtime, scan: Scan, rough: Offset) -> Offset:
     return Offset(block * found, block * spread, at(centre))
 
 
-def with_coarseness(offset: Offset, block: int, is_full: bool) -> Offset:
-    """The offset with what coarse pixels of ``block`` add to its deviation, which draws of frames do not show; far more in a
-    short scan, most rays of which are measured once: a shift that leaves fewer of them twice fits better by itself."""
-    return replace(offset, spread=math.hypot(offset.spread, block * (_COARSE if is_full else _COARSE_SHORT)))
+def with_coarseness(offset: Offset, block: int, scan: Scan) -> Offset:
+    """The offset with what coarse pixels of ``block`` add to its deviation, which draws of frames do not show. It is far more
+    where ``scan`` measures few rays twice: a shift that leaves fewer of them then fits better by itself."""
+    twice = min(2 * stated_redundancy(scan), 1.0)
+    share = _COARSE if is_full_turn(scan) and twice == 1 else _COARSE_SHORT / max(twice, _LEAST_TWICE)
+    return replace(offset, spread=math.hypot(offset.spread, block * share))
 
 
 def block_of(scan: Scan) -> int:

@@ -33,8 +33,8 @@ def check_rotation(stated: Offset, other: Offset) -> Finding:
 
 
 def blamed(finding: Finding, moved_px: float, stated_px: float, tolerance_px: float) -> Finding:
-    """The suspicious ``finding`` with what to do: mirrored frames where the panel, turned round, fits nearer to the opposite of
-    the stated offset than to it; neither where those are closer together than the tolerance."""
+    """The suspicious ``finding`` with its cause: frames are mirrored where the panel, turned round, fits nearer to the
+    opposite of the stated offset than to it. An offset below the tolerance does not tell."""
     if abs(stated_px) < tolerance_px:
         text = f"{finding.text}; frames mirrored in u would look the same"
         advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
