@@ -184,10 +184,10 @@ def _sizes(scan: Scan) -> Iterator[Cause]:
     for factor in (0.5, 0.8, 0.9, 1.1, 1.25, 2.0):
         text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
         advice = "correct pixel sizes (binning? unit?) or distances (unit? source to panel?)"
-        yield Cause(text, advice, partial(_nearly, scan, factor))
+        yield Cause(text, advice, partial(nearly_sized, scan, factor))
 
 
-def _nearly(scan: Scan, factor: float) -> Scan:
+def nearly_sized(scan: Scan, factor: float) -> Scan:
     """Pixels ``factor`` times as large with the axis at its column, and a grid that grows as it does for ``stretched``."""
     return replace(resized(scan, factor, keeps_axis=True), grid=stretched(scan, factor, factor).grid)
 

@@ -63,7 +63,7 @@ def check_coverage(scan: Scan) -> Finding:
     wide_mm, grid_mm = _width_mm(scan, p, valid, threshold), max(scan.grid.size_mm[1:])
     text += f"; it is about {wide_mm:.3g} mm wide at the axis, the grid {grid_mm:.3g} mm"
     seen_mm = 2 * field_of_view_mm(scan.geometry)[1]
-    if grid_mm > _ANOTHER_SIZE * seen_mm or wide_mm > _ANOTHER_SIZE * grid_mm:
+    if grid_mm > _ANOTHER_SIZE * max(seen_mm, *scan.grid.voxel_size_mm) or wide_mm > _ANOTHER_SIZE * grid_mm:
         advice = "compare pixel sizes, distances and the grid, and their units, with the scanner's log"
         return Finding(_QUESTION, SUSPICIOUS, wide_mm, grid_mm, "mm", f"{text}, and the panel sees {seen_mm:.3g} mm", advice)
     if level <= threshold:

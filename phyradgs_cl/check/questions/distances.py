@@ -2,10 +2,10 @@
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, Finding
+from phyradgs_cl.check.hypotheses import nearly_sized
 from phyradgs_cl.check.questions.offset import free_offset
 from phyradgs_cl.check.residual import fitted
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
-from phyradgs_cl.check.variants import resized
 from phyradgs_cl.runtime import Runtime
 
 _OTHERS = (0.8, 1.25)
@@ -21,7 +21,7 @@ def check_distances(rt: Runtime, scan: Scan) -> Finding:
     question: under those the frames are not consistent.
     """
     stated = fitted(rt, scan)
-    others = {factor: fitted(rt, free_offset(rt, resized(scan, factor, keeps_axis=True))) for factor in _OTHERS}
+    others = {factor: fitted(rt, free_offset(rt, nearly_sized(scan, factor))) for factor in _OTHERS}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}
     best = min(ratios, key=lambda factor: ratios[factor])
     text = f"pixels over the panel's distance {best:g} times as large leave {ratios[best]:.3g} times the squared residual"

@@ -67,8 +67,8 @@ def best_offset(rt: Runtime, scan: Scan, rough: Offset) -> Offset:
 
 
 def with_coarseness(offset: Offset, block: int, scan: Scan) -> Offset:
-    """The offset with what coarse pixels of ``block`` add to its deviation, which draws of frames do not show. It is far more
-    where ``scan`` measures few rays twice: a shift that leaves fewer of them then fits better by itself."""
+    """The offset with what coarse pixels of ``block`` add to its deviation, which draws of frames do not show. It is far
+    more where ``scan`` measures few rays twice: a shift that leaves fewer of them then fits better by itself."""
     twice = min(2 * stated_redundancy(scan), 1.0)
     share = _COARSE if is_full_turn(scan) and twice == 1 else _COARSE_SHORT / max(twice, _LEAST_TWICE)
     return replace(offset, spread=math.hypot(offset.spread, block * share))
