@@ -3,17 +3,19 @@
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl [--names a,b] [--size 64] [--seeds 7] [--faults none,rotation]
     python benchmarks/check_faults.py --table RESULTS.jsonl
 
-Scans are those of benchmarks/scans.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. The
-last faults are planted in scans of their own: `short exposure` in one that exposes half of the time between frames, so
-that twice the exposure fits the timing and only the frames can tell, and `narrow cone` with the source 100 times as far,
-where a wrong sign of rotation leaves no trace and `cannot tell` is the right answer.
+Scans are those of benchmarks/scans.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. Some
+faults need scans of their own: `short exposure` one that exposes half of the time between frames, so that twice the
+exposure fits the timing and only the frames can tell; `narrow cone` one with the source 100 times as far, where a wrong
+sign of rotation leaves no trace and `cannot tell` is the right answer; `... aside` one with a panel 8 % of its width
+beside the axis, correctly stated; `half turn` one of 180° and the fan. Scans with wrong sizes, distances or images have the
+grid that an import would give them.
 """
 
 import argparse
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +23,15 @@ from scans import RAPID, append, chosen, files_of, lines_of, make_scan, read_lin
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Protocol, Scan, make_protocol
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, check
 from phyradgs_cl.runtime import Runtime
 
 DEAD_SHARE, DRIFT, OFFSET_PX = 0.01, 0.05, 3.0
+ASIDE = 0.08
 SHORT = make_protocol("rapid", exposure_deg=7.2, readout_ratio=1.72)
+DENSE = make_protocol("rapid", views=50, exposure_deg=7.2)
+Plant = Callable[[Scan, np.random.Generator], Scan]
 
 
 def as_it_is(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -78,21 +84,94 @@ def exposure(scan: Scan, rng: np.random.Generator) -> Scan:
     return replace(scan, shutter=shutter, trajectory=CircularOrbit(scan.geometry, longer))
 
 
-Plant = Callable[[Scan, np.random.Generator], Scan]
-# name: (what is planted, protocol, how many times the source is away, questions that should find it, right verdict)
-FAULTS: dict[str, tuple[Plant, Protocol, float, tuple[str, ...], str]] = {
-    "none": (as_it_is, RAPID, 1.0, (), ""),
-    "rotation": (rotation, RAPID, 1.0, ("sign of rotation",), SUSPICIOUS),
-    "readout": (readout, RAPID, 1.0, ("sign of readout",), SUSPICIOUS),
-    "offset": (offset, RAPID, 1.0, ("centre of rotation",), SUSPICIOUS),
-    "drift": (drift, RAPID, 1.0, ("gain drift",), SUSPICIOUS),
-    "dead": (dead, RAPID, 1.0, ("dead pixels",), SUSPICIOUS),
-    "exposure": (exposure, RAPID, 1.0, ("timing", "exposure"), SUSPICIOUS),
-    "short none": (as_it_is, SHORT, 1.0, (), ""),
-    "short exposure": (exposure, SHORT, 1.0, ("exposure",), SUSPICIOUS),
-    "narrow none": (as_it_is, RAPID, 100.0, (), ""),
-    "narrow cone": (rotation, RAPID, 100.0, ("sign of rotation",), CANNOT_TELL),
+def stated(scan: Scan, **changes: object) -> Scan:
+    """The same frames with another geometry stated, and the grid that an import makes of it."""
+    geometry = replace(scan.geometry, **changes)
+    orbit = CircularOrbit(geometry, scan.trajectory.kinematics)
+    return replace(scan, geometry=geometry, trajectory=orbit, grid=default_grid(geometry), reference=None)
+
+
+def pixels(factor: float) -> Plant:
+    """Pixel sizes stated ``factor`` times as large as they are; the stated offset in mm is right."""
+    return lambda scan, rng: stated(scan, pixel_size_mm=tuple(factor * p for p in scan.geometry.pixel_size_mm))
+
+
+def distances(factor: float) -> Plant:
+    """Both distances stated ``factor`` times as large as they are."""
+    names = ("source_to_axis_mm", "source_to_detector_mm")
+    return lambda scan, rng: stated(scan, **{name: factor * getattr(scan.geometry, name) for name in names})
+
+
+def images(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    """Every frame changed alike."""
+    return lambda scan, rng: stated(replace(scan, projections=np.ascontiguousarray(change(scan.projections))))
+
+
+def of_half_turn(scan: Scan) -> Scan:
+    """The frames of 180° and the fan."""
+    geometry = scan.geometry
+    fan_rad = 2 * np.arctan2(geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm)
+    sweeps: FrameSweeps = scan.trajectory.kinematics
+    last = int(np.searchsorted(sweeps.angle_start_rad - sweeps.angle_start_rad[0], np.pi + fan_rad)) + 1
+    part = {name: getattr(sweeps, name)[:last] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
+    orbit = CircularOrbit(geometry, replace(sweeps, **part))
+    return replace(
+        scan, projections=scan.projections[:last], trajectory=orbit, frame_start_s=scan.frame_start_s[:last]
+    )
+
+
+def half_turn_offset(scan: Scan, rng: np.random.Generator) -> Scan:
+    return offset(of_half_turn(scan), rng)
+
+
+CENTRE, SIGN, READOUT, SAME = "centre of rotation", "sign of rotation", "sign of readout", "consistency"
+
+EITHER = (SUSPICIOUS, CANNOT_TELL)  # a narrow cone does not show it
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is planted in which scan. One of ``questions`` should have one of the ``right`` verdicts, and the first
+    suspicious answer should say ``says``. aside: a true offset of the panel, in shares of its width."""
+
+    plant: Plant = as_it_is
+    questions: tuple[str, ...] = ()
+    right: tuple[str, ...] = (SUSPICIOUS,)
+    says: str = ""
+    protocol: Protocol = RAPID
+    away: float = 1.0
+    aside: float = 0.0
+
+
+FAULTS: dict[str, Fault] = {
+    "none": Fault(),
+    "rotation": Fault(rotation, (SIGN,)),
+    "readout": Fault(readout, (READOUT,)),
+    "offset": Fault(offset, (CENTRE,)),
+    "drift": Fault(drift, ("gain drift",)),
+    "dead": Fault(dead, ("dead pixels",)),
+    "exposure": Fault(exposure, ("timing", "exposure")),
+    "short none": Fault(protocol=SHORT),
+    "short exposure": Fault(exposure, ("exposure",), protocol=SHORT),
+    "narrow none": Fault(away=100.0),
+    "narrow cone": Fault(rotation, (SIGN,), (CANNOT_TELL,), away=100.0),
+    "half turn none": Fault(lambda scan, rng: of_half_turn(scan), protocol=DENSE),
+    "half turn offset": Fault(half_turn_offset, (CENTRE,), protocol=DENSE),
+    "none aside": Fault(aside=ASIDE),
 }
+WHOLE = {
+    "pixels x 0.1": Fault(pixels(0.1), (SAME,), says="pixel sizes 10 times"),
+    "pixels x 0.001": Fault(pixels(0.001), (SAME,), says="pixel sizes 1000 times"),
+    "pixels x 1000": Fault(pixels(1000.0), (SAME,), says="pixel sizes 0.001 times"),
+    "distances x 0.1": Fault(distances(0.1), (SAME,), says="distances 10 times"),
+    "distances x 0.001": Fault(distances(0.001), (SAME,), says="distances 1000 times"),
+    "distances x 10": Fault(distances(10.0), (SAME,), says="distances 0.1 times"),
+    "transposed": Fault(images(lambda p: p.swapaxes(1, 2)), (SAME,), says="transposed"),
+    "mirrored in u": Fault(images(lambda p: p[:, :, ::-1]), (SAME, SIGN), says="mirrored in u"),
+    "mirrored in v": Fault(images(lambda p: p[:, ::-1]), (SAME, READOUT), EITHER, "mirrored in v"),
+}
+for name, fault in WHOLE.items():
+    FAULTS |= {name: fault, f"{name} aside": replace(fault, aside=ASIDE)}
 
 
 def run_all(arguments: argparse.Namespace) -> None:
@@ -102,17 +181,16 @@ def run_all(arguments: argparse.Namespace) -> None:
     done = {key_of(line) for line in read_lines(results)}
     for seed in (int(s) for s in arguments.seeds.split(",")):
         for name, path in volumes.items():
-            scans: dict[tuple[Protocol, float], Scan] = {}
+            scans: dict[tuple[Protocol, float, float], Scan] = {}
             for fault in faults:
                 facts = {"volume": name, "fault": fault, "size": arguments.size, "seed": seed}
                 if key_of(facts) in done:
                     continue
-                plant, protocol, away, _, _ = FAULTS[fault]
-                if (protocol, away) not in scans:
-                    scans[protocol, away] = make_scan(rt, path, arguments.size, seed, protocol, away=away)
-                scan = plant(
-                    scans[protocol, away], np.random.default_rng([seed, *f"{name} {fault}".encode()])
-                )
+                planted = FAULTS[fault]
+                key = planted.protocol, planted.away, planted.aside
+                if key not in scans:
+                    scans[key] = make_scan(rt, path, arguments.size, seed, *key)
+                scan = planted.plant(scans[key], np.random.default_rng([seed, *f"{name} {fault}".encode()]))
                 append(results, {**facts, **run_one(rt, scan)})
 
 
@@ -132,6 +210,15 @@ def key_of(line: dict[str, object]) -> tuple[object, ...]:
     return tuple(line[key] for key in ("volume", "fault", "size", "seed"))
 
 
+def is_right(planted: Fault, findings: list[dict[str, object]]) -> bool:
+    """Whether a question that should find it does, and the first suspicious answer says what it is."""
+    if not planted.questions:
+        return True
+    answered = any(f["question"] in planted.questions and f["verdict"] in planted.right for f in findings)
+    alarms = [f"{f['text']} -> {f['advice']}" for f in findings if f["verdict"] == SUSPICIOUS]
+    return answered and (not alarms or planted.says in alarms[0])
+
+
 def table(path: Path) -> str:
     """Markdown: a row for each planted fault, then every scan that was answered wrong."""
     lines = lines_of(path)
@@ -140,12 +227,13 @@ def table(path: Path) -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     wrong: list[str] = []
-    for fault, (_, _, _, questions, right) in FAULTS.items():
+    for fault, planted in FAULTS.items():
         chosen = [line for line in lines if line["fault"] == fault]
         if not chosen:
             continue
+        questions = planted.questions
         verdicts = [{f["question"]: f["verdict"] for f in line["findings"]} for line in chosen]
-        hits = [not questions or right in {v.get(q) for q in questions} for v in verdicts]
+        hits = [is_right(planted, line["findings"]) for line in chosen]
         others = [
             [q for q, verdict in v.items() if verdict == SUSPICIOUS and q not in questions] for v in verdicts
         ]

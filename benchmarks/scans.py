@@ -18,15 +18,17 @@ RAPID = PROTOCOLS["rapid"]
 
 
 def make_scan(
-    rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0
+    rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0, aside: float = 0.0
 ) -> Scan:
     """The scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
 
     ``size`` counts the reference's voxels per side, half the detector's pixels; ``away`` multiplies the distances of source
-    and detector, which leaves the magnification.
+    and detector, which leaves the magnification; ``aside`` moves the panel along u by that share of its width.
     """
     detector = 2 * size
-    geometry = ConeGeometry(5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2)
+    geometry = ConeGeometry(
+        5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2, (0.0, 4.0 * aside)
+    )
     scene = volume_scene(rt, load_attenuation(path), f"volume {path}", geometry, Grid.cube(size, 2.0), size, "rows")
     return SyntheticCase(rt, scene, geometry, protocol, "rows", seed).scan(FLY)
 

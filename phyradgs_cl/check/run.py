@@ -19,14 +19,16 @@ from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
 from phyradgs_cl.check.questions.gain import GAIN, check_gain
 from phyradgs_cl.check.questions.offset import (
     CENTRE,
+    OTHER_CAUSE,
     Offset,
     best_offset,
     block_of,
     check_offset,
     rough_offset,
+    with_coarseness,
 )
 from phyradgs_cl.check.questions.readout import READOUT, check_readout
-from phyradgs_cl.check.questions.rotation import SIGN, check_rotation, is_clear
+from phyradgs_cl.check.questions.rotation import SIGN, blamed, check_rotation, is_clear
 from phyradgs_cl.check.questions.saturation import OVERFLOW, CountReader, check_saturation
 from phyradgs_cl.check.questions.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
@@ -37,7 +39,8 @@ from phyradgs_cl.runtime import Runtime
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """The findings in order, and the shift of the panel along u in mm that explains the frames best (NaN: none does)."""
+    """The findings in order, and the shift of the panel along u in mm that explains the frames best (NaN: none does, or
+    something else has to be put right first, and ``is_consistent`` is false)."""
 
     findings: list[Finding]
     offset_mm: float
@@ -91,12 +94,12 @@ def check(
     if coverage.unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
         return leave_the_rest()
     quick = coarse(scan, QUICK)
-    fits = check_consistency(rt, quick)
+    fits = check_consistency(rt, quick, scan)
     add(fits.finding)
     if not fits.is_sound:
         return leave_the_rest()
     quick = some_frames(quick, fits.kept)
-    is_reversed, offset, centre = _turning(rt, quick, add, fits.sees_angles)
+    is_reversed, offset, centre = _turning(rt, quick, scan, add, fits.sees_angles)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     quick = _under(quick, is_reversed, offset, centre)
     add(check_distances(rt, quick) if fits.sees_angles else _looks_alike(DISTANCES))
@@ -109,6 +112,8 @@ def check(
         add(check_readout(rt, fine) if fits.sees_angles else _looks_alike(READOUT))
     if asks_exposure:
         add(check_exposure(rt, quick) if fits.sees_angles else _looks_alike(EXPOSURE))
+    if is_reversed or centre.unit == OTHER_CAUSE:  # its sign or size is another's to say
+        return CheckResult(found, math.nan, math.nan, False)
     return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
 
 
@@ -117,7 +122,7 @@ def _looks_alike(question: str) -> Finding:
 
 
 def _turning(
-    rt: Runtime, quick: Scan, add: Callable[[Finding], Finding], sees_angles: bool
+    rt: Runtime, quick: Scan, as_stated: Scan, add: Callable[[Finding], Finding], sees_angles: bool
 ) -> tuple[bool, Offset, Finding]:
     """(does the gantry turn the other way, where is its axis on the panel, what was found about that); a panel
     of few columns says neither."""
@@ -132,11 +137,20 @@ def _turning(
     was_clear = is_clear(stated, other)
     if not was_clear:
         stated, other = best_offset(rt, quick, stated), best_offset(rt, turned, other)
-    is_reversed = add(check_rotation(stated, other)).verdict == SUSPICIOUS
+    sign = check_rotation(stated, other)
+    is_reversed = sign.verdict == SUSPICIOUS
     offset = other if is_reversed else stated
     if was_clear:
         offset = best_offset(rt, turned if is_reversed else quick, offset)
-    return is_reversed, offset, add(check_offset(offset, block, quick.geometry.pixel_size_mm[1] / block))
+    offset = with_coarseness(offset, block, as_stated)
+    pitch_mm = quick.geometry.pixel_size_mm[1] / block
+    stated_px = as_stated.geometry.detector_offset_mm[1] / pitch_mm
+    centre = check_offset(offset, block, pitch_mm, stated_px)
+    if is_reversed:
+        sign = blamed(sign, offset.pixels, stated_px, centre.threshold)
+        centre = replace(centre, verdict=CANNOT_TELL, text=f"rests on {SIGN}: {SUSPICIOUS}", advice="")
+    add(sign)
+    return is_reversed, offset, add(centre)
 
 
 def _usable(scan: Scan) -> Scan:
@@ -162,4 +176,5 @@ def _without(scan: Scan, dead: np.ndarray) -> Scan:
 def _under(scan: Scan, is_reversed: bool, offset: Offset, centre: Finding) -> Scan:
     """The scan as the questions so far have it: turned round where it has to be, the panel where it really is."""
     scan = reversed_rotation(scan) if is_reversed else scan
-    return shifted(scan, offset.pixels) if centre.verdict == SUSPICIOUS else scan
+    is_moved = math.isfinite(offset.pixels) and abs(offset.pixels) > centre.threshold
+    return shifted(scan, offset.pixels) if is_moved else scan

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.check.questions.timing import azimuth_rad, start_azimuths_rad, wrapped
 
@@ -16,18 +17,20 @@ _MIRROR = np.array([1.0, -1.0, 1.0] * 4)  # of the four vectors of a pose, at th
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Poses of ``base`` for a panel of ``columns``, changed in the order of the fields.
+    """Poses of ``base`` for a panel of (rows, columns), changed in the order of the fields.
 
     is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
-    on its side. shift_px: the panel moves along u, in its own columns. blocks: of how many rows and columns blocks of pixels
-    are. frames (F,): which of ``base`` are used; None: all.
+    on its side. shift_px: the panel moves along u, in its own columns. images: how the pixels of the frames lie on the
+    panel, poses (..., 12) → poses; None: as stated. blocks: of how many rows and columns blocks of pixels are. frames (F,):
+    which of ``base`` are used; None: all.
     """
 
     base: Trajectory
-    columns: int
+    panel: tuple[int, int]
     offset_u_mm: float = 0.0
     is_reversed: bool = False
     shift_px: float = 0.0
+    images: Callable[[np.ndarray], np.ndarray] | None = None
     blocks: tuple[int, int] = (1, 1)
     frames: np.ndarray | None = None
 
@@ -38,6 +41,8 @@ class Path:
         if self.is_reversed:
             pose = self._mirrored(pose)
         pose[..., 3:6] += self.shift_px * pose[..., 6:9]
+        if self.images is not None:
+            pose = self.images(pose)
         for block, step in zip(self.blocks, (slice(9, 12), slice(6, 9)), strict=True):
             pose[..., 3:6] += (block - 1) / 2 * pose[..., step]
             pose[..., step] *= block
@@ -47,7 +52,7 @@ class Path:
         pose = pose * _MIRROR
         column = pose[..., 6:9]
         pitch_mm = np.linalg.norm(column, axis=-1, keepdims=True)
-        pose[..., 3:6] += (self.columns - 1 - 2 * self.offset_u_mm / pitch_mm) * column
+        pose[..., 3:6] += (self.panel[1] - 1 - 2 * self.offset_u_mm / pitch_mm) * column
         pose[..., 6:9] = -column
         return pose
 
@@ -58,7 +63,7 @@ def path_of(scan: Scan) -> Path:
     if isinstance(path, Path):
         return path
     offset_u_mm = scan.geometry.detector_offset_mm[1] if isinstance(path, CircularOrbit) else 0.0
-    return Path(path, scan.geometry.detector_shape[1], offset_u_mm)
+    return Path(path, scan.geometry.detector_shape, offset_u_mm)
 
 
 def with_path(scan: Scan, **changes: Any) -> Scan:
@@ -137,6 +142,58 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
     z, y, x = scan.grid.voxel_size_mm
     grid = replace(scan.grid, voxel_size_mm=(v * z, u * y, u * x)) if grows else scan.grid
     return replace(scan, trajectory=Changed(scan.trajectory, change), grid=grid)
+
+
+def mirrored(scan: Scan, axis: str) -> Scan:
+    """The frames mirrored in ``axis``, u or v, on the stated panel."""
+    panel, number = path_of(scan).panel, ("v", "u").index(axis)
+    is_read_along = scan.shutter.axis == ("rows", "columns")[number]
+    turned = reversed_readout(scan) if is_read_along else scan
+    return with_path(turned, images=lambda pose: _flipped(pose, number, panel[number]))
+
+
+def transposed(scan: Scan, is_quarter_turn: bool) -> Scan:
+    """The frames' rows along u and their columns along v; is_quarter_turn: and mirrored in u, which is a turn by 90°."""
+    rows, columns = path_of(scan).panel
+
+    def change(pose: np.ndarray) -> np.ndarray:
+        pose[..., 3:6] += (columns - rows) / 2 * (pose[..., 6:9] - pose[..., 9:12])
+        pose = transpose_pose(pose)
+        return _flipped(pose, 0, rows) if is_quarter_turn else pose
+
+    axis = "columns" if scan.shutter.axis == "rows" else "rows"
+    turns_back = is_quarter_turn and axis == "rows"
+    shutter = replace(scan.shutter, axis=axis, direction=-scan.shutter.direction if turns_back else scan.shutter.direction)
+    return with_path(replace(scan, shutter=shutter), images=change)
+
+
+def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
+    """Pixels ``factor`` times as large. keeps_axis: the central ray stays at its pixel, as if the distances were shorter
+    instead; else the panel's offset stays in mm."""
+    path = path_of(scan)
+    rows, columns = path.panel
+
+    def change(_: int, pose: np.ndarray) -> np.ndarray:
+        source, first, step_u, step_v = (pose[..., i : i + 3].copy() for i in (0, 3, 6, 9))
+        if keeps_axis:
+            normal = np.cross(step_u, step_v)
+            normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            centre = source + normal * ((first - source) * normal).sum(-1, keepdims=True)
+        else:
+            centre = first + (columns - 1) / 2 * step_u + (rows - 1) / 2 * step_v
+        pose[..., 3:6] = centre + factor * (first - centre)
+        pose[..., 6:] *= factor
+        return pose
+
+    return with_path(scan, base=Changed(path.base, change))
+
+
+def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
+    """Poses (..., 12) of frames whose ``count`` rows (axis 0) or columns (1) run backwards."""
+    step = (slice(9, 12), slice(6, 9))[axis]
+    pose[..., 3:6] += (count - 1) * pose[..., step]
+    pose[..., step] *= -1
+    return pose
 
 
 def _rotated(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

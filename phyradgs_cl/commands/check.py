@@ -66,7 +66,8 @@ def _checked_output(scan: Path, fix_offset: bool, output: Path | None) -> Path |
 def _write_copy(scan: Path, target: Path, found: CheckResult, quiet: bool) -> None:
     if not found.is_consistent:
         remedy = "set right what is suspicious, and check again"
-        raise InputError("--fix-offset", "frames that do not fit together", "an offset that means something", remedy)
+        found_instead = "frames that do not fit together as stated"
+        raise InputError("--fix-offset", found_instead, "an offset that means something", remedy)
     if not (math.isfinite(found.offset_mm) and math.isfinite(found.offset_spread_mm)):
         expected = "a scan whose frames tell it"
         raise InputError("--fix-offset", "no offset that fits best", expected, "leave it out")

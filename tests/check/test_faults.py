@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
 from phyradgs_cl.check.questions.exposure import check_exposure
+from phyradgs_cl.check.questions.offset import OTHER_CAUSE, Offset, check_offset
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan, write_scan
@@ -81,6 +83,86 @@ def test_an_offset_is_estimated_with_its_uncertainty(rt, clean, pixels) -> None:
     assert 0 < found.offset_spread_mm < 0.1 * pitch_mm
 
 
+@pytest.fixture(scope="module", params=[0.0, 0.375])
+def aside(request, scan_of):
+    """A scan whose panel stands in its place, and one whose panel stands three pixels beside it, as stated."""
+    geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125), (0.0, request.param))
+    return scan_of(geometry, views=15, exposure_deg=24.0, readout_ratio=0.5)
+
+
+def imported(scan, change=None, **geometry):
+    """Changed frames with another geometry stated, and the grid that an import makes of it."""
+    scan = scan if change is None else replace(scan, projections=np.ascontiguousarray(change(scan.projections)))
+    scan = stated(scan, **geometry)
+    return replace(scan, grid=default_grid(scan.geometry))
+
+
+def only_alarm(found):
+    """The only suspicious answer; the offset is then no matter."""
+    assert len(found.suspicious) == 1, found.suspicious
+    assert verdicts(found)["centre of rotation"] == CANNOT_TELL
+    assert not found.is_consistent and np.isnan(found.offset_mm)
+    return f"{found.suspicious[0].text} -> {found.suspicious[0].advice}"
+
+
+@pytest.mark.parametrize("factor", [0.1, 1000.0])
+def test_sizes_in_another_unit_are_no_offset(rt, aside, factor) -> None:
+    """Ten times too small, the panel has its axis beside it, where frames fit under any geometry."""
+    said = only_alarm(check(imported(aside, pixel_size_mm=(factor * 0.125,) * 2), rt))
+    assert f"pixel sizes {1 / factor:g} times as large" in said
+    assert ("they do not tell which" in said) == (aside.geometry.detector_offset_mm[1] == 0)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_distances_in_another_unit_are_no_offset(rt, aside, factor) -> None:
+    far = {"source_to_axis_mm": 5.0 * factor, "source_to_detector_mm": 7.0 * factor}
+    said = only_alarm(check(imported(aside, **far), rt))
+    assert f"distances {1 / factor:g} times as large" in said and "pixel sizes" in said
+
+
+def test_frames_that_are_transposed_or_mirrored(rt, aside) -> None:
+    """A mirror in u turns the offset round, and that is no second finding."""
+    for change in (lambda p: p.swapaxes(1, 2), lambda p: np.rot90(p, axes=(1, 2))):
+        assert "transposed" in only_alarm(check(imported(aside, change), rt))
+    said = only_alarm(check(imported(aside, lambda p: p[:, :, ::-1]), rt))
+    assert "mirrored in u" in said
+    assert ("look the same" in said) == (aside.geometry.detector_offset_mm[1] == 0)
+    found = check(imported(aside, lambda p: p[:, ::-1]), rt)
+    assert set(suspected(found)) <= {"sign of readout"}
+
+
+def test_a_beam_without_a_fan_leaves_sizes_and_offset_open() -> None:
+    """Stated 20 pixels beside the middle, found at 2, the panel may have larger pixels; at -20 it may be a mirror image."""
+
+    def found(pixels):
+        return check_offset(Offset(pixels, 0.05, np.empty(0)), 2, 0.1, 20.0)
+
+    assert found(-18.0).unit == OTHER_CAUSE and "pixel sizes were 10 times as large" in found(-18.0).text
+    assert "--fix-offset" not in found(-18.0).advice and "--fix-offset" in found(-15.0).advice
+    assert "mirrored in u" in found(-40.0).text and "mirrored" not in found(-15.0).text
+
+
+@pytest.mark.parametrize("pixels", [-0.5, 0.5])
+def test_the_deviation_of_an_offset_covers_its_error_in_half_a_turn(rt, scan_of, pixels) -> None:
+    """Most rays are then measured once, and coarse volumes pull the offset to one side."""
+    geometry = ConeGeometry(5.0, 7.0, (64, 64), (0.0625, 0.0625))
+    scan = scan_of(geometry, size=32, views=40, exposure_deg=9.0)
+    sweeps, kept = scan.trajectory.kinematics, slice(0, 24)
+    part = {name: getattr(sweeps, name)[kept] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
+    half = replace(
+        scan, projections=scan.projections[kept], frame_start_s=scan.frame_start_s[kept],
+        trajectory=CircularOrbit(geometry, replace(sweeps, **part)),
+    )  # fmt: skip
+    found = check(stated(half, detector_offset_mm=(0.0, -pixels * 0.0625)), rt)
+    assert abs(found.offset_mm - pixels * 0.0625) < 2 * found.offset_spread_mm < 0.05
+
+
+def test_a_grid_of_another_size_than_the_object(rt, clean) -> None:
+    small = stated(clean, pixel_size_mm=(0.0125, 0.0125))
+    finding = next(f for f in check(small, rt).findings if f.question == "coverage")
+    assert finding.verdict == SUSPICIOUS and "the grid 2 mm, and the panel sees 0.2" in finding.text
+
+
 @pytest.mark.parametrize("change", [-0.05, 0.05])
 def test_a_drift_of_the_gain(rt, clean, change) -> None:
     gain = np.log1p(change) * np.arange(clean.frames) / (clean.frames - 1)
@@ -151,9 +233,12 @@ def test_an_object_that_looks_the_same_from_every_angle_raises_no_alarm(rt, clea
     assert found.suspicious == [] and verdicts(found)["sign of rotation"] == CANNOT_TELL
 
 
-def test_an_offset_is_not_corrected_where_the_frames_do_not_fit(cli, clean, tmp_path, capsys) -> None:
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_an_offset_is_not_corrected_where_the_frames_do_not_fit(cli, clean, tmp_path, capsys, is_turned) -> None:
+    """Nor where the gantry turns the other way: of mirrored frames the offset would have the wrong sign."""
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
-    write_scan(path, replace(clean, projections=clean.projections[np.random.default_rng(3).permutation(15)]))
+    mixed = replace(clean, projections=clean.projections[np.random.default_rng(3).permutation(15)])
+    write_scan(path, negative(stated(clean, detector_offset_mm=(0.0, 0.25))) if is_turned else mixed)
     assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == 2
     streams = capsys.readouterr()
     assert "frames that do not fit together" in streams.err and not fixed.exists()

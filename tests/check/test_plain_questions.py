@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Saturation
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Saturation
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.questions.angles import check_angles
 from phyradgs_cl.check.questions.coverage import check_coverage
@@ -88,9 +88,21 @@ def test_missing_views_and_too_short_a_turn(clean) -> None:
     two_gaps = check_angles(some_frames(clean, np.r_[0:4, 7:9, 12:15]))
     assert two_gaps.verdict == SUSPICIOUS and two_gaps.value == pytest.approx(96)
     short = check_angles(some_frames(clean, np.arange(6)))
-    assert short.verdict == SUSPICIOUS and short.value == pytest.approx(120)
+    assert short.verdict == SUSPICIOUS and short.value == pytest.approx(144)  # with half a step before and behind
     alike = check_angles(some_frames(clean, np.zeros(6, int)))
     assert alike.verdict == SUSPICIOUS and alike.text == "1 different angle"
+
+
+@pytest.mark.parametrize(("away", "verdict"), [(100.0, OK), (1.0, SUSPICIOUS)])
+def test_half_a_turn_is_enough_for_rays_that_are_nearly_parallel(clean, away, verdict) -> None:
+    """Views at 0, 1, ... 179 degrees, as synchrotrons take them; a fan needs more."""
+    geometry = replace(clean.geometry, source_to_axis_mm=5 * away, source_to_detector_mm=7 * away)
+    count = np.arange(180)
+    angle_rad = np.deg2rad(count)
+    orbit = CircularOrbit(geometry, FrameSweeps(1.0 * count, 0.0, angle_rad, angle_rad))
+    frames = np.repeat(clean.projections[:1], 180, 0)
+    scan = replace(clean, projections=frames, geometry=geometry, trajectory=orbit, frame_start_s=1.0 * count, is_fly=False)
+    assert check_angles(scan).verdict == verdict
 
 
 def cropped(scan, columns, offset_mm):

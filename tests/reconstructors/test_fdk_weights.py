@@ -165,7 +165,10 @@ def test_incomplete_data_are_named(rt, caplog, arc_deg, offset_mm, message) -> N
 
 
 def test_complete_data_are_not(rt, caplog) -> None:
+    """Half a turn is enough for rays that are nearly parallel."""
+    parallel = ConeGeometry(500.0, 700.0, (44, 48), (0.075, 0.075))
     with caplog.at_level(logging.WARNING):
+        levels(rt, parallel.pose(turn(180, 180.0)))
         for columns, offset_mm, arc_deg in ((48, 0, 215.0), (48, 0, 360.0), (34, 0.5, 360.0)):
             levels(rt, cone(columns, offset_mm).pose(turn(60, arc_deg)), columns)
     assert not caplog.records

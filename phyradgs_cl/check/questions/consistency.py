@@ -1,8 +1,9 @@
 """Do the frames fit together under what the file says of their order, angles and geometry?"""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -10,11 +11,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.coarse import some_frames
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.frames import alike, odd_ones
-from phyradgs_cl.check.questions.offset import best_offset, rough_offset
-from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped
+from phyradgs_cl.check.hypotheses import (
+    REDUNDANT,
+    Cause,
+    causes_of_frames,
+    frame_number,
+    stated_redundancy,
+    whole_scans,
+)
+from phyradgs_cl.check.questions.offset import best_offset, block_of, rough_offset
 from phyradgs_cl.check.residual import Fit, fit, fitted, system_of
 from phyradgs_cl.check.statistics import t_statistic
-from phyradgs_cl.check.variants import Path, path_of, reversed_rotation, shifted, stretched, turned, with_path
+from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.runtime import Runtime
 
 _LARGEST = 0.35  # residual over that of the frames in a random order: right scans of every kind leave 0.02 to 0.23
@@ -25,6 +33,8 @@ _CLEAR = 0.5  # squared residual of another order, step or size over the stated 
 _ERRORS = 4.0
 _SYMMETRIC = 2.0  # residual in a random order over the stated one's
 _SAME = 0.03  # residual in a random order over the frames' own spread: less of both, and every angle looks alike
+_MOST_WHOLE = 2  # hypotheses about the whole scan that are looked at closely
+_PER_PIXEL = 1.5  # by which a coarse pixel of shift counts against a hypothesis: stated offsets are mostly right
 _OUTLIER = 4.0  # residual of a frame over the usual one's
 _MOST_OUTLIERS = 0.2  # of the frames
 CONSISTENCY = "consistency"
@@ -41,34 +51,23 @@ class Consistency:
     sees_angles: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Cause:
-    """Another order, step or size: what it is, what to do, and the scan under it."""
-
-    text: str
-    advice: str
-    scan: Callable[[], Scan]
-
-
-def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
+def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """The residual of a coarse ``scan``, over that of its frames in a random order; and whatever explains them far
     better. Rotation and shift have questions of their own: the best of these is what other causes (an order or step of
-    angles, a size of pixels) have to halve. Frames that stand out are left out first."""
+    angles, sizes, distances, images the other way round) have to halve. Frames that stand out are left out first.
+    ``as_stated``: the scan that the coarse one was made of."""
     everything = np.arange(scan.frames)
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
         return Consistency(_finding(CANNOT_TELL, 0.0, text, ""), everything, False, False)
     kept, notes = _without_odd(scan)
-    unshifted, part = _best_turning(rt, some_frames(scan, kept))
+    unshifted, part, rough = _best_turning(rt, some_frames(scan, kept))
     stated = fit(system_of(rt, part))
     left, part, stated, more = _without_outliers(rt, part, stated)
     kept, unshifted, notes = kept[left], some_frames(unshifted, left), notes + more
     spread = float(np.asarray(part.projections, np.float64).var()) * part.frames
-    rng = np.random.default_rng(0)
-    orders = [rng.permutation(part.frames) for _ in range(_DRAWS)]
-    shuffled = (replace(part, projections=part.projections[order]) for order in orders)
-    random = float(np.mean([fitted(rt, draw).sum() for draw in shuffled]))
+    random = _random(rt, part)
     share = float(np.sqrt(stated.total / max(random, 1e-30)))
     sees_angles = share * _SYMMETRIC < 1 or random > _SAME**2 * spread
     text = f"residual {share:.2g} of that of the frames in a random order"
@@ -78,7 +77,16 @@ def check_consistency(rt: Runtime, scan: Scan) -> Consistency:
         finding = _finding(verdict, share, "; ".join([*notes, text]), _about(notes))
         return Consistency(finding, kept, True, False)
     most = min(_CLEAR * stated.total, _LARGEST**2 * random)
-    cause = _cause(rt, unshifted, stated, most, looks_closely=share > _NEEDS_LOOK)
+    one_sided = stated_redundancy(as_stated) < REDUNDANT
+    whole = _whole(rt, some_frames(scan, kept), as_stated, np.inf if one_sided else rough)
+    if one_sided and (cause := _fitting(rt, whole)) is not None:
+        return Consistency(_finding(SUSPICIOUS, share, "; ".join([*notes, cause.text]), cause.advice), kept, False, True)
+    if one_sided and stated_redundancy(as_stated) < 0:
+        text = "detector_offset puts the axis of rotation beside the panel, where frames fit under any geometry"
+        advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log"
+        return Consistency(_finding(SUSPICIOUS, share, "; ".join([*notes, text]), advice), kept, False, True)
+    causes = chain(whole, causes_of_frames(unshifted, part, looks_closely=share > _NEEDS_LOOK))
+    cause = _cause(rt, causes, stated, most)
     if cause is not None:
         finding = _finding(SUSPICIOUS, share, "; ".join([*notes, cause.text]), cause.advice)
         return Consistency(finding, kept, False, True)
@@ -103,28 +111,60 @@ def _about(notes: list[str]) -> str:
 def _without_odd(scan: Scan) -> tuple[np.ndarray, list[str]]:
     """(frames that do not stand out by themselves, what was said of the others)."""
     odd, twice = odd_ones(scan.projections, scan.pixel_mask), alike(scan)
-    notes = [f"frame {_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
-    notes += [f"frame {_number(scan, f)} is frame {_number(scan, f - 1)} recorded twice" for f in twice]
+    notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
+    notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in twice]
     return np.setdiff1d(np.arange(scan.frames), [*odd, *twice]), notes
 
 
-def _number(scan: Scan, frame: int) -> int:
-    """A frame's number in the file, from 0."""
-    path = scan.trajectory
-    return int(path.frames[frame]) if isinstance(path, Path) and path.frames is not None else int(frame)
-
-
-def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan]:
-    """The scan as it is, or turned the other way where that leaves far less; the same with its panel shifted, likewise."""
+def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
+    """The scan as it is, or turned the other way where that leaves far less; the same with its panel shifted, likewise; the
+    mean squared residual after the few iterations of ``rough_offset``."""
     ways = [scan, reversed_rotation(scan)]
     roughs = [rough_offset(rt, way) for way in ways]
     best = int(np.argmin([rough.residuals.sum() for rough in roughs]))
+    least = float(roughs[best].residuals.mean())
     offset = best_offset(rt, ways[best], roughs[best])
     if not np.isfinite(offset.pixels):
-        return scan, scan
+        return scan, scan, least
     other = shifted(ways[best], offset.pixels)
     is_better = fitted(rt, other).sum() < _CLEAR * fitted(rt, scan).sum()
-    return (ways[best], other) if is_better else (scan, scan)
+    return (ways[best], other, least) if is_better else (scan, scan, least)
+
+
+def _whole(rt: Runtime, scan: Scan, as_stated: Scan, rough: float) -> list[Cause]:
+    """The best two hypotheses about the whole scan, with their panel shifted: of those that fit better than ``rough`` after
+    few iterations."""
+    tried = [(cause, cause.scan()) for cause in whole_scans(scan, as_stated)]
+    offsets = [rough_offset(rt, other) for _, other in tried]
+    moved = [abs(offset.pixels) / block_of(scan) for offset in offsets]
+    rank = np.argsort([o.residuals.sum() * _PER_PIXEL**m for o, m in zip(offsets, moved, strict=True)])
+    best: list[int] = []
+    for number in rank:  # of one factor the one that moves the panel less
+        if tried[number][0].factor == 1 or all(tried[number][0].factor != tried[n][0].factor for n in best):
+            best.append(int(number))
+    found = []
+    for number in best[:_MOST_WHOLE]:
+        (cause, other), offset = tried[number], offsets[number]
+        if offset.residuals.mean() < rough:
+            pixels = best_offset(rt, other, offset).pixels
+            found.append(replace(cause, scan=partial(shifted, other, pixels if np.isfinite(pixels) else offset.pixels)))
+    return found
+
+
+def _random(rt: Runtime, scan: Scan) -> float:
+    """The sum of squared residuals of the scan's frames in a random order."""
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(scan.frames) for _ in range(_DRAWS)]
+    return float(np.mean([fitted(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
+
+
+def _fitting(rt: Runtime, causes: Iterable[Cause]) -> Cause | None:
+    """The first other size under which frames fit together by themselves, whatever they leave as stated."""
+    for cause in causes:
+        scan = cause.scan()
+        if cause.factor != 1 and fitted(rt, scan).sum() < _LARGEST**2 * _random(rt, scan):
+            return cause
+    return None
 
 
 def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Scan, Fit, list[str]]:
@@ -144,7 +184,7 @@ def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray,
     if not out or len(out) >= _MOST_OUTLIERS * scan.frames:
         return everything, scan, stated, []
     part = some_frames(scan, left)
-    names = [_number(scan, f) for f in out]
+    names = [frame_number(scan, f) for f in out]
     note = f"frame{'s' if len(out) > 1 else ''} {', '.join(map(str, sorted(names)))} (from 0) do not fit the others"
     order = np.arange(scan.frames)
     order[out] = order[out[::-1]]
@@ -154,99 +194,11 @@ def _without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray,
     return left, part, current, [note]
 
 
-def _cause(rt: Runtime, scan: Scan, stated: Fit, most: float, looks_closely: bool) -> Cause | None:
+def _cause(rt: Runtime, causes: Iterable[Cause], stated: Fit, most: float) -> Cause | None:
     """What explains the frames best, where its squared residual is below ``most``: of frames that then fit together."""
     best, least = None, most
-    for cause in _causes(scan, looks_closely):
+    for cause in causes:
         squares = fitted(rt, cause.scan())
         if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
             best, least = cause, float(squares.sum())
     return best
-
-
-def _causes(scan: Scan, looks_closely: bool) -> Iterator[Cause]:
-    yield from _arcs(scan)
-    yield from _sizes(scan)
-    if looks_closely:
-        yield from _orders(scan)
-        yield from _missing(scan)
-
-
-def _orders(scan: Scan) -> Iterator[Cause]:
-    path = path_of(scan)
-    numbers = np.arange(scan.frames) if path.frames is None else path.frames
-    count = int(numbers[-1]) + 1
-    starts = np.interp(np.arange(count), numbers, scan.frame_start_s)
-    for first in (0, 1):
-        lexical = np.array(sorted(range(first, count + first), key=str)) - first
-        if (lexical == np.arange(count)).all():
-            continue
-        true = lexical[numbers]
-
-        def ordered(true: np.ndarray = true) -> Scan:
-            return replace(with_path(scan, frames=true), frame_start_s=starts[true])
-
-        text = "frames fit in another order: that of names without leading zeros (1, 10, 11, ... 2)"
-        yield Cause(text, "sort the frames by number, not by name, and import them again", ordered)
-
-
-def _azimuths(scan: Scan) -> np.ndarray:
-    """Angle of each frame's start from the first one's (F,), as the trajectory counts it where it does."""
-    base = path_of(scan).base
-    if hasattr(base, "angle_rad"):
-        path = path_of(scan)
-        numbers = np.arange(scan.frames) if path.frames is None else path.frames
-        at = [float(base.angle_rad(int(n), np.array([scan.frame_start_s[f]]))[0]) for f, n in enumerate(numbers)]
-        return np.array(at) - at[0]
-    angles = start_azimuths_rad(scan)
-    return np.unwrap(angles) - angles[:1]
-
-
-def _arcs(scan: Scan) -> Iterator[Cause]:
-    from_first = _azimuths(scan)
-    path = path_of(scan)
-    sense = -1.0 if path.is_reversed else 1.0
-    total_deg = float(np.rad2deg(abs(from_first[-1])))
-    radian = float(np.degrees(1.0))
-    named = {
-        radian: "angles in radians were taken for degrees",
-        1 / radian: "angles in degrees were taken for radians",
-        0.5: "the step of the angles is half of what is stated",
-        2.0: "the step of the angles is twice what is stated",
-    }
-    for percent in (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5):
-        than_stated = f"{abs(percent)} % {'smaller' if percent < 0 else 'larger'} than stated"
-        named[1 + percent / 100] = f"the step of the angles is about {than_stated}"
-    for factor, text in named.items():
-        span = f"the frames span {factor * total_deg:.4g}°, not {total_deg:.4g}°"
-        advice = f"{span}: correct rotation_angle, its unit or its step"
-        turn = sense * (factor - 1) * from_first
-        yield Cause(text, advice, partial(turned, scan, turn, factor))
-
-
-def _sizes(scan: Scan) -> Iterator[Cause]:
-    v, u = scan.geometry.pixel_size_mm
-    if abs(v / u - 1) > 0.02:
-        text, advice = "pixel sizes fit if v and u are exchanged", "exchange x_pixel_size and y_pixel_size"
-        yield Cause(text, advice, partial(stretched, scan, u / v, v / u))
-    for factor in (0.5, 0.8, 0.9, 1.1, 1.25, 2.0, 1e-3, 1e3):
-        if not 0.02 < factor * scan.geometry.detector_shape[1] * u / scan.geometry.source_to_detector_mm < 3:
-            continue
-        text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
-        advice = "correct pixel sizes (binning? unit?) or distances (unit? source to panel?)"
-        yield Cause(text, advice, partial(stretched, scan, factor, factor))
-
-
-def _missing(scan: Scan) -> Iterator[Cause]:
-    """Frames that are missing, or there twice, with later ones moved up or back by a step."""
-    steps = wrapped(np.diff(_azimuths(scan)))
-    step = float(np.median(steps)) * (-1.0 if path_of(scan).is_reversed else 1.0)
-    for at in np.unique(np.linspace(1, scan.frames - 1, 15).round().astype(int)):
-        later = (np.arange(scan.frames) >= at) * step
-        number = _number(scan, int(at))
-        text = f"a frame is missing near frame {number} (from 0): later ones fit one step further on"
-        advice = "find the missing frame, or shift the angles behind it by a step"
-        yield Cause(text, advice, partial(turned, scan, later))
-        text = f"a frame is there twice near frame {number} (from 0): later ones fit one step before"
-        advice = "take the frame out, so that later ones get their own angles"
-        yield Cause(text, advice, partial(turned, scan, -later))

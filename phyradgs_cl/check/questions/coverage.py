@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.field_of_view import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
@@ -15,6 +16,8 @@ _OPAQUE = 30.0  # line integral: nothing comes through
 _INVERTED = 0.9  # of the largest value: from here the sides are not air but the brightest there is
 _BRIGHT = 0.05  # of the pixels: how many may be brighter than the flats
 _FRAMES = 0.1  # of all: how many may touch a border
+_COVERED = 0.1  # of a column's rows
+_ANOTHER_SIZE = 5.0  # times as wide: grids are cut to a part of an object, or made a little wider, but no more
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units: line integrals mean nothing then
 CUT_OFF = "line integral at the border"
 _QUESTION = "coverage"
@@ -57,6 +60,12 @@ def check_coverage(scan: Scan) -> Finding:
     asked = {name: level for name, level in sides.items() if name != allowed}
     name, level = max(asked.items(), key=lambda item: item[1])
     text = f"at most {level:.3g} at the {name} border, where air is 0 and the object reaches {largest:.3g}"
+    wide_mm, grid_mm = _width_mm(scan, p, valid, threshold), max(scan.grid.size_mm[1:])
+    text += f"; it is about {wide_mm:.3g} mm wide at the axis, the grid {grid_mm:.3g} mm"
+    seen_mm = 2 * field_of_view_mm(scan.geometry)[1]
+    if grid_mm > _ANOTHER_SIZE * max(seen_mm, *scan.grid.voxel_size_mm) or wide_mm > _ANOTHER_SIZE * grid_mm:
+        advice = "compare pixel sizes, distances and the grid, and their units, with the scanner's log"
+        return Finding(_QUESTION, SUSPICIOUS, wide_mm, grid_mm, "mm", f"{text}, and the panel sees {seen_mm:.3g} mm", advice)
     if level <= threshold:
         return Finding(_QUESTION, OK, level, threshold, "line integral", text)
     advice = (
@@ -64,6 +73,14 @@ def check_coverage(scan: Scan) -> Finding:
         "a box as large as the object: --roi-mm of what is wanted and --margin-mm; fdk with --set extrapolate=reprojected"
     )
     return Finding(_QUESTION, SUSPICIOUS, level, threshold, CUT_OFF, text, advice)
+
+
+def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
+    """The object's usual width at the axis: of the columns in which a tenth of the rows is above ``threshold``."""
+    geometry = scan.geometry
+    columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
+    half_fan_rad = math.atan2(columns * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm)
+    return 2 * geometry.source_to_axis_mm * math.sin(half_fan_rad)
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:

@@ -73,7 +73,9 @@ def _others(scan: Scan) -> dict[str, Scan]:
 
 def _advice(scan: Scan, name: str) -> str:
     if name == _OTHER_WAY:
-        return f"set readout_direction to {-scan.shutter.direction}, or import with --readout-direction"
+        mirror = "v" if scan.shutter.axis == "rows" else "u"
+        other = f"set readout_direction to {-scan.shutter.direction}, or import with --readout-direction"
+        return f"{other}; frames mirrored in {mirror} look the same: mirror those instead"
     if name == _AT_REST:
         return "did the gantry stop for every view? Then import without a frame time (stop-and-shoot)"
     return "check the readout's axis, direction and time: the frames fit better otherwise"

@@ -1,5 +1,7 @@
 """Does the gantry turn the way that the angles say?"""
 
+from dataclasses import replace
+
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.questions.offset import Offset
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
@@ -17,14 +19,29 @@ def is_clear(stated: Offset, other: Offset) -> bool:
 
 def check_rotation(stated: Offset, other: Offset) -> Finding:
     """Coarse reconstructions with the angles as they are and turned round, each with its own best panel shift. Four
-    standard errors decide, and 20 % of the squared residual: a mirror image in a narrow fan fits as well."""
+    standard errors decide, and 20 % of the squared residual: a mirror image in a narrow fan fits as well. Frames mirrored
+    in u fit with the angles turned round as well, and with the opposite offset: ``blamed`` says which of the two it is."""
     errors, ratio = t_statistic(stated.residuals, other.residuals), residual_ratio(stated.residuals, other.residuals)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
     if errors >= _ERRORS and ratio >= _LEAST_RATIO:
         return Finding(SIGN, OK, *values)
     if errors <= -_ERRORS and ratio <= 1 / _LEAST_RATIO:
-        advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
-        return Finding(SIGN, SUSPICIOUS, *values, advice)
+        return Finding(SIGN, SUSPICIOUS, *values)
     advice = "look for a feature whose side is known: a mirror image would fit as well"
     return Finding(SIGN, CANNOT_TELL, *values, advice)
+
+
+def blamed(finding: Finding, moved_px: float, stated_px: float, tolerance_px: float) -> Finding:
+    """The suspicious ``finding`` with its cause: frames are mirrored where the panel, turned round, fits nearer to the
+    opposite of the stated offset than to it. An offset below the tolerance does not tell."""
+    if abs(stated_px) < tolerance_px:
+        text = f"{finding.text}; frames mirrored in u would look the same"
+        advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
+    elif abs(moved_px + 2 * stated_px) < abs(moved_px):
+        text = f"frames are mirrored in u: {finding.text}, with detector_offset of the other sign"
+        advice = "mirror the columns of the frames (or change the signs of the angles and of detector_offset along u)"
+    else:
+        text = f"{finding.text}, with detector_offset as stated"
+        advice = "change the sign of the angles ('gantry' for 'sample')"
+    return replace(finding, text=text, advice=f"{advice}, and check again")

@@ -14,6 +14,7 @@ log = logging.getLogger(__name__)
 
 _CIRCLE, _NO_CIRCLE = 0.05, 0.5  # of the way from source to panel: from here FDK loses decibels, or the object
 _PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0
+_TOLERATED_RAD = np.deg2rad(0.5)  # the fan of rays that are nearly parallel: half a turn is enough
 RayWeight = Callable[[int], np.ndarray]
 
 
@@ -128,7 +129,7 @@ def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: 
     radius_mm = np.hypot(np.abs(x_mm).max(), np.abs(y_mm).max())
     source_mm = float(np.hypot(canonical[..., 0], canonical[..., 1]).min())
     needed_rad = np.pi + 2 * min(fan.half_rad, float(np.arcsin(min(radius_mm / source_mm, 1.0))))
-    if arc.coverage_rad < needed_rad - 1e-6:
+    if arc.coverage_rad < needed_rad - _TOLERATED_RAD:
         log.warning(
             "FDK: the views cover %.1f°, complete data need %.1f° (half a turn and the fan)",
             np.rad2deg(arc.coverage_rad),
