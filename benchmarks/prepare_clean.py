@@ -41,11 +41,11 @@ def clean_cells(clean: Scan, method: str, rt: Runtime) -> Iterator[dict[str, Any
         yield {"steps": steps, "unchanged": same, "lost_db": round(lost, 3)}
 
 
-def ringed_cells(clean: Scan, method: str, rt: Runtime, usual: dict[str, Any], done: set[str]) -> Iterator[dict[str, Any]]:
+def ringed_cells(
+    clean: Scan, method: str, rt: Runtime, usual: dict[str, Any], spreads: list[float]
+) -> Iterator[dict[str, Any]]:
     clean_db = cache(lambda: psnr_db(clean, method, rt))
-    for spread in RINGS:
-        if f"rings {spread}" in done:
-            continue
+    for spread in spreads:
         ringed = simulate(**usual, rings=spread)
         ringed_db, prepared_db = psnr_db(ringed, method, rt), psnr_db(prepare(ringed, DEFAULT_STEPS, device=rt), method, rt)
         regained = (prepared_db - ringed_db) / max(clean_db() - ringed_db, 1e-2)
@@ -74,6 +74,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--detector", type=int, default=96)
     parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
+    parser.add_argument("--rings", type=float, nargs="*", default=RINGS, help="spreads of gains; none: clean scans alone")
     parser.add_argument("--methods", nargs="+", default=["fdk"])
     parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     given = parser.parse_args()
@@ -88,14 +89,15 @@ def main() -> None:
                 "exposure_deg": 0.8 * 360 / views, "noise": "tigre", "dose": 28_000, "seed": 3,
             }  # fmt: skip
             for method in given.methods:
-                place = {"size": given.size, "phantom": Path(phantom).stem, "views": views, "method": method}
+                place = {"size": given.size, "detector": given.detector, "phantom": Path(phantom).stem}
+                place |= {"views": views, "method": method}
                 done = {line["steps"] for line in read_lines(given.results) if place.items() <= line.items()}
-                wanted = {*STEPS, *(f"rings {spread}" for spread in RINGS if views in RINGED_VIEWS)}
-                if wanted <= done:
+                spreads = [s for s in given.rings if views in RINGED_VIEWS and f"rings {s}" not in done]
+                if set(STEPS) <= done and not spreads:
                     continue
                 clean = simulate(**usual)
                 cells = [] if set(STEPS) <= done else [clean_cells(clean, method, rt)]
-                cells += [ringed_cells(clean, method, rt, usual, done)] if views in RINGED_VIEWS else []
+                cells.append(ringed_cells(clean, method, rt, usual, spreads))
                 for line in (line for cell in cells for line in cell):
                     print(json.dumps({**place, **line}), flush=True)
                     append(given.results, {**place, **line})

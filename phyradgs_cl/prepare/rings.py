@@ -3,9 +3,9 @@
 Over a full turn the mean of all views is the projection of the object averaged around the axis, which looks the same from
 both sides. What differs between a column and its mirror image at the axis is therefore of the panel. This difference, taken
 from two independent sets of views, says whether there are rings and how strong they are; without them frames stay as they
-are. ``mean`` takes the pattern from the mean over views, which it denoises in overlapping blocks of cosines with the strength
-that was measured: the object is what stands out of the pattern there. ``fitted`` then adds what a volume with little total
-variation leaves of the frames (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268).
+are. ``mean`` takes the pattern from the mean over views, which it denoises in overlapping blocks of cosines with the
+strength that was measured: the object is what stands out of the pattern there. ``fitted`` then adds what a volume with
+little total variation leaves of the frames (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268).
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ _LEAST_PAIRS = 0.25  # of all columns: from here columns are compared with their
 _LEAST_SHARE = 0.25  # of the variance of the mean's noise: weaker patterns are not worth a change
 _NEGLIGIBLE = 1e-4  # in line integrals: rings of a gain that is 0.01 % off
 _SURE = 12.0  # standard errors, of about 1/√pixels, of the pattern's variance over that of the noise
-_THRESHOLD = 2.7  # standard deviations of the pattern: larger coefficients are the object's
+_THRESHOLD = 3.5  # standard deviations of the pattern: larger coefficients are the object's
 _SHIFTS = 8  # of the blocks, along each side
 _EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their mean, on a full turn
 
@@ -38,7 +38,7 @@ class RingOptions:
     """method: mean or fitted. window: side in pixels of the blocks of cosines; wider patterns stay, but for ``fitted``."""
 
     method: str = "mean"
-    window: int = 12
+    window: int = 10
 
     def __post_init__(self) -> None:
         checks.one_of("rings.method", self.method, METHODS)
@@ -78,7 +78,7 @@ def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_
 
 
 def ring_pattern(
-    frames: np.ndarray, *, window: int = 12, axis_column: float | None = None, full_turn: bool = True
+    frames: np.ndarray, *, window: int = 10, axis_column: float | None = None, full_turn: bool = True
 ) -> np.ndarray:
     """What the pixels' gains add to all line integrals (F, v, u), (v, u) float32; 0 everywhere where no pattern is certain.
     window: side of the blocks in pixels; the rest as of ``ring_strength``."""
@@ -138,7 +138,9 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
     return _blockwise(image, first, lambda c: c**2 / (c**2 + sigma**2), window)
 
 
-def _blockwise(image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int) -> np.ndarray:
+def _blockwise(
+    image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
+) -> np.ndarray:
     """The mean over all blocks at a pixel of what is left of their cosines' coefficients, by the share that the
     ``guide``'s say; the mean value of a block stays. Blocks of fewer coefficients count more."""
     width = [(window, window + (-n) % window) for n in image.shape]
