@@ -29,8 +29,8 @@ STEPS = (*DEFAULT_STEPS.split(","), DEFAULT_STEPS)
 
 
 def psnr_db(scan: Scan, method: str, rt: Runtime) -> float:
-    volume = reconstruct(scan, method, motion="per-row", device=rt, report=False).volume
-    return float(compare(volume, scan.reference)["psnr_db"])
+    result = reconstruct(scan, method, motion="per-row", device=rt, report=False)
+    return float(compare(result.volume, np.asarray(scan.reference))["psnr_db"])
 
 
 def clean_cells(clean: Scan, method: str, rt: Runtime) -> Iterator[dict[str, Any]]:
