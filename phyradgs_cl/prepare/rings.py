@@ -1,13 +1,14 @@
-"""Rings: what stays in a pixel over all views, because its gain is not what the flats say.
+"""Rings: the error that a pixel's gain adds to its line integrals in every view.
 
-``few``: per frame what a median along the row takes away, and what of that the sectors of a turn have in common (Boin and
-Haibel, Opt. Express 14 (2006) 12071, with averages). It asks no more of a view than that the object moves on, and holds for
-fly-scans. ``fitted``: likewise of what a volume with little total variation, which has few rings, leaves of the frames
-(after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268): patterns of any width, of an object that is on the grid.
-``many``: the sorting of Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396, algorithm 3: over a turn all neighbouring
-pixels see much the same values, in another order.
+Over a full turn the mean of all views is the projection of the object averaged around the axis, which looks the same from
+both sides. What differs between a column and its mirror image at the axis is therefore of the panel. This difference, taken
+from two independent sets of views, says whether there are rings and how strong they are; without them frames stay as they
+are. ``mean`` takes the pattern from the mean over views, which it denoises in overlapping blocks of cosines with the
+strength that was measured: the object is what stands out of the pattern there. ``fitted`` then adds what a volume with
+little total variation leaves of the frames (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,93 +19,188 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.dead import axis_column
 from phyradgs_cl.prepare.masked import unmasked_frames
-from phyradgs_cl.prepare.step import Facts, MakeModel, Model
+from phyradgs_cl.prepare.step import Facts, MakeModel
 
-METHODS = ("auto", "few", "fitted", "many")
-MANY_VIEWS = 180
-_NORMAL_MAD, _MEDIAN_ERROR = 1.4826, 1.2533  # of normal values; a median's standard error over a mean's
-_PASSES, _SECTORS = 3, 15
-_LEAST_ERROR = 0.5  # of the panel's median: no pixel is surer than this
-_SURE = 6.0  # standard errors: a pixel this far off is a ring whatever the others are
-_NEAR_AXIS = 3.0  # columns: here the object's own rings look like the panel's
+METHODS = ("mean", "fitted")
+_NORMAL_MAD = 1.4826
+_LEAST_FRAMES = 8
+_LEAST_PAIRS = 0.25  # of all columns: from here columns are compared with their mirror images
+_LEAST_SHARE = 0.25  # of the variance of the mean's noise: weaker patterns are not worth a change
+_NEGLIGIBLE = 1e-4  # in line integrals: rings of a gain that is 0.01 % off
+_SURE = 12.0  # standard errors, of about 1/√pixels, of the pattern's variance over that of the noise
+_THRESHOLD = 3.5  # standard deviations of the pattern: larger coefficients are the object's
+_SHIFTS = 8  # of the blocks, along each side
+_EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their mean, on a full turn
 
 
 @dataclass(frozen=True)
 class RingOptions:
-    """method: few or many, or auto by the number of views; fitted. window: pixels of the median along a row; wider rings
-    stay, but for ``fitted``."""
+    """method: mean or fitted. window: side in pixels of the blocks of cosines; wider patterns stay, but for ``fitted``."""
 
-    method: str = "auto"
-    window: int = 7
+    method: str = "mean"
+    window: int = 10
 
     def __post_init__(self) -> None:
         checks.one_of("rings.method", self.method, METHODS)
         checks.within("rings.window", self.window, 3, 999)
 
 
-def ring_pattern(frames: np.ndarray, *, window: int = 7, axis_column: float | None = None) -> np.ndarray:
-    """What the pixels add to all line integrals (F, v, u), (v, u) float32: the method ``few``.
+@dataclass(frozen=True)
+class Strength:
+    """Variances, in line integrals squared: of the pattern, of its part that a column shares, and of the noise of the mean
+    over all views. least: variance from which a pattern is certain."""
 
-    Views are taken in sectors of the turn. Of what their medians have in common every pixel gets the share that their
-    scatter says is real (Wiener's, the variance of the pattern from all pixels): structure that stays for some views only is
-    left alone. Pixels far beyond that scatter get all of it, but for those near ``axis_column``.
+    pattern: float
+    column: float
+    noise: float
+    least: float
+
+    @property
+    def is_certain(self) -> bool:
+        return self.pattern > self.least
+
+
+def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_turn: bool = True) -> Strength:
+    """Measures the pattern that all views of line integrals (F, v, u) share and no object makes.
+
+    The pattern's variance is the robust covariance of two sets of views, the even and the odd ones, in a second difference
+    along the row, between columns that mirror each other at ``axis_column`` (None: the middle). On an arc, ``full_turn``
+    False, the sets are its halves, which see the object differently.
     """
-    pattern = np.zeros(frames.shape[1:], np.float32)
-    may_be_object = np.zeros(frames.shape[2], bool)
-    if axis_column is not None:
-        may_be_object = np.abs(np.arange(frames.shape[2]) - axis_column) <= _NEAR_AXIS
-    for _ in range(_PASSES):  # a baseline of frames with fewer rings has fewer rings
-        smooth = scipy.ndimage.median_filter(frames - pattern, size=(1, 1, window), mode="nearest")
-        pattern = _common(frames - smooth, may_be_object)
-    return pattern
+    half = (len(frames) + 1) // 2
+    sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
+    one, other = (_rough(_antisymmetric(part.mean(axis=0, dtype=np.float64), axis_column)) for part in sets)
+    noise, rows = _variance(one - other) / 4, len(one) // 2
+    least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
+    pattern = _covariance(one, other)
+    column = _covariance(one[:rows], other[rows : 2 * rows]) if rows else 0.0
+    return Strength(pattern, float(np.clip(column, 0, max(pattern, 0))), noise, max(least, _NEGLIGIBLE**2))
 
 
-def _common(rest: np.ndarray, may_be_object: np.ndarray) -> np.ndarray:
-    """What the sectors of ``rest`` (F, v, u) share, (v, u) float32, as far as it is sure."""
-    count = min(_SECTORS, len(rest))
-    sectors = np.stack([np.median(part, axis=0) for part in np.array_split(rest, count)])
-    middle = np.median(sectors, axis=0)
-    error = _NORMAL_MAD * np.median(np.abs(sectors - middle), axis=0) * _MEDIAN_ERROR / np.sqrt(count)
-    error = np.maximum(error, _LEAST_ERROR * np.median(error))
-    spread = _NORMAL_MAD * np.median(np.abs(middle - np.median(middle)))
-    signal, noise = max(0.0, float(spread**2 - np.median(error**2))), np.maximum(error**2, 1e-20)
-    sure = 1 - noise * _SURE**2 / np.maximum(middle**2, 1e-20)
-    sure[:, may_be_object] = 0
-    return (middle * np.maximum(signal / (signal + noise), sure)).astype(np.float32)
-
-
-def fitted_pattern(frames: np.ndarray, model: Model, first: np.ndarray) -> np.ndarray:
-    """What the pixels add to all line integrals (F, v, u), (v, u) float32, from a ``first`` guess on: ``fitted``."""
-    pattern, nowhere = first, np.zeros(frames.shape[2], bool)
-    for _ in range(_PASSES):  # a volume of frames with fewer rings has fewer rings
-        left = frames - model.frames(model.regularised(frames - pattern))
-        pattern = _common(left, nowhere)
-    return pattern
-
-
-def sort_rings(frames: np.ndarray, *, window: int = 7) -> np.ndarray:
-    """Line integrals (F, v, u) without rings, float32: the method ``many``."""
-    order = np.argsort(frames, axis=0)
-    ranked = np.take_along_axis(frames, order, axis=0)
-    smooth = scipy.ndimage.median_filter(ranked, size=(1, 1, window), mode="nearest")
-    result = np.empty(frames.shape, np.float32)
-    np.put_along_axis(result, order, smooth.astype(np.float32), axis=0)
-    return result
+def ring_pattern(
+    frames: np.ndarray, *, window: int = 10, axis_column: float | None = None, full_turn: bool = True
+) -> np.ndarray:
+    """What the pixels' gains add to all line integrals (F, v, u), (v, u) float32; 0 everywhere where no pattern is certain.
+    window: side of the blocks in pixels; the rest as of ``ring_strength``."""
+    strength = ring_strength(frames, axis_column=axis_column, full_turn=full_turn)
+    return _pattern(frames, strength, window, axis_column if full_turn else np.inf)
 
 
 def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """The scan without its rings, by the method that is chosen."""
-    method = options.method
-    if method == "auto":
-        method = "many" if scan.frames >= MANY_VIEWS else "few"
+    """The scan without its rings; the scan itself where no pattern is certain."""
     frames = unmasked_frames(scan)
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
-        raise InputError("rings.window", str(options.window), expected, "a little more than the rings are wide")
-    if method == "many":
-        clean = sort_rings(frames, window=options.window)
-    else:
-        pattern = ring_pattern(frames, window=options.window, axis_column=axis_column(scan))
-        clean = frames - (pattern if method == "few" else fitted_pattern(frames, make_model(scan), pattern))
-    change = float(np.sqrt(np.mean((clean - frames).astype(np.float64) ** 2)))
-    return replace(scan, projections=clean), {"method": method, "rms_change": change}
+        raise InputError("rings.window", str(options.window), expected, "state fewer pixels")
+    column, full_turn = axis_column(scan), is_full_turn(scan)
+    strength = ring_strength(frames, axis_column=column, full_turn=full_turn)
+    measured = {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
+    if scan.frames < _LEAST_FRAMES or not strength.is_certain:
+        return scan, {"result": "nothing to do", **measured}
+    pattern = _pattern(frames, strength, options.window, column if full_turn else np.inf)
+    if options.method == "fitted":
+        model = make_model(scan)
+        left = frames - pattern
+        pattern = pattern + (left - model.frames(model.regularised(left))).mean(axis=0)
+    facts = {"result": "removed", **measured, "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
+    return replace(scan, projections=frames - pattern), facts
+
+
+def is_full_turn(scan: Scan) -> bool:
+    """Whether the sources of all views lie evenly around a circle: equally far from their mean."""
+    times_s = scan.frame_start_s + scan.shutter.middle_s
+    sources = np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0][:3] for f in range(scan.frames)])
+    distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
+    return bool(distance.max() < _EQUALLY_FAR * distance.min())
+
+
+def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
+    """The pattern (v, u) float32 of this strength. Both halves of the mean, alike and unlike at the axis, are denoised: the
+    first, of which rings are, has half the pattern's variance."""
+    mean = frames.mean(axis=0, dtype=np.float64)
+    if not strength.is_certain:
+        return np.zeros(mean.shape, np.float32)
+    mirrored = _mirror(mean.shape[1], axis_column)
+    whole = len(mirrored) == mean.shape[1]
+    parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
+    variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
+    rough = sum(part - _denoised(part, variances, window) for part in parts)
+    return np.asarray(rough * strength.pattern / (strength.pattern + strength.noise), np.float32)
+
+
+def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
+    """An image (v, u) without noise of two ``variances``, of each pixel and of each column: coefficients of overlapping
+    blocks of cosines, first those above a threshold, then Wiener's share by these."""
+    sigma = np.full((window, window), variances[0])
+    sigma[0] += window * variances[1]
+    sigma = np.sqrt(np.maximum(sigma, 1e-30))
+    first = _blockwise(image, image, lambda c: (np.abs(c) > _THRESHOLD * sigma).astype(np.float64), window)
+    return _blockwise(image, first, lambda c: c**2 / (c**2 + sigma**2), window)
+
+
+def _blockwise(
+    image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
+) -> np.ndarray:
+    """The mean over all blocks at a pixel of what is left of their cosines' coefficients, by the share that the
+    ``guide``'s say; the mean value of a block stays. Blocks of fewer coefficients count more."""
+    width = [(window, window + (-n) % window) for n in image.shape]
+    padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
+    total, weight = np.zeros_like(padded), np.zeros_like(padded)
+    rows, columns = (n - window for n in padded.shape)
+    starts = range(0, window, max(1, window // _SHIFTS))
+    for v in starts:
+        for u in starts:
+            where = np.s_[v : v + rows, u : u + columns]
+            coefficients, guides = (_cosines(part[where], window) for part in (padded, guiding))
+            share = share_of(guides)
+            share[..., 0, 0] = 1
+            certain = 1 / (share**2).sum(axis=(2, 3), keepdims=True)
+            block = scipy.fft.idctn(share * coefficients, axes=(2, 3), norm="ortho") * certain
+            total[where] += _joined(block)
+            weight[where] += _joined(np.broadcast_to(certain, block.shape))
+    inside = np.s_[window : window + image.shape[0], window : window + image.shape[1]]
+    return total[inside] / weight[inside]
+
+
+def _cosines(image: np.ndarray, window: int) -> np.ndarray:
+    """Coefficients (block v, block u, window, window) of an image (v, u) of whole blocks."""
+    rows, columns = (n // window for n in image.shape)
+    blocks = image.reshape(rows, window, columns, window).swapaxes(1, 2)
+    return np.asarray(scipy.fft.dctn(blocks, axes=(2, 3), norm="ortho"))
+
+
+def _joined(blocks: np.ndarray) -> np.ndarray:
+    rows, columns, window, _ = blocks.shape
+    return blocks.swapaxes(1, 2).reshape(rows * window, columns * window)
+
+
+def _mirror(columns: int, axis_column: float | None) -> np.ndarray:
+    """The mirror image at the axis of those columns, counted from the first, that have one; of as many columns in a row."""
+    twice = columns - 1 if axis_column is None else 2 * axis_column
+    if not abs(twice) < 2 * columns:
+        return np.zeros(0, int)
+    mirrored = round(twice) - np.arange(columns)
+    return mirrored[(mirrored >= 0) & (mirrored < columns)]
+
+
+def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
+    """What of a mean over views (v, u) differs from its mirror image at the axis, over √2: white noise keeps its variance.
+    All of it where few columns have a mirror image."""
+    mirrored = _mirror(mean.shape[1], axis_column)
+    if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
+        return mean
+    return (mean[:, mirrored[::-1]] - mean[:, mirrored]) / np.sqrt(2)
+
+
+def _rough(image: np.ndarray) -> np.ndarray:
+    """The second difference along rows, with the variance of white noise kept."""
+    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)
+
+
+def _variance(values: np.ndarray) -> float:
+    return float((_NORMAL_MAD * np.median(np.abs(values - np.median(values)))) ** 2)
+
+
+def _covariance(one: np.ndarray, other: np.ndarray) -> float:
+    """Robust covariance (Gnanadesikan and Kettenring, Biometrics 28 (1972) 81): few pixels at edges do not count."""
+    return (_variance(one + other) - _variance(one - other)) / 4

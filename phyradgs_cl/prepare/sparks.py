@@ -18,6 +18,8 @@ from phyradgs_cl.prepare.step import Facts, MakeModel
 _NORMAL_MAD = 1.4826
 _SHARPNESS = 0.3  # of a spark's height, above what lies on either side
 _NEAR, _FAR = 2, 3  # pixels away
+_MOVED = 5  # pixels in which the next frame shows a gap of the object again
+_SHOWN_AGAIN = 0.5  # of a spark's height
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _AROUND = np.ones((3, 3), bool)
 
@@ -41,9 +43,16 @@ def find_sparks(
     """Pixels of line integrals (F, v, u) that are brighter than any object can make them, bool (F, v, u).
 
     Those below the median of 5 × 5 by ``least`` and by ``threshold`` deviations (from the median of 9 × 9 absolute
-    differences), in every direction, in groups of at most ``pixels``.
+    differences), in every direction, in groups of at most ``pixels``. What the frames before and after both show nearby, at
+    least half as high, is a gap of the object that moves on.
     """
-    return np.stack([_in_frame(frame, threshold, least, pixels) for frame in frames])
+    found = np.stack([_in_frame(frame, threshold, least, pixels) for frame in frames])
+    for f in np.flatnonzero(found.any(axis=(1, 2))) if len(frames) > 2 else ():
+        height = _height(frames[f])
+        around = (frames[f - 1 if f else 1], frames[f + 1 if f + 1 < len(frames) else f - 1])
+        shown = [scipy.ndimage.maximum_filter(_height(frame), size=_MOVED) for frame in around]
+        found[f] &= np.minimum(*shown) < _SHOWN_AGAIN * height
+    return found
 
 
 def mask_sparks(scan: Scan, options: SparkOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
@@ -55,8 +64,7 @@ def mask_sparks(scan: Scan, options: SparkOptions, make_model: MakeModel) -> tup
 
 
 def _in_frame(frame: np.ndarray, threshold: float, least: float, pixels: int) -> np.ndarray:
-    middle = scipy.ndimage.median_filter(frame, size=5, mode="nearest")
-    height = middle - frame
+    height = _height(frame)
     bright = height > least
     if not bright.any():
         return bright
@@ -67,6 +75,11 @@ def _in_frame(frame: np.ndarray, threshold: float, least: float, pixels: int) ->
     groups, count = scipy.ndimage.label(bright, _AROUND)
     sizes = np.bincount(groups.ravel(), minlength=count + 1)
     return bright & (sizes[groups] <= pixels)
+
+
+def _height(frame: np.ndarray) -> np.ndarray:
+    """How much brighter than the median of 5 × 5 pixels a frame (v, u) is, in line integrals."""
+    return np.asarray(scipy.ndimage.median_filter(frame, size=5, mode="nearest") - frame)
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:

@@ -1,0 +1,107 @@
+"""What the usual steps of ``prepare`` cost clean scans, and what ``rings`` gives back where there are some.
+
+    python benchmarks/prepare_clean.py docs/results/prepare_clean.jsonl --phantoms VOLUMES/cthead_128.h5 ...
+    python benchmarks/prepare_clean.py docs/results/prepare_clean.jsonl --table
+
+A line per volume, views, method and cell: a step on the clean scan, or rings of some percent. ``lost_db`` is 0 without a run
+where the step leaves the frames bit for bit. Lines that are there are not made again. docs/prepare.md has the table.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scans import append, lines_of, read_lines
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.api import compare, prepare, reconstruct, simulate
+from phyradgs_cl.prepare import DEFAULT_STEPS
+from phyradgs_cl.runtime import Runtime
+
+VIEWS = (25, 75, 180, 360, 720)
+RINGED_VIEWS = (180, 360, 720)
+RINGS = (0.01, 0.02, 0.05)
+STEPS = (*DEFAULT_STEPS.split(","), DEFAULT_STEPS)
+
+
+def psnr_db(scan: Scan, method: str, rt: Runtime) -> float:
+    result = reconstruct(scan, method, motion="per-row", device=rt, report=False)
+    return float(compare(result.volume, np.asarray(scan.reference))["psnr_db"])
+
+
+def clean_cells(clean: Scan, method: str, rt: Runtime) -> Iterator[dict[str, Any]]:
+    for steps in STEPS:
+        prepared = prepare(clean, steps, device=rt)
+        same = np.array_equal(prepared.projections, clean.projections) and bool(prepared.valid.all())
+        lost = 0.0 if same else psnr_db(clean, method, rt) - psnr_db(prepared, method, rt)
+        yield {"steps": steps, "unchanged": same, "lost_db": round(lost, 3)}
+
+
+def ringed_cells(
+    clean: Scan, method: str, rt: Runtime, usual: dict[str, Any], spreads: list[float]
+) -> Iterator[dict[str, Any]]:
+    clean_db = cache(lambda: psnr_db(clean, method, rt))
+    for spread in spreads:
+        ringed = simulate(**usual, rings=spread)
+        ringed_db, prepared_db = psnr_db(ringed, method, rt), psnr_db(prepare(ringed, DEFAULT_STEPS, device=rt), method, rt)
+        regained = (prepared_db - ringed_db) / max(clean_db() - ringed_db, 1e-2)
+        values = {"clean_db": clean_db(), "ringed_db": ringed_db, "prepared_db": prepared_db, "regained": regained}
+        yield {"steps": f"rings {spread}", **{key: round(value, 3) for key, value in values.items()}}
+
+
+def table(lines: list[dict[str, Any]]) -> str:
+    """Markdown: a row per method and number of views; the worst volume of each cell."""
+    text = ["| method | views | volumes | clean: frames changed, most lost | 1 % regained | 2 % | 5 % |", "| --- " * 7 + "|"]
+    for method, views in sorted({(line["method"], line["views"]) for line in lines}):
+        of = [line for line in lines if (line["method"], line["views"]) == (method, views)]
+        clean = [line for line in of if "lost_db" in line]
+        changed, lost = sum(not line["unchanged"] for line in clean), max((line["lost_db"] for line in clean), default=0)
+        shares = [[line["regained"] for line in of if line["steps"] == f"rings {spread}"] for spread in RINGS]
+        cells = [f"{100 * min(s):.0f} to {100 * max(s):.0f} %" if s else "" for s in shares]
+        volumes = len({line["phantom"] for line in of})
+        text.append(f"| {method} | {views} | {volumes} | {changed} of {len(clean)}, {lost:.3f} dB | {' | '.join(cells)} |")
+    return "\n".join(text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("results", type=Path, help="a file of one line of JSON per run")
+    parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"], help="names, or files of volumes")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--detector", type=int, default=96)
+    parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
+    parser.add_argument("--rings", type=float, nargs="*", default=RINGS, help="spreads of gains; none: clean scans alone")
+    parser.add_argument("--methods", nargs="+", default=["fdk"])
+    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
+    given = parser.parse_args()
+    if given.table:
+        print(table(lines_of(given.results)))
+        return
+    rt = Runtime()
+    for views in given.views:
+        for phantom in given.phantoms:
+            usual = {
+                "phantom": phantom, "size": given.size, "detector": given.detector, "views": views, "device": rt,
+                "exposure_deg": 0.8 * 360 / views, "noise": "tigre", "dose": 28_000, "seed": 3,
+            }  # fmt: skip
+            for method in given.methods:
+                place = {"size": given.size, "detector": given.detector, "phantom": Path(phantom).stem}
+                place |= {"views": views, "method": method}
+                done = {line["steps"] for line in read_lines(given.results) if place.items() <= line.items()}
+                spreads = [s for s in given.rings if views in RINGED_VIEWS and f"rings {s}" not in done]
+                if set(STEPS) <= done and not spreads:
+                    continue
+                clean = simulate(**usual)
+                cells = [] if set(STEPS) <= done else [clean_cells(clean, method, rt)]
+                cells.append(ringed_cells(clean, method, rt, usual, spreads))
+                for line in (line for cell in cells for line in cell):
+                    print(json.dumps({**place, **line}), flush=True)
+                    append(given.results, {**place, **line})
+
+
+if __name__ == "__main__":
+    main()
