@@ -1,5 +1,6 @@
 """reconstruct: a scan file to a volume file."""
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -67,7 +68,8 @@ def reconstruct_command(
             with finish_despite_interrupt():
                 report.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
-    how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s"
+    used_s = time.process_time()  # of the command so far, its start included: other programs do not change it
+    how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     say(f"{written}: {how}{scores(metrics)}")
     if TUNED in result.facts:
         say(tuned_words(result.facts[TUNED]))
