@@ -91,7 +91,7 @@ def draw(truth: np.ndarray, volumes: Mapping[str, np.ndarray], path: Path) -> No
         for each in (above, below):
             each.set_axis_off()
     axes[1, 0].set_axis_off()
-    words = f"one slice of {truth.shape[0]}³ voxels\nby the default method:\n25 frames, each exposed\nwhile the gantry turns 14.4°"
+    words = "one slice by the default\nmethod: 25 frames, each\nexposed while the gantry\nturns by 14.4°"
     axes[1, 0].text(0.5, 0.5, words, ha="center", va="center", transform=axes[1, 0].transAxes)
     bar = figure.colorbar(shown, ax=axes[1, 1:], label="1/mm", shrink=0.9)
     bar.ax.tick_params(labelsize=8)
