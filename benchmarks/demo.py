@@ -90,6 +90,7 @@ def draw(truth: np.ndarray, volumes: Mapping[str, np.ndarray], path: Path) -> No
         below.set_title("" if volume is truth else "its error")
         for each in (above, below):
             each.set_axis_off()
+    axes[1, 0].clear()  # the truth has no error
     axes[1, 0].set_axis_off()
     words = "one slice by the default\nmethod: 25 frames, each\nexposed while the gantry\nturns by 14.4°"
     axes[1, 0].text(0.5, 0.5, words, ha="center", va="center", transform=axes[1, 0].transAxes)

@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.api import calibrate, reconstruct, simulate
 from phyradgs_cl.calibrate.moved import Change, moved
 from phyradgs_cl.check import check
+from phyradgs_cl.drawing import CURVE
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.runtime import Runtime
 
@@ -41,13 +42,13 @@ def check_figure() -> Figure:
     stated = _with_offset(right, 0.0)
     found = check(stated, Runtime(None))
     fixed = _with_offset(right, found.offset_mm)
-    figure = Figure(figsize=(10.5, 3.1), layout="constrained")
+    figure = Figure(figsize=(10.5, 2.55), layout="constrained")
     axes = figure.subplots(1, 3)
     for each, scan, title in zip(axes, (stated, fixed), ("as stated", "after --fix-offset"), strict=False):
         _draw_slice(each, reconstruct(scan).volume, right, title)
     _draw_slice(axes[-1], right.reference, right, "truth")
     (line,) = (one for one in found.findings if one.question == "centre of rotation")
-    figure.suptitle(f"{line.verdict}: {line.question}: {line.text}", fontsize=_SMALL, color="#b3261e")
+    figure.suptitle(f"{line.verdict}: {line.question}: {line.text}", fontsize=_SMALL, color=CURVE)
     return figure
 
 
