@@ -35,10 +35,10 @@ def methods_figure() -> Figure:
     return figure
 
 
-def check_figure() -> Figure:
+def check_figure(size: int = 48) -> Figure:
     """A scan whose panel stands three pixels beside where it is stated, before and after `check --fix-offset`."""
-    offset_mm = 3 * 4 / 96
-    right = simulate("foot", size=48, detector=96, noise="tigre", dose=1e4, detector_offset_mm=(0.0, offset_mm))
+    offset_mm = 3 * 4 / (2 * size)
+    right = simulate("foot", size=size, detector=2 * size, noise="tigre", dose=1e4, detector_offset_mm=(0.0, offset_mm))
     stated = _with_offset(right, 0.0)
     found = check(stated, Runtime(None))
     fixed = _with_offset(right, found.offset_mm)
@@ -52,23 +52,29 @@ def check_figure() -> Figure:
     return figure
 
 
-def calibrate_figure() -> Figure:
+def calibrate_figure(size: int = 48) -> Figure:
     """A scan whose panel is shifted, rolled and tilted, and nothing of it stated, before and after `calibrate`."""
-    right = simulate("foot", size=48, detector=96, noise="tigre", dose=1e4)
-    offset_mm, roll_deg, tilt_deg = 2.5 * 4 / 96, 2.0, 1.0
-    stated = moved(right, Change(offset_u_mm=-offset_mm, roll_rad=-np.deg2rad(roll_deg), tilt_v_rad=-np.deg2rad(tilt_deg)))
+    right = simulate("foot", size=size, detector=2 * size, noise="tigre", dose=1e4)
+    planted = {"offset-u": 2.5 * 4 / (2 * size), "roll": 2.0, "tilt-v": 1.0}  # mm, degrees
+    shift_mm, roll_rad, tilt_rad = planted["offset-u"], np.deg2rad(planted["roll"]), np.deg2rad(planted["tilt-v"])
+    stated = moved(right, Change(offset_u_mm=-shift_mm, roll_rad=-roll_rad, tilt_v_rad=-tilt_rad))
     found = calibrate(stated, "offset,roll,tilt")
-    print(found)
-    figure = Figure(figsize=(10.5, 5.6), layout="constrained")
+    figure = Figure(figsize=(10.5, 4.4), layout="constrained")
     axes = figure.subplots(2, 3)
     limit = float(np.percentile(np.abs(found.before[0]), 99.5))
     states = ((stated, found.before, "before"), (found.scan, found.after, "after"))
     for row, (scan, residuals, when), rms in zip(axes, states, found.residual_rms, strict=True):
         row[0].imshow(residuals[0], cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower")
-        row[0].set_title(f"residual of a frame, {when}\nRMS of all: {rms:.2g}", fontsize=_SMALL)
-        _draw_slice(row[1], reconstruct(scan).volume, right, f"fista {when}")
+        row[0].set_title(f"{when}: residual of frame 0 (RMS of all {rms:.2g})", fontsize=_SMALL)
         row[0].set_axis_off()
+        _draw_slice(row[1], reconstruct(scan).volume, right, when)
     _draw_slice(axes[0, 2], right.reference, right, "truth")
+    lines = [f"{'':9s}{'stated':>7s}{'found':>17s}{'true':>6s}"]
+    for one in (one for one in found.parameters if one.name in planted):
+        value = "-" if one.found is None else f"{one.found:.3f} ± {one.deviation:.3f}"
+        true = one.stated + planted[one.name]
+        lines.append(f"{one.name:9s}{one.stated:7.3f}{value:>17s}{true:6.3g} {one.unit}")
+    axes[1, 2].text(0.5, 0.5, "\n".join(lines), family="monospace", fontsize=8.5, ha="center", va="center")
     axes[1, 2].set_axis_off()
     return figure
 

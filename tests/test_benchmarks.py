@@ -37,7 +37,7 @@ def test_the_demo(tmp_path) -> None:
     *rows, total = (line.split() for line in lines[start + 1 : start + 6])
     assert [row[:2] for row in rows] == [["fdk", "ignored"], ["fista", "ignored"], ["fista", "known"], ["phyradgs", "known"]]
     used_s = [float(row[-1]) for row in rows]
-    assert 0 < min(used_s) and sum(used_s) < float(total[-1])  # the simulation is in the sum
+    assert min(used_s) > 0 and sum(used_s) < float(total[-1])  # the simulation is in the sum
     assert float(rows[2][2]) > float(rows[1][2])  # PSNR, motion known and ignored
     assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
 

@@ -1,6 +1,7 @@
-"""The figure of the conventions shows what the package does: tested with projector, shutter and TIFF import."""
+"""Figures show what the package does: conventions, by projector, shutter and TIFF import; what check and calibrate mend."""
 
 import importlib.util
+import re
 from pathlib import Path
 from types import ModuleType
 
@@ -16,13 +17,17 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 SHADOW, IN_FILE = (4, 6), (1, 6)  # as read off docs/images/conventions.png
 
 
-@pytest.fixture(scope="module")
-def drawn() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("conventions_of_the_docs", DOCS / "conventions.py")
+def module_of_the_docs(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"{name}_of_the_docs", DOCS / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def drawn() -> ModuleType:
+    return module_of_the_docs("conventions")
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +82,12 @@ def test_readout_direction_1_reads_row_0_first(drawn) -> None:
     for direction, first in ((1, 0), (-1, rows - 1)):
         opens_s = Shutter(1.0, 0.5, direction=direction).line_windows_s(rows)[:, 0]
         assert opens_s.argmin() == first
+
+
+@pytest.mark.parametrize("name", ["check", "calibrate"])
+def test_the_picture_after_is_better_than_the_one_before(name) -> None:
+    """At a third of the size that the documentation shows."""
+    figure = getattr(module_of_the_docs("examples_drawn"), f"{name}_figure")(size=16)
+    scores = re.findall(r": (\S+) dB", " ".join(axes.get_title() for axes in figure.axes))
+    before_db, after_db = map(float, scores)
+    assert after_db > before_db + 2
