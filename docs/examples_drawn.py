@@ -64,17 +64,19 @@ def calibrate_figure(size: int = 48) -> Figure:
     limit = float(np.percentile(np.abs(found.before[0]), 99.5))
     states = ((stated, found.before, "before"), (found.scan, found.after, "after"))
     for row, (scan, residuals, when), rms in zip(axes, states, found.residual_rms, strict=True):
-        row[0].imshow(residuals[0], cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower")
+        low, high = (round(share * len(residuals[0])) for share in (0.15, 0.85))
+        shown = residuals[0][low:high, low:high]
+        row[0].imshow(shown, cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower", interpolation="nearest")
         row[0].set_title(f"{when}: residual of frame 0 (RMS of all {rms:.2g})", fontsize=_SMALL)
         row[0].set_axis_off()
         _draw_slice(row[1], reconstruct(scan).volume, right, when)
     _draw_slice(axes[0, 2], right.reference, right, "truth")
     lines = [f"{'':9s}{'stated':>7s}{'found':>17s}{'true':>6s}"]
     for one in (one for one in found.parameters if one.name in planted):
-        value = "-" if one.found is None else f"{one.found:.3f} ± {one.deviation:.3f}"
+        value = "-" if one.found is None else f"{one.found:.4f} ± {one.deviation:.4f}"
         true = one.stated + planted[one.name]
         lines.append(f"{one.name:9s}{one.stated:7.3f}{value:>17s}{true:6.3g} {one.unit}")
-    axes[1, 2].text(0.5, 0.5, "\n".join(lines), family="monospace", fontsize=8.5, ha="center", va="center")
+    axes[1, 2].text(0, 0.5, "\n".join(lines), family="monospace", fontsize=8.5, linespacing=1.8, va="center")
     axes[1, 2].set_axis_off()
     return figure
 
