@@ -1,18 +1,26 @@
-"""Draws the figures of the documentation into docs/images: python docs/figures.py
+"""Draws the figures of the documentation into docs/images: python docs/figures.py [NAME ...], by default all.
 
 shutter.png        exposure and readout of one frame, and its cut into strips and sub-intervals
 exact_splat.png    a wide Gaussian's line integrals: the exact splat and the affine one against quadrature
 time_sampling.png  what the simulator's time samples and the micro-views leave of a fine average
 
+conventions.png    gantry, panel and image file: how angle, rows and columns belong together
+
 scan_plot.png      what ``scan.plot`` draws
 result_plot.png    what ``result.plot`` draws
+methods.png        one scan by five methods
+check.png          a wrong offset, and after ``check --fix-offset``
+calibrate.png      a panel that stands elsewhere, and after ``calibrate``
 
-The first three are computed on the spot in float64 and need no OpenCL device.
+The first four are computed on the spot in float64 and need no OpenCL device. ``make demo`` draws demo.png.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
+from conventions import conventions_figure
+from examples_drawn import calibrate_figure, check_figure, methods_figure
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Polygon
@@ -209,11 +217,21 @@ def api_figures() -> None:
     save(reconstruct(scan, "fista-tv", motion="per-row", iterations=60).plot(scan, frame=3), "result_plot.png")
 
 
+FIGURES = {
+    "shutter": shutter_figure,
+    "splat": splat_figure,
+    "sampling": sampling_figure,
+    "api": api_figures,
+    "conventions": lambda: save(conventions_figure(), "conventions.png"),
+    "methods": lambda: save(methods_figure(), "methods.png"),
+    "check": lambda: save(check_figure(), "check.png"),
+    "calibrate": lambda: save(calibrate_figure(), "calibrate.png"),
+}
+
+
 def main() -> None:
-    shutter_figure()
-    splat_figure()
-    sampling_figure()
-    api_figures()
+    for name in sys.argv[1:] or FIGURES:
+        FIGURES[name]()
 
 
 if __name__ == "__main__":

@@ -30,6 +30,18 @@ def facts_of(tmp_path: Path, name: str, *words: str) -> dict:
     return facts
 
 
+def test_the_demo(tmp_path) -> None:
+    """Its table has every run with its motion, and its processor seconds are counted in the sum."""
+    lines = run("demo.py", str(tmp_path), "--quick").splitlines()
+    start = next(n for n, line in enumerate(lines) if line.startswith("method "))
+    *rows, total = (line.split() for line in lines[start + 1 : start + 6])
+    assert [row[:2] for row in rows] == [["fdk", "ignored"], ["fista", "ignored"], ["fista", "known"], ["phyradgs", "known"]]
+    used_s = [float(row[-1]) for row in rows]
+    assert min(used_s) > 0 and sum(used_s) < float(total[-1])  # the simulation is in the sum
+    assert float(rows[2][2]) > float(rows[1][2])  # PSNR, motion known and ignored
+    assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_scaling(tmp_path) -> None:
     figure = tmp_path / "figure.png"
     facts = facts_of(tmp_path, "scaling.py", "--figure", str(figure))

@@ -1,5 +1,6 @@
 """reconstruct: a scan file to a volume file."""
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -69,7 +70,8 @@ def reconstruct_command(
             with finish_despite_interrupt():
                 report.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
-    how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s"
+    used_s = time.process_time()  # of the command so far, its start included: other programs do not change it
+    how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
     if TUNED in result.facts:

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,14 @@ def test_the_error_on_held_out_pixels_is_said_and_kept(scan, reconstructed, caps
     assert facts_of(volume)["input"]["holdout"] == 3
     reconstructed(scan, "--method", "fdk")
     assert "held-out" not in capsys.readouterr().out
+
+
+def test_seconds_of_the_processor_are_printed(scan, reconstructed, capsys):
+    """Those of the process up to then, whatever else the machine does."""
+    before_s = time.process_time()
+    reconstructed(scan, "--method", "fdk")
+    said = re.search(r"fdk, \S+ s \((\S+) s of processor time\), PSNR", capsys.readouterr().out)
+    assert before_s - 0.05 <= float(said[1]) <= time.process_time() + 0.05  # rounded to a tenth
 
 
 def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, capsys):
