@@ -164,7 +164,7 @@ def test_errors_about_motion_offer_what_the_method_has() -> None:
 
 
 def test_counts_belong_to_the_motions_that_have_them() -> None:
-    models = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row"}, "segments": {"exact"}}
+    models = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row", "own-times"}, "segments": {"exact"}}
     pairs = [(method, name) for method in METHODS for name in motions_of(method)]
     for (method, name), (key, having) in product(pairs, models.items()):
         changes = {"motion": name, key: 3}
