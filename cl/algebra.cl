@@ -36,6 +36,17 @@ __kernel void add_scaled(
         store_some(fmax(load_some(x + at, rest) + scale * load_some(y + at, rest), (vf)(least)), result + at, rest);
 }
 
+/* x + scale (x - y) */
+__kernel void extrapolate(
+    __global const float *x, const float scale, __global const float *y, const long count, __global float *result)
+{
+    const long at = (long)get_global_id(0) * LANES, rest = count - at;
+    if (rest <= 0)
+        return;
+    const vf here = load_some(x + at, rest);
+    store_some(here + scale * (here - load_some(y + at, rest)), result + at, rest);
+}
+
 /* x + scale y z, at least `least` */
 __kernel void add_product(
     __global const float *x, const float scale, __global const float *y, __global const float *z, const float least,
@@ -142,6 +153,23 @@ __kernel void dot_parts(
     vwide sum = wide_zero();
     for (long at = first; at < stop; at += step)
         sum = plus_product(sum, load_some(x + at, count - at), load_some(y + at, count - at));
+    sum_t own = sum_of_lanes(sum);
+    TREE(scratch, own, sum_add)
+    if (get_local_id(0) == 0)
+        parts[get_group_id(0)] = own;
+}
+
+/* of each group: sum of (x - y) (y - z), items as for dot_parts */
+__kernel void turn_parts(
+    __global const float *x, __global const float *y, __global const float *z, const long count, const long first_by,
+    const long step, const long span, __local sum_t *scratch, __global sum_t *parts)
+{
+    const long first = first_by * get_global_id(0), stop = min(first + span, count);
+    vwide sum = wide_zero();
+    for (long at = first; at < stop; at += step) {
+        const vf middle = load_some(y + at, count - at);
+        sum = plus_product(sum, load_some(x + at, count - at) - middle, middle - load_some(z + at, count - at));
+    }
     sum_t own = sum_of_lanes(sum);
     TREE(scratch, own, sum_add)
     if (get_local_id(0) == 0)

@@ -90,12 +90,6 @@ __kernel void dct_excess(
     }
 }
 
-/* Blocks along one axis that cover voxel ``at``. */
-static inline int covering(const int at, const int count)
-{
-    return min(at, count - EDGE) - max(0, at - EDGE + 1) + 1;
-}
-
 /* Plain (nz, ny, nx) to the padded layout. */
 __kernel void dct_start(
     __global const float *volume, const int4 shape, const int pitch, __global float *padded, __global float *excess)
@@ -108,16 +102,27 @@ __kernel void dct_start(
     excess[IMAGE_GUARD + row * pitch + x] = 0.0f;
 }
 
+/* A work-item takes LANES voxels of a row. */
 __kernel void dct_end(
     __global const float *volume, __global const float *excess, const int4 shape, const int pitch, const int nonnegative,
     __global float *result)
 {
-    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
+    const int x = (int)get_global_id(0) * LANES, y = (int)get_global_id(1), z = (int)get_global_id(2);
     if (x >= shape.x)
         return;
-    const size_t row = (size_t)z * shape.y + y;
-    const int blocks = covering(x, shape.x) * covering(y, shape.y) * covering(z, shape.z);
-    const float mean = TURNS * excess[IMAGE_GUARD + row * pitch + x] / (float)max(blocks, 1);
-    const float value = volume[row * shape.x + x] - mean;
-    result[row * shape.x + x] = nonnegative ? fmax(value, 0.0f) : value;
+    const size_t row = (size_t)z * shape.y + y, first = row * shape.x + x;
+    /* blocks along each axis that cover a voxel */
+    const vf at = (float)x + V_IOTA;
+    const vf along = min(at, (float)(shape.x - EDGE)) - max(at - (float)(EDGE - 1), 0.0f) + 1.0f;
+    const int across = (min(y, shape.y - EDGE) - max(0, y - EDGE + 1) + 1) * (min(z, shape.z - EDGE) - max(0, z - EDGE + 1) + 1);
+    const vf mean = TURNS * V_LOAD(excess + IMAGE_GUARD + row * pitch + x) / max(along * (float)across, 1.0f);
+    if (x + LANES <= shape.x) {
+        const vf value = V_LOAD(volume + first) - mean;
+        V_STORE(nonnegative ? max(value, 0.0f) : value, result + first);
+        return;
+    }
+    for (int k = 0; k < shape.x - x; ++k) {
+        const float value = volume[first + k] - ((const float *)&mean)[k];
+        result[first + k] = nonnegative ? fmax(value, 0.0f) : value;
+    }
 }

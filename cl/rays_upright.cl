@@ -8,23 +8,26 @@
 
 #define TURN 16 /* voxels along x and z that are turned at a time */
 
-/* (z, y, x) as rays.cl has it to guard, then (y, x, pitch) with a border of BORDER in y and x; zeros must be there */
+/* (z, y, x), voxel (z, y, x) at from.x + y from.y + z from.z + x, to guard, then (y, x, pitch) with a border of BORDER in y
+   and x; zeros must be there */
 __kernel void turn_upright(
-    __global const float *volume, const int4 shape, const int volume_pitch,
-    const int column_pitch,
+    __global const float *volume, const long4 from, const int4 shape, const int column_pitch,
     __global float *columns)
 {
     const int x0 = (int)get_global_id(0) * TURN, y = (int)get_global_id(1), z0 = (int)get_global_id(2) * TURN;
     if (x0 >= shape.x || z0 >= shape.z)
         return;
-    const size_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
-    __global const float *from = volume + IMAGE_GUARD + (z0 + BORDER) * sz + (y + BORDER) * sy + x0;
+    __global const float *voxels = volume + from.x + y * from.y + z0 * from.z + x0;
     __global float *to = columns + IMAGE_GUARD
                          + ((y + BORDER) * (size_t)(shape.x + 2 * BORDER) + x0 + BORDER) * column_pitch + z0;
     const int wide = min(TURN, shape.x - x0), high = min(TURN, shape.z - z0);
     float tile[TURN][TURN];
     for (int z = 0; z < high; ++z)
-        vstore16(vload16(0, from + z * sz), 0, tile[z]);
+        if (wide == TURN)
+            vstore16(vload16(0, voxels + z * from.z), 0, tile[z]);
+        else
+            for (int x = 0; x < wide; ++x)
+                tile[z][x] = voxels[z * from.z + x];
     for (int x = 0; x < wide; ++x)
         for (int z = 0; z < high; ++z)
             to[(size_t)x * column_pitch + z] = tile[z][x];

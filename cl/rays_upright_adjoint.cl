@@ -30,6 +30,8 @@ static inline int2 columns_of_box(__global const float *matrix, const int stride
 RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int first, const int stop, const int along_x)
 {
     const int begins = is_along_x(cell, u, first) == along_x;
+    if (!LEAN)
+        return begins ? (int2)(first, stop) : (int2)(first, first);
     if (begins == (is_along_x(cell, u, stop - 1) == along_x))
         return begins ? (int2)(first, stop) : (int2)(first, first);
     int low = first, high = stop - 1; /* the border lies between them */
@@ -50,6 +52,7 @@ typedef struct {
     int is_cut;                     /* whether lines of the slot beyond the last have the other main axis */
     int v_first, v_stop, last_start; /* last_start: where two vectors may begin at most */
     float sb, sc, da, ea, dz, ez;
+    float inv;                      /* 1 / da; of a column that leans one over its turn in the rays' plane */
     float across, along;
     float first, last;              /* slope (dz + v ez) / (da + v ea) of the first and the last line */
     float dense;                    /* largest number of lines to a voxel, times ahead */
@@ -66,14 +69,24 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
     r.dz = ray_component(cell, 2, u, 0);
     r.ea = LEAN ? cell[RAY_EV + !along_x] : 0.0f;
     r.ez = cell[RAY_EV + 2];
-    const float db = ray_component(cell, along_x, u, 0), eb = LEAN ? cell[RAY_EV + along_x] : 0.0f;
-    const float turn = r.da * r.ez - r.dz * r.ea, inv = 1.0f / turn;
-    r.across = LEAN ? (db * r.ez - r.dz * eb) * inv : db * (1.0f / r.da);
-    r.along = LEAN ? (r.da * eb - db * r.ea) * inv : 0.0f;
+    const float db = ray_component(cell, along_x, u, 0), over_first = r.dz + (float)lines.x * r.ez;
+    const float over_last = r.dz + (float)(lines.y - 1) * r.ez;
+#if LEAN
+    const float eb = cell[RAY_EV + along_x];
     const float near = r.da + (float)lines.x * r.ea, far = r.da + (float)(lines.y - 1) * r.ea;
-    r.first = (r.dz + (float)lines.x * r.ez) / near;
-    r.last = (r.dz + (float)(lines.y - 1) * r.ez) / far;
-    r.dense = fmax(near * near, far * far) * fabs(inv);
+    r.inv = 1.0f / (r.da * r.ez - r.dz * r.ea);
+    r.across = (db * r.ez - r.dz * eb) * r.inv;
+    r.along = (r.da * eb - db * r.ea) * r.inv;
+    r.first = over_first / near;
+    r.last = over_last / far;
+    r.dense = fmax(near * near, far * far) * fabs(r.inv);
+#else
+    r.inv = 1.0f / r.da;
+    r.across = db * r.inv;
+    r.along = 0.0f;
+    r.first = over_first * r.inv;
+    r.last = over_last * r.inv;
+#endif
     return r;
 }
 
@@ -174,12 +187,12 @@ RAY_INLINE void lines_onto(const column_t r, const float ahead, const int z_firs
     const float h0 = fma(r.first, ahead, r.sc) - (float)z_first, h1 = fma(r.last, ahead, r.sc) - (float)z_first;
     const int from = (int)clamp(floor(fmin(h0, h1) - LINE_MARGIN), 0.0f, (float)nz);
     const int stop = (int)clamp(ceil(fmax(h0, h1) + LINE_MARGIN) + 1.0f, 0.0f, (float)nz);
-    /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
-    const float per = r.dense / fmax(fabs(ahead), LEAST_SLOPE);
-    float reach = per * (1.0f + 4.0f * fabs(r.ea / r.da) * per) + LINE_MARGIN;
 #define COLUMN(j) ((j) < 0 || (j) >= nb ? beyond : sums + (j) * step)
     const int j = (int)floor(fmin(b0, b1));
 #if LEAN
+    /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
+    const float per = r.dense / fmax(fabs(ahead), LEAST_SLOPE);
+    float reach = per * (1.0f + 4.0f * fabs(r.ea / r.da) * per) + LINE_MARGIN;
     /* lines are spaced evenly but for a little in the middle */
     const float bottom = (float)(z_first + from), top = (float)(z_first + stop);
     const float line0 = line_at(r, ahead, bottom), line1 = line_at(r, ahead, top);
@@ -216,8 +229,8 @@ RAY_INLINE void lines_onto(const column_t r, const float ahead, const int z_firs
 #else
     const float far_share = b_zero - (float)j, near_share = 1.0f - far_share;
     float *low = COLUMN(j), *high = COLUMN(j + 1);
-    const float inv = 1.0f / r.da, slope = r.ez * inv * ahead, at_zero = fma(r.dz * inv, ahead, r.sc);
-    const float per_slope = fabs(slope) > LEAST_SLOPE ? 1.0f / slope : 1.0f / LEAST_SLOPE;
+    const float slope = r.ez * r.inv * ahead, at_zero = fma(r.dz * r.inv, ahead, r.sc);
+    const float per_slope = 1.0f / (fabs(slope) > LEAST_SLOPE ? slope : LEAST_SLOPE), reach = fabs(per_slope) + LINE_MARGIN;
     const int most = (int)fmin(2.0f * reach, (float)(r.v_stop - r.v_first - 1)) + 1;
     for (int z = from; z < stop; z += LANES) {
         const vf height = V_IOTA + (float)(z_first + z), below = at_zero - height;
@@ -252,7 +265,8 @@ __kernel void rays_upright_adjoint(
     const int slot_columns, const int slot_pitch, const long slots_floats,
     __global const float *cells, __global const int *slots, const int slot_count,
     __global const float *matrices, const int matrix_stride, /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
-    const int4 shape, const int4 origin, const int volume_pitch,
+    const int4 shape, const int4 origin,
+    const long4 to,                   /* voxel (z, y, x) at to.x + y to.y + z to.z + x */
     const int add,
     __global float *volume)
 {
@@ -262,14 +276,13 @@ __kernel void rays_upright_adjoint(
         return;
     const int nx = min(ADJOINT_X, shape.x - x_first), ny = min(ADJOINT_Y, shape.y - y_first);
     const int nz = min(ADJOINT_Z, shape.z - z_first);
-    const size_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
-    __global float *voxels = volume + IMAGE_GUARD + (z_first + BORDER) * sz + (y_first + BORDER) * sy + x_first;
+    __global float *voxels = volume + to.x + z_first * to.z + y_first * to.y + x_first;
     float sums[ADJOINT_Y][ADJOINT_X][ADJOINT_Z + LANES], beyond[ADJOINT_Z + LANES]; /* a vector may begin at any voxel */
     for (int z = 0; z < ADJOINT_Z + LANES; ++z) {
         beyond[z] = 0.0f;
         for (int y = 0; y < ADJOINT_Y; ++y)
             for (int x = 0; x < ADJOINT_X; ++x)
-                sums[y][x][z] = add && z < nz && y < ny && x < nx ? voxels[z * sz + y * sy + x] : 0.0f;
+                sums[y][x][z] = add && z < nz && y < ny && x < nx ? voxels[z * to.z + y * to.y + x] : 0.0f;
     }
     const float4 first = (float4)(origin.x + x_first - 1, origin.y + y_first - 1, origin.z + z_first - 1, 0);
     const float4 last = first + (float4)(nx + 1, ny + 1, nz + 1, 0);
@@ -307,5 +320,5 @@ __kernel void rays_upright_adjoint(
     for (int z = 0; z < nz; ++z)
         for (int y = 0; y < ny; ++y)
             for (int x = 0; x < nx; ++x)
-                voxels[z * sz + y * sy + x] = sums[y][x][z];
+                voxels[z * to.z + y * to.y + x] = sums[y][x][z];
 }

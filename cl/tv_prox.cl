@@ -24,6 +24,7 @@ __kernel void tv_dual(
     __global const float *volume, const int4 shape, const float4 axis_weight,
     const float step,                 /* one over the Lipschitz constant times the weight */
     const float momentum,
+    __global const float *from,       /* moved; at first the dual itself */
     __global float *dual, __global float *moved)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
@@ -35,9 +36,9 @@ __kernel void tv_dual(
     const float gx = x + 1 < shape.x ? axis_weight.x * (volume[at + 1] - here) : 0.0f;
     const float gy = y + 1 < shape.y ? axis_weight.y * (volume[at + row] - here) : 0.0f;
     const float gz = z + 1 < shape.z ? axis_weight.z * (volume[at + slice] - here) : 0.0f;
-    const float qx = moved[at] + step * gx;
-    const float qy = moved[at + plane] + step * gy;
-    const float qz = moved[at + 2 * plane] + step * gz;
+    const float qx = from[at] + step * gx;
+    const float qy = from[at + plane] + step * gy;
+    const float qz = from[at + 2 * plane] + step * gz;
     const float shrink = 1.0f / fmax(1.0f, sqrt(qx * qx + qy * qy + qz * qz));
     const float px = qx * shrink, py = qy * shrink, pz = qz * shrink;
     moved[at] = px + momentum * (px - dual[at]);

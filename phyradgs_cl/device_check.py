@@ -109,7 +109,9 @@ def _algebra(rt: Runtime) -> Iterator[Comparison]:
     yield there.numpy(there.add_product(x, y, z, 0.7)), host.add_product(a, b, c, 0.7), VALUE
     yield there.numpy(there.multiply(x, y)), host.multiply(a, b), VALUE
     yield there.numpy(there.reciprocal(x, 0.01)), host.reciprocal(a, 0.01), VALUE
+    yield there.numpy(there.extrapolate(x, y, 0.7)), host.extrapolate(a, b, 0.7), VALUE
     yield np.array(there.inner(x, y)), np.array(host.inner(a, b)), VALUE
+    yield np.array(there.turn(x, y, z)), np.array(host.turn(a, b, c)), VALUE
     yield np.array(there.largest(x, absolute=True)), np.array(host.largest(a, absolute=True)), VALUE
     yield there.numpy(there.descend(x, y, 0.7)), a - 0.7 * b / host.norm(b), VALUE
     out = rt.zeros(64)

@@ -65,7 +65,8 @@ class DctProx:
             arguments = self._padded, *layout, shift, np.float32(threshold), self._excess
             rt.launch(self._excess_of, blocks, *arguments, group=rt.group())
         clip = np.int32(nonnegative)
-        rt.launch(self._end, voxels, volume, self._excess, *layout, clip, result, group=by_voxel)
+        items = (-(-nx // rt.lanes), ny, nz)
+        rt.launch(self._end, items, volume, self._excess, *layout, clip, result, group=rt.group(on_cpu=min(items[0], 8)))
 
 
 def dct_prox(volume: np.ndarray, threshold: float, turn: int, *, nonnegative: bool) -> np.ndarray:

@@ -55,25 +55,25 @@ class TvProx:
         self, observed: DeviceArray, weight: float, iterations: int, nonnegative: bool, result: DeviceArray
     ) -> None:
         if weight <= 0:
-            self._primal(observed, 0.0, nonnegative, result)
+            self._primal(observed, self._dual, 0.0, nonnegative, result)
             return
-        self.rt.copy(self._dual, self._moved)
         step = np.float32(1 / (_lipschitz(self.axis_weights) * weight))
-        t = 1.0
+        t, start = 1.0, self._dual
         for _ in range(iterations):
-            self._primal(observed, weight, nonnegative, result)
+            self._primal(observed, start, weight, nonnegative, result)
             t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
             self._launch(
                 self._dual_step, result, self._shape4, self._weights4, step, np.float32((t - 1) / t_next),
-                self._dual, self._moved,
+                start, self._dual, self._moved,
             )  # fmt: skip
-            t = t_next
-        self.rt.copy(self._dual, self._moved)
-        self._primal(observed, weight, nonnegative, result)
+            t, start = t_next, self._moved
+        self._primal(observed, self._dual, weight, nonnegative, result)
 
-    def _primal(self, observed: DeviceArray, weight: float, nonnegative: bool, result: DeviceArray) -> None:
+    def _primal(
+        self, observed: DeviceArray, dual: DeviceArray, weight: float, nonnegative: bool, result: DeviceArray
+    ) -> None:
         self._launch(
-            self._primal_step, observed, self._moved, self._shape4, self._weights4, np.float32(weight),
+            self._primal_step, observed, dual, self._shape4, self._weights4, np.float32(weight),
             np.int32(nonnegative), result,
         )  # fmt: skip
 

@@ -48,6 +48,10 @@ class Space(Interface, Generic[A]):
         """x + ``scale`` y, clipped at 0 if asked."""
         ...
 
+    def extrapolate(self, x: A, y: A, scale: float) -> A:
+        """x + ``scale`` (x − y)."""
+        ...
+
     def add_product(self, x: A, y: A, z: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
         """x + ``scale`` y z element by element, clipped at 0 if asked."""
         ...
@@ -62,6 +66,10 @@ class Space(Interface, Generic[A]):
 
     def inner(self, x: A, y: A) -> float:
         """Σ x y, summed in float64 or as accurately."""
+        ...
+
+    def turn(self, x: A, y: A, z: A) -> float:
+        """Σ (x − y) (y − z), above 0 where the step from z to y goes on to x."""
         ...
 
     def norm(self, x: A) -> float:
@@ -102,6 +110,10 @@ class HostSpace:
         result: np.ndarray = x + np.float32(scale) * y
         return np.maximum(result, 0, out=result) if nonnegative else result
 
+    def extrapolate(self, x: np.ndarray, y: np.ndarray, scale: float) -> np.ndarray:
+        result: np.ndarray = x + np.float32(scale) * (x - y)
+        return result
+
     def add_product(
         self, x: np.ndarray, y: np.ndarray, z: np.ndarray, scale: float = 1.0, *, nonnegative: bool = False
     ) -> np.ndarray:
@@ -117,6 +129,9 @@ class HostSpace:
 
     def inner(self, x: np.ndarray, y: np.ndarray) -> float:
         return inner(x, y)
+
+    def turn(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
+        return inner(x - y, y - z)
 
     def norm(self, x: np.ndarray) -> float:
         return norm(x)
@@ -186,6 +201,9 @@ class DeviceSpace:
     ) -> DeviceArray:
         return self._each("add_scaled", x, np.float32(scale), y, _least(nonnegative))
 
+    def extrapolate(self, x: DeviceArray, y: DeviceArray, scale: float) -> DeviceArray:
+        return self._each("extrapolate", x, np.float32(scale), y)
+
     def add_product(
         self, x: DeviceArray, y: DeviceArray, z: DeviceArray, scale: float = 1.0, *, nonnegative: bool = False
     ) -> DeviceArray:
@@ -200,12 +218,16 @@ class DeviceSpace:
 
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """x − ``step`` y/‖y‖, and x where y is 0; nothing comes back."""
-        self._sum(y, y, self._whole)
+        self._sum("dot_parts", self._whole, y, y)
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
     def inner(self, x: DeviceArray, y: DeviceArray) -> float:
-        self._sum(x, y, self._whole)
+        self._sum("dot_parts", self._whole, x, y)
+        return self._read(self._whole)
+
+    def turn(self, x: DeviceArray, y: DeviceArray, z: DeviceArray) -> float:
+        self._sum("turn_parts", self._whole, x, y, z)
         return self._read(self._whole)
 
     def norm(self, x: DeviceArray) -> float:
@@ -214,7 +236,7 @@ class DeviceSpace:
     def sum_squares(self, arrays: Iterable[DeviceArray]) -> float:
         count = 0
         for count, x in enumerate(arrays, start=1):
-            self._sum(x, x, self._total, add=count > 1)
+            self._sum("dot_parts", self._total, x, x, add=count > 1)
         return self._read(self._total) if count else 0.0
 
     def largest(self, x: DeviceArray, *, absolute: bool = False) -> float:
@@ -235,9 +257,9 @@ class DeviceSpace:
         values = self.rt.download(number)
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
-    def _sum(self, x: DeviceArray, y: DeviceArray, whole: DeviceArray, *, add: bool = False) -> None:
-        """Σ x y into a number, or onto it, on the device alone."""
-        groups = self._reduce("dot_parts", x, y, scratch=8)
+    def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
+        """A sum over arrays, whose first level the named kernel makes, into a number, or onto it, on the device alone."""
+        groups = self._reduce(name, *arrays, scratch=8)
         group = self.rt.group(1, _GPU_GROUP)
         kernel = self.rt.kernel("algebra", "dot_whole")
         scratch = self.rt.local(8 * group)

@@ -131,7 +131,7 @@ def test_voxels_miss_more_the_larger_they_are_and_less_behind_a_blur(scan) -> No
     smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (2.0 / 24)  # voxels, half-way from the axis to the side
     blurred = misfit_of(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
     assert blurred.noise == fine.noise
-    assert blurred.edges_mm == pytest.approx(fine.edges_mm / np.sqrt(1 + smeared), rel=0.01)
+    assert blurred.edges_mm == pytest.approx(fine.edges_mm / np.sqrt(1 + smeared), rel=0.02)
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:

@@ -24,6 +24,7 @@ def test_elementwise_functions_are_their_twins(any_rt, shape) -> None:
     for name, call in {
         "add": lambda s, x, y, z: s.add(x, y, -0.7),
         "add, clipped": lambda s, x, y, z: s.add(x, y, nonnegative=True),
+        "extrapolate": lambda s, x, y, z: s.extrapolate(x, y, 0.3),
         "add_product": lambda s, x, y, z: s.add_product(x, y, z, 0.3),
         "add_product, clipped": lambda s, x, y, z: s.add_product(x, y, z, nonnegative=True),
         "multiply": lambda s, x, y, z: s.multiply(x, y),
@@ -45,8 +46,10 @@ def test_the_last_axes_are_repeated(any_rt) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_numbers_are_their_twins(any_rt, shape) -> None:
-    space, (x, y, _) = DeviceSpace(any_rt), operands(shape)
+    space, (x, y, z) = DeviceSpace(any_rt), operands(shape)
     a, b = space.array(x), space.array(y)
+    steps = HOST.norm(x - y) * HOST.norm(y - z)
+    assert abs(space.turn(a, b, space.array(z)) - HOST.turn(x, y, z)) <= SUMS * steps
     scale = HOST.norm(x) * HOST.norm(y)
     assert abs(space.inner(a, b) - HOST.inner(x, y)) <= SUMS * scale
     assert space.norm(a) == pytest.approx(HOST.norm(x), rel=SUMS)

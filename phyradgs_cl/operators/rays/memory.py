@@ -136,13 +136,20 @@ class RayMemory:
         else:
             result[brick.box] = layout.inside(self.rt.download(on_device))
 
-    def turned(self, layout: RayLayout, volume: DeviceArray) -> DeviceArray | None:
-        """A whole volume with z along a row, where there is room for that."""
-        if not self._columns_bytes:
-            return None
+    @property
+    def has_columns(self) -> bool:
+        """Whether there is room for a whole volume with z along a row, after ``plan``."""
+        return self._columns_bytes > 0
+
+    def turned(self, volume: Array) -> DeviceArray:
+        """A whole volume (z, y, x) with z along a row: a device array as it lies, a host's by way of the padded layout."""
         if self._columns is None:
             self._columns = self.rt.zeros(self._columns_bytes // 4)
-        turn_volume(self.rt, layout, volume, self._columns)
+        if isinstance(volume, DeviceArray):
+            turn_volume(self.rt, self.layout, (volume, Strides.plain(volume.shape)), self._columns)
+        else:
+            layout, padded = self.write_volume(volume, self._bricks[0])
+            turn_volume(self.rt, layout, (padded, layout.volume_strides), self._columns)
         return self._columns
 
     def slots(self) -> DeviceArray:

@@ -17,6 +17,7 @@ from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
 from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
+from phyradgs_cl.runtime.layout import Strides
 
 
 class LinearOperator(Interface):
@@ -113,16 +114,17 @@ class RayOperator:
         if average != "log" and len(bricks) > 1:
             self._project_layers(volume, average, result)
             return
+        columns = self.memory.turned(volume) if self._is_upright and self.memory.has_columns else None
         for part in self.memory.batches(len(self._chosen)):
+            frames = self.memory.frames(part.stop - part.start)
+            if columns is not None:
+                self._project_upright(columns, part, average, frames)
+                self.memory.read_frames(frames, result, part, self._readout.axis)
+                continue
             listed = self._listed(part)
-            frames = self.memory.frames(listed.size)
             for k, brick in enumerate(bricks):
                 if k + part.start == 0 or len(bricks) > 1:
                     layout, on_device = self.memory.write_volume(volume, brick)
-                    columns = self.memory.turned(layout, on_device) if self._is_upright else None
-                if columns is not None:
-                    self._project_upright(layout, columns, part, average, frames)
-                    continue
                 launch_forward(
                     self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
                 )
@@ -133,11 +135,10 @@ class RayOperator:
         """Whether the upright kernels serve, and the memory planned for has room for slots."""
         return self._upright is not None and self.memory.slot_frames > 0
 
-    def _project_upright(
-        self, layout: RayLayout, columns: DeviceArray, part: slice, average: str, frames: DeviceArray
-    ) -> None:
+    def _project_upright(self, columns: DeviceArray, part: slice, average: str, frames: DeviceArray) -> None:
         """Some frames of a turned volume, into their padded memory."""
         assert self._upright is not None and self._poses is not None
+        layout = self.memory.layout
         start, *steps = layout.pixel_strides(self._readout.axis)
         for first, slots in self._slots_of(part):
             target = frames, np.array([start + first * steps[-1], *steps], np.int64)
@@ -185,6 +186,9 @@ class RayOperator:
         parts = list(self.memory.batches(len(self._chosen)))
         for k, brick in enumerate(bricks):
             layout, on_device = self.memory.volume(brick)
+            target = on_device, layout.volume_strides
+            if self._is_upright and isinstance(result, DeviceArray):
+                target = result, Strides.plain(result.shape, brick.start)
             for part in parts:
                 add, axis = part.start > 0, self._readout.axis
                 if k == 0 or len(parts) > 1:
@@ -192,15 +196,16 @@ class RayOperator:
                     write = self.memory.write_turned if turns else self.memory.write_frames
                     there = write(frames, part, axis)
                 if self._is_upright:
-                    self._adjoint_upright(layout, part, there, on_device, add)
+                    self._adjoint_upright(layout, part, there, target, add)
                     continue
                 launch_adjoint(self.rt, layout, self._cells, self._listed(part), there, on_device, add=add)
-            self.memory.read_volume(layout, on_device, result)
+            if target[0] is on_device:
+                self.memory.read_volume(layout, on_device, result)
 
     def _adjoint_upright(
-        self, layout: RayLayout, part: slice, frames: DeviceArray, volume: DeviceArray, add: bool
+        self, layout: RayLayout, part: slice, frames: DeviceArray, target: tuple[DeviceArray, Strides], add: bool
     ) -> None:
-        """Sums some frames, with detector columns as rows, onto a padded volume."""
+        """Sums some frames, with detector columns as rows, onto a volume with these strides."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._readout.axis)
@@ -208,7 +213,7 @@ class RayOperator:
             like = self.detector_shape, pitch_mm, first * each
             split_slots(self.rt, self._cells, self._poses, slots, frames, *like, there)
             launch_upright_adjoint(
-                self.rt, layout, self._upright, self._poses, slots, there, volume, add=add or first > 0
+                self.rt, layout, self._upright, self._poses, slots, there, target, add=add or first > 0
             )
 
     def subset(self, frames: Sequence[int]) -> "RayOperator":

@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.layout import BORDER, RayLayout, ray_constants
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses
 from phyradgs_cl.runtime import DeviceArray, Runtime
-from phyradgs_cl.runtime.layout import GUARD, pitch_of
+from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _LINES = 128  # of a detector column for a work-item
 _FEWEST_LINES = 8  # to a pose: fewer do not pay for its slot
@@ -120,13 +120,13 @@ def launch_upright_adjoint(
     poses: UprightPoses,
     slots: Slots,
     values: DeviceArray,
-    volume: DeviceArray,
+    target: tuple[DeviceArray, Strides],
     *,
     add: bool = False,
 ) -> None:
-    """Sums slots, as ``split_slots`` leaves them, onto a padded volume."""
+    """Sums slots, as ``split_slots`` leaves them, onto a volume with these strides."""
     nz, ny, nx = layout.brick.shape
-    shape, origin, pitch, *_ = layout.constants()
+    shape, origin, *_ = layout.constants()
     x, y, z = _OWNED
     rt.launch(
         rt.kernel("rays_upright_adjoint", "rays_upright_adjoint", ADJOINT_X=x, ADJOINT_Y=y, ADJOINT_Z=z, **slots.defines),
@@ -142,20 +142,22 @@ def launch_upright_adjoint(
         np.int32(poses.matrix_stride),
         shape,
         origin,
-        pitch,
+        target[1].vector(),
         np.int32(add),
-        volume,
+        target[0],
         group=1,
     )
 
 
-def turn_volume(rt: Runtime, layout: RayLayout, volume: DeviceArray, columns: DeviceArray) -> None:
-    """A padded volume (z, y, x) to ``columns`` (y, x, z), whose padding is zero already and stays so."""
+def turn_volume(
+    rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
+) -> None:
+    """A volume (z, y, x) with these strides to ``columns`` (y, x, z), whose padding is zero already and stays so."""
     nz, ny, nx = layout.grid.shape
-    shape, _, pitch, *_ = layout.constants()
+    shape, *_ = layout.constants()
     size = (-(-nx // _TURN), ny, -(-nz // _TURN))
     kernel = rt.kernel("rays_upright", "turn_upright", **_defines(Upright(_LINES, False)))
-    rt.launch(kernel, size, volume, shape, pitch, np.int32(pitch_of(nz)), columns, group=1)
+    rt.launch(kernel, size, volume[0], volume[1].vector(), shape, np.int32(pitch_of(nz)), columns, group=1)
 
 
 def _defines(how: Upright) -> dict[str, int]:

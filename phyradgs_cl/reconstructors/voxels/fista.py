@@ -225,15 +225,15 @@ class Fista:
 
     def _step_of(self, subset: System, weight: float) -> Any:
         """The residual of the subset's frames just before its step."""
-        system, space = self.system, self.system.space
+        space = self.system.space
         following = float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
         beta = (self.momentum - 1) / following
-        point = space.add(self.volume, system.less(self.volume, self.previous), beta)
+        point = space.extrapolate(self.volume, self.previous, beta)
         residual = subset.residual(point)
         gradient = subset.back(subset.weighed(residual))
         moved = space.add(point, gradient, len(self.subsets) / self.curvature)
         volume = self.prior(space, moved, weight / self.curvature, nonnegative=self.options.nonnegative)
-        uphill = space.inner(system.less(point, volume), system.less(volume, self.volume)) > 0
+        uphill = space.turn(point, volume, self.volume) > 0
         self.previous, self.volume = self.volume, volume
         self.momentum = 1.0 if uphill else following
         return residual

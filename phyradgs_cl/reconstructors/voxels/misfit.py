@@ -14,6 +14,7 @@ from phyradgs_cl.detector import noise_behind
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Space
 
+_SPREAD = 2.83  # standard deviations of an exposure's times that count as its length: from the first of five to the last
 _EDGES = 0.09  # voxels' sides by which a ray is wrong at edges
 
 
@@ -36,9 +37,12 @@ def misfit_of(scan: Scan, motion: Motion) -> Misfit:
 def _blur_mm(scan: Scan, motion: Motion) -> float:
     """How far a line's exposure smears what lies half-way between the volume's middle and its side."""
     cells = motion.cells(scan, scan.frames // 2).still()
-    first, stop = cells.line_cells()[cells.lines // 2]
-    sources_mm = cells.pose[first:stop, :3] - scan.grid.offset_mm[::-1]
-    turn_rad = np.linalg.norm(np.ptp(sources_mm, axis=0)) / np.linalg.norm(sources_mm[0])
+    line = cells.lines // 2
+    serving = [c for c, lines in enumerate(cells.ranges) if lines.start <= line < lines.stop]
+    weights = np.array([cells.weights_of(c)[line - cells.line_start[c]] for c in serving])
+    sources_mm = cells.pose[serving, :3] - scan.grid.offset_mm[::-1]
+    apart_mm = sources_mm - weights @ sources_mm / weights.sum()
+    turn_rad = _SPREAD * np.sqrt(weights @ (apart_mm**2).sum(1) / weights.sum()) / np.linalg.norm(sources_mm[0])
     return float(turn_rad * max(scan.grid.size_mm[1:]) / 4)
 
 
