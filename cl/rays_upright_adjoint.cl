@@ -116,6 +116,18 @@ RAY_INLINE near_lines_t near_lines(const column_t r, const vf line, const float 
     return found;
 }
 
+#ifdef V_LOOKUP
+/* Where two vectors of lines begin for the lower and for the upper half of the voxels; negative where they do not hold them. */
+RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, const int most)
+{
+    const int begin = V_FIRST(lines.first), before = V_END_OF_HALF(lines.first);
+    const int middle = V_HALF(lines.first), end = V_LAST(lines.first);
+    const int2 base = (int2)(min(min(begin, before), r.last_start), min(min(middle, end), r.last_start));
+    const int fit = max(begin, before) + most - base.x <= 2 * LANES && max(middle, end) + most - base.y <= 2 * LANES;
+    return fit ? base : (int2)(-1);
+}
+#endif
+
 #if LEAN
 /* line first + m of each lane; values are 0 beyond the last */
 #define GATHER_SLOPE(m) GATHER(r.slopes, min(lines.first + (m), r.v_stop - 1))
@@ -245,6 +257,20 @@ RAY_INLINE void lines_onto(const column_t r, const float ahead, const int z_firs
             for (int m = 0; m < most; ++m, v += 1.0f, place += 1) {
                 const vf weight = max(1.0f - fabs(fma(v, (vf)(slope), below)), 0.0f);
                 sum = fma(V_LOOKUP(v0, v1, place), weight, sum);
+            }
+            V_STORE(fma((vf)(near_share), sum, V_LOAD(low + z)), low + z);
+            V_STORE(fma((vf)(far_share), sum, V_LOAD(high + z)), high + z);
+            continue;
+        }
+        const int2 base = bases_of_halves(r, lines, most);
+        if (base.x >= 0) { /* more lines than voxels */
+            const vf v0 = V_LOAD(r.values + base.x), v1 = V_LOAD(r.values + base.x + LANES);
+            const vf w0 = V_LOAD(r.values + base.y), w1 = V_LOAD(r.values + base.y + LANES);
+            const vi is_upper = VI_IOTA >= LANES / 2;
+            vi place = lines.first - VI_PICK(base.x, base.y, is_upper);
+            for (int m = 0; m < most; ++m, v += 1.0f, place += 1) {
+                const vf weight = max(1.0f - fabs(fma(v, (vf)(slope), below)), 0.0f);
+                sum = fma(V_PICK(V_LOOKUP(v0, v1, place), V_LOOKUP(w0, w1, place), is_upper), weight, sum);
             }
         } else
 #endif

@@ -44,14 +44,20 @@ typedef LANE_TYPE(int, LANES) vi;
 #if LANES == 4
 #define V_IOTA ((vf)(0, 1, 2, 3))
 #define V_LAST(v) ((v).s3)
+#define V_END_OF_HALF(v) ((v).s1)
+#define V_HALF(v) ((v).s2)
 static inline float v_sum(vf v) { float2 b = v.lo + v.hi; return b.x + b.y; }
 #elif LANES == 8
 #define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7))
 #define V_LAST(v) ((v).s7)
+#define V_END_OF_HALF(v) ((v).s3)
+#define V_HALF(v) ((v).s4)
 static inline float v_sum(vf v) { float4 a = v.lo + v.hi; float2 b = a.lo + a.hi; return b.x + b.y; }
 #else
 #define V_IOTA ((vf)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #define V_LAST(v) ((v).sf)
+#define V_END_OF_HALF(v) ((v).s7)
+#define V_HALF(v) ((v).s8)
 static inline float v_sum(vf v)
 {
     float8 c = v.lo + v.hi;
