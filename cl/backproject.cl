@@ -3,6 +3,7 @@
    be a brick of the grid, with its first voxel at `origin`. Twins: operators/twins/backproject.py.
      backproject          any pose; a work-item takes LANES voxels along x and walks the views
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
+     backproject_leaning  columns that lean a little, as every calibrated panel's do
      backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes one voxel */
 #include "common/lanes.h"
 
@@ -111,6 +112,79 @@ __kernel void backproject_upright(
             const float v = shift + step * z;
             const int row = (int)v; /* rounding may leave v a hair below 0, where the cast still gives 0 */
             sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
+        }
+    }
+    for (int z = 0; z < count; ++z)
+        target[z * slice] = sum[z];
+}
+
+/* Samples of a turned image's column at rows v, of which two vectors hold all, or by gathers. */
+#ifdef V_LOOKUP
+#define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
+    ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
+            : lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv))
+static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
+static inline vf lerp_lookup(const vf lower, const vf upper, const vi place, const vf share)
+{
+    return lerp_of(V_LOOKUP(lower, upper, place), V_LOOKUP(lower, upper, place + 1), share);
+}
+#else
+#define COLUMN_SAMPLES(column, least, place, wv, fits) lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv)
+static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
+#endif
+
+/* As backproject_upright, where the detector column, the depth and the rows change a little along z: LANES voxels lie between
+   two detector columns, or pass from one to the next. */
+__kernel void backproject_leaning(
+    __global const float *projections, __global const float *matrices, __global const float *weights,
+    const int views, const int rows, const int width, const int image_pitch, const long image_step,
+    const int4 shape, const int4 origin, const int volume_pitch,
+    const int block,
+    __global float *volume)
+{
+    if (get_global_id(0) >= shape.x)
+        return;
+    const int x = (int)get_global_id(0) + origin.x, y = (int)get_global_id(1) + origin.y;
+    const int below = (int)get_global_id(2) * block, first = below + origin.z, count = min(block, shape.z - below);
+    const size_t slice = (size_t)shape.y * volume_pitch;
+    __global float *target = volume + IMAGE_GUARD + below * slice + get_global_id(1) * volume_pitch + get_global_id(0);
+    float sum[BLOCK_VOXELS + LANES];
+    for (int z = 0; z < count; ++z)
+        sum[z] = target[z * slice];
+    for (int f = 0; f < views; ++f) {
+        __global const float *m = matrices + (size_t)f * 12;
+        const float depth_0 = m[8] * x + (m[9] * y + m[10] * first + m[11]);
+        const float u_0 = m[0] * x + (m[1] * y + m[2] * first + m[3]), v_0 = m[4] * x + (m[5] * y + m[6] * first + m[7]);
+        __global const float *image = projections + f * image_step + IMAGE_GUARD;
+        for (int k = 0; k < count; k += LANES) {
+            const vf z = V_IOTA + (float)k, inv = 1.0f / fma(z, (vf)(m[10]), (vf)(depth_0));
+            const vf u = fma(z, (vf)(m[2]), (vf)(u_0)) * inv, v = fma(z, (vf)(m[6]), (vf)(v_0)) * inv;
+            const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (inv > 0.0f);
+            if (!V_ANY(inside))
+                continue;
+            const vf vs = V_PICK(0.0f, v, inside);
+            const vi row = min(V_INT(vs), max(rows - 2, 0));
+            const vf wv = vs - V_FLOAT(row), weight = weights[f] * inv * inv;
+            const float u0 = clamp(V_FIRST(u), 0.0f, (float)(width - 1)), u1 = clamp(V_LAST(u), 0.0f, (float)(width - 1));
+            const int from = min((int)fmin(u0, u1), max(width - 2, 0)), to = min((int)fmax(u0, u1), max(width - 2, 0));
+            const float v0 = V_FIRST(v), v1 = V_LAST(v);
+            const int fits = fabs(v1 - v0) < (float)(2 * LANES - 3);
+            const int least = clamp((int)clamp(fmin(v0, v1), 0.0f, (float)rows), 0, max(rows + 1 - 2 * LANES, 0));
+            const vi place = fits ? max(row, least) : row;
+            __global const float *a = image + (size_t)from * image_pitch, *b = a + (width > 1 ? image_pitch : 0);
+            const vf low = COLUMN_SAMPLES(a, least, place, wv, fits);
+            vf value, high = COLUMN_SAMPLES(b, least, place, wv, fits);
+            if (from == to)
+                value = fma(u - (float)from, high - low, low);
+            else {
+                value = max(1.0f - fabs(u - (float)from), 0.0f) * low + max(1.0f - fabs(u - (float)(from + 1)), 0.0f) * high;
+                for (int column = from + 2; column <= to + 1; ++column) {
+                    b += image_pitch;
+                    high = COLUMN_SAMPLES(b, least, place, wv, fits);
+                    value += max(1.0f - fabs(u - (float)column), 0.0f) * high;
+                }
+            }
+            V_STORE(V_LOAD(sum + k) + V_PICK(0.0f, weight * value, inside), sum + k);
         }
     }
     for (int z = 0; z < count; ++z)

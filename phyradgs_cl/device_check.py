@@ -218,7 +218,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
 
 def _backprojections(rt: Runtime) -> Iterator[Comparison]:
     frames, weight, angles = _noise((3, *SHAPE), 7), np.array([0.5, 0.8, 1.0]), np.array([0.0, 1.3, 2.9])
-    for tilt in (0.0, 0.05):
+    for tilt in (0.0, 0.02, 0.6):
         pose = GEOMETRY.pose(angles)
         pose[:, 9:12] += tilt * pose[:, 6:9]
         yield backproject(rt, frames, pose, weight, GRID), backprojection(frames, pose, weight, GRID), VALUE

@@ -22,6 +22,7 @@ _VIEWS_SHARE = 0.25  # of the room
 _BLOCK_VOXELS = 128  # along z for a work-item of the upright kernel
 _COLUMN_ROWS = 512  # detector rows that such a block may meet
 _UPRIGHT = 1e-7  # of the depth: how far u or depth may move over the whole height
+_MOST_LEAN = 0.25  # columns to a row, along z: further the general kernel is faster
 _Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
@@ -32,10 +33,11 @@ def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.nda
     device where the frames are.
     """
     matrices = voxel_matrices(pose, grid)
-    block = 0 if rt.pixel_items else _upright_block(matrices, grid)
+    block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = _Views(frames, bool(block), matrices, weight)
     if block:
-        volume = _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, block, *where))
+        name = "backproject_leaning" if leans else "backproject_upright"
+        volume = _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, block, *where))
     else:
         volume = _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
     return cast(SameArray, volume)
@@ -154,30 +156,36 @@ def _lines(rt: Runtime, across: np.int32, images: _Arguments, brick: Brick, volu
     rt.launch(kernel, (nx, ny, nz), *images, *_volume_shape(brick), across, volume, group=group)
 
 
-def _upright(rt: Runtime, block: int, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _upright(rt: Runtime, name: str, block: int, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
     """``images`` are transposed: the width that they tell is the number of rows."""
     nz, ny, nx = brick.shape
     defines = {"IMAGE_GUARD": GUARD, "BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
-    kernel = rt.kernel("backproject", "backproject_upright", **defines)
+    kernel = rt.kernel("backproject", name, **defines)
     image, table, weights, views, columns, rows, *rest = images
     data = (image, table, weights, views, rows, columns, *rest)
     rt.launch(kernel, (nx, ny, -(-nz // block)), *data, *_volume_shape(brick), np.int32(block), volume)
 
 
-def _upright_block(matrices: np.ndarray, grid: Grid) -> int:
-    """Voxels along z that a work-item of the upright kernel may take; 0 where it does not apply.
+def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
+    """Voxels along z that a work-item of the upright kernels may take, 0 where they do not apply; whether columns lean.
 
-    It needs u and depth (rows 0 and 2 of a matrix) that do not change with z, and every voxel before the source.
+    Upright columns have u and depth (rows 0 and 2 of a matrix) that do not change with z. Every voxel has to be before the
+    source.
     """
     nz, ny, nx = grid.shape
-    corners = np.array([[x, y, 0, 1] for x in (0, nx - 1) for y in (0, ny - 1)])
+    corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1)])
     depth = matrices[:, 8:12] @ corners.T
-    if depth.min() <= 0 or np.abs(matrices[:, [2, 10]]).max() * nz > _UPRIGHT * depth.min():
-        return 0
+    if depth.min() <= 0:
+        return 0, False
+    leans = bool(np.abs(matrices[:, [2, 10]]).max() * nz > _UPRIGHT * depth.min())
+    at = np.einsum("fij,kj->fki", matrices.reshape(-1, 3, 4), corners)
+    u, v = at[..., 0] / depth, at[..., 1] / depth
+    if leans and (np.abs(np.diff(u)[:, ::2]) > _MOST_LEAN * np.abs(np.diff(v)[:, ::2])).any():
+        return 0, False
     rows_per_voxel = (np.abs(matrices[:, 6:7]) / depth).max()
     if np.abs(matrices[:, 6]).min() == 0:
-        return 0
-    return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_per_voxel, 1e-3)))
+        return 0, False
+    return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_per_voxel, 1e-3))), leans
 
 
 def _images(rt: Runtime, views: _Views, part: slice) -> _Arguments:
