@@ -8,7 +8,8 @@ The scanner: source 600 mm from the axis and 1200 mm from the detector, a full t
 the smallest of all runs, for a random volume with a border of zeros (where RTK ends a volume half a voxel earlier) and
 random frames; results are compared away from that border. RTK's adjoint runs on one thread. Processor time, over all
 threads, tells more than wall time where the machine is not quiet. Motion models are compared with each other on a
-rolling shutter that exposes and reads for a whole view.
+rolling shutter that exposes for half a view and reads for the other half; ``gapless`` exposes for a whole view. Panels that
+lean are rolled by 0.3 degrees and tilted by 0.5.
 """
 
 import argparse
@@ -22,8 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, Trajectory
 from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.common_times import common_time_cells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.runtime import Runtime
@@ -32,20 +34,45 @@ VIEWS, PIXELS, VOXELS = 90, 128, 128
 BORDER = 2  # voxels
 SID_MM, SDD_MM, PIXEL_MM, VOXEL_MM = 600.0, 1200.0, 4.0, 2.0
 EXPOSURE_S, READOUT_S, VIEW_S = 0.5, 0.5, 1.0
+ROLL_DEG, TILT_DEG = 0.3, 0.5
 
 Seconds = dict[str, float]
+
+
+class Leaning:
+    """An orbit whose panel is rolled and tilted about its middle."""
+
+    def __init__(self, orbit: CircularOrbit) -> None:
+        self.orbit = orbit
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        pose = self.orbit.pose(frame, time_s).copy()
+        eu, ev = pose[..., 6:9].copy(), pose[..., 9:12].copy()
+        half, roll, tilt = (PIXELS - 1) / 2, np.deg2rad(ROLL_DEG), np.deg2rad(TILT_DEG)
+        middle = pose[..., 3:6] + half * (eu + ev)
+        ev = np.cos(tilt) * ev + np.sin(tilt) * np.cross(eu, ev) / PIXEL_MM
+        pose[..., 6:9], pose[..., 9:12] = np.cos(roll) * eu + np.sin(roll) * ev, np.cos(roll) * ev - np.sin(roll) * eu
+        pose[..., 3:6] = middle - half * (pose[..., 6:9] + pose[..., 9:12])
+        return pose
 
 
 def tables(motion: str) -> list[TimeCells]:
     """The cells of a full turn; ``still`` is a gantry at rest, as RTK knows it."""
     geometry = ConeGeometry(SID_MM, SDD_MM, (PIXELS, PIXELS), (PIXEL_MM, PIXEL_MM))
-    orbit = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / VIEWS / VIEW_S))
+    orbit: Trajectory = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / VIEWS / VIEW_S))
+    if motion.endswith("leaning"):
+        orbit = Leaning(orbit)
     shutter = Shutter(0.0) if motion == "still" else Shutter(EXPOSURE_S, READOUT_S)
+    if motion.startswith("gapless"):
+        shutter = Shutter(VIEW_S, READOUT_S)
     wheres = [(orbit, shutter, frame, frame * VIEW_S, PIXELS) for frame in range(VIEWS)]
     if motion == "micro-views 8x5":
         return [micro_view_cells(*where, 8, 5) for where in wheres]
-    if motion.startswith("per-row"):
-        return [per_line_cells(*where, int(motion.split()[1])) for where in wheres]
+    if motion.startswith("own times"):
+        return [per_line_cells(*where, 5) for where in wheres]
+    if motion.startswith(("per-row", "gapless")):
+        start_s = VIEW_S * np.arange(VIEWS)
+        return [common_time_cells(orbit, shutter, frame, start_s, PIXELS, 5) for frame in range(VIEWS)]
     return [static_cells(*where) for where in wheres]
 
 
@@ -53,7 +80,9 @@ INNER: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "forward": lambda frames: frames,
     "adjoint": lambda volume: volume[BORDER:-BORDER, BORDER:-BORDER, BORDER:-BORDER],
 }
-MOTIONS = ("static", "per-row 1", "per-row 5", "micro-views 8x5")
+MOTIONS = (
+    "static", "static, leaning", "per-row 5", "per-row 5, leaning", "gapless per-row 5", "own times 5", "micro-views 8x5",
+)  # fmt: skip
 
 
 def timed(call: Callable[[], np.ndarray]) -> Seconds:
