@@ -136,5 +136,7 @@ def option_name(field: str) -> str:
 def needed(value: float | None, field: str, subject: str, named: Named) -> float:
     """A length that the file does not carry, from the options, or an InputError that asks for it."""
     if value is None:
-        raise InputError(subject, "nothing", "a length in mm", f"say {named(field)}")
+        parallel = "; of a parallel beam a thousand panel widths, and one more to the detector"
+        remedy = f"say {named(field)}{parallel if field.startswith('source_to') else ''}"
+        raise InputError(subject, "nothing", "a length in mm", remedy)
     return value

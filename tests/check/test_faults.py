@@ -9,8 +9,10 @@ import pytest
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
+from phyradgs_cl.check.questions import consistency
 from phyradgs_cl.check.questions.exposure import check_exposure
 from phyradgs_cl.check.questions.offset import OTHER_CAUSE, Offset, check_offset
+from phyradgs_cl.check.variants import reversed_rotation
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan, write_scan
@@ -81,6 +83,23 @@ def test_an_offset_is_estimated_with_its_uncertainty(rt, clean, pixels) -> None:
     assert suspected(found) == ["centre of rotation"]
     assert found.offset_mm == pytest.approx(-pixels * pitch_mm, abs=0.1 * pitch_mm)
     assert 0 < found.offset_spread_mm < 0.1 * pitch_mm
+
+
+def test_both_senses_are_looked_at_where_few_iterations_do_not_tell(rt, clean, monkeypatch) -> None:
+    """A scan turned the other way may fit a little better at first, and not in the end."""
+    other = reversed_rotation(clean)
+    monkeypatch.setattr(consistency, "reversed_rotation", lambda scan: other)
+    monkeypatch.setattr(consistency, "shifted", lambda scan, pixels: (scan, pixels))
+    first = {id(clean): 1.1, id(other): 1.0}
+    monkeypatch.setattr(
+        consistency, "rough_offset", lambda rt, scan: Offset(2.0, np.nan, np.array([first[id(scan)]]))
+    )
+    monkeypatch.setattr(consistency, "best_offset", lambda rt, scan, rough: Offset(2.5, 0.1, rough.residuals))
+    left = {id(clean): 0.1, id(other): 0.6}
+    monkeypatch.setattr(
+        consistency, "fitted", lambda rt, way: np.array([left[id(way[0])] if isinstance(way, tuple) else 2.0])
+    )
+    assert consistency._best_turning(rt, clean) == (clean, (clean, 2.5), 1.0)
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.375])

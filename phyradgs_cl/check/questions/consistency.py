@@ -30,6 +30,7 @@ _NEEDS_LOOK = 0.1
 _DRAWS = 2
 _FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32
 _CLEAR = 0.5  # squared residual of another order, step or size over the stated one's
+_NEARLY = 1.5  # squared residual after few iterations over the least one's, up to which a sense of rotation is looked at
 _ERRORS = 4.0
 _SYMMETRIC = 2.0  # residual in a random order over the stated one's
 _SAME = 0.03  # residual in a random order over the frames' own spread: less of both, and every angle looks alike
@@ -121,14 +122,16 @@ def _best_turning(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     mean squared residual after the few iterations of ``rough_offset``."""
     ways = [scan, reversed_rotation(scan)]
     roughs = [rough_offset(rt, way) for way in ways]
-    best = int(np.argmin([rough.residuals.sum() for rough in roughs]))
-    least = float(roughs[best].residuals.mean())
-    offset = best_offset(rt, ways[best], roughs[best])
-    if not np.isfinite(offset.pixels):
-        return scan, scan, least
-    other = shifted(ways[best], offset.pixels)
-    is_better = fitted(rt, other).sum() < _CLEAR * fitted(rt, scan).sum()
-    return (ways[best], other, least) if is_better else (scan, scan, least)
+    least = min(float(rough.residuals.mean()) for rough in roughs)
+    best, left = (scan, scan), _CLEAR * fitted(rt, scan).sum()
+    for way, rough in zip(ways, roughs, strict=True):
+        if rough.residuals.mean() > _NEARLY * least:  # in a narrow fan few iterations do not tell the two apart
+            continue
+        offset = best_offset(rt, way, rough)
+        other = shifted(way, offset.pixels if np.isfinite(offset.pixels) else 0.0)
+        if np.isfinite(offset.pixels) and (squares := fitted(rt, other).sum()) < left:
+            best, left = (way, other), squares
+    return *best, least
 
 
 def _whole(rt: Runtime, scan: Scan, as_stated: Scan, rough: float) -> list[Cause]:
