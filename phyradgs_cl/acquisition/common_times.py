@@ -37,7 +37,8 @@ def common_time_cells(
     share = _shares(windows_s, edges_s)
     served = share > 0
     kept = np.flatnonzero(served.any(axis=1))
-    middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), float(np.max(frame_start_s)) + last_s)[kept]
+    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # trajectories may be known to the end of the scan alone
+    middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[kept]
     start = served[kept].argmax(axis=1)
     stop = lines - served[kept, ::-1].argmax(axis=1)
     order = np.argsort(start, kind="stable")
