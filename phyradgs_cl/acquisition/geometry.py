@@ -5,6 +5,7 @@ and from row to row (v̂·dv). Operators take poses, never angles.
 """
 
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 
@@ -19,7 +20,8 @@ class ConeGeometry:
     """A circular cone-beam orbit about +z with a flat panel, in mm.
 
     ``source_to_axis_mm`` and ``source_to_detector_mm`` are along the central ray, ``detector_shape`` counts (rows, columns),
-    ``pixel_size_mm`` is (dv, du) and ``detector_offset_mm`` (along v, along u) shifts the panel's centre away from that ray.
+    ``pixel_size_mm`` is (dv, du), or one number for square pixels, kept as the pair. ``detector_offset_mm`` (v, u) in mm
+    shifts the panel's centre away from that ray.
     Raises InputError for lengths and counts that are not above 0, and a panel nearer to the source than the axis.
     """
 
@@ -39,6 +41,8 @@ class ConeGeometry:
         if (counts < 1).any() or (counts != np.floor(counts)).any():
             raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
         object.__setattr__(self, "detector_shape", (int(counts[0]), int(counts[1])))
+        if isinstance(self.pixel_size_mm, Real):
+            object.__setattr__(self, "pixel_size_mm", (self.pixel_size_mm, self.pixel_size_mm))
         _positive_mm("pixel_size_mm", self.pixel_size_mm, (2,))
         for name in ("pixel_size_mm", "detector_offset_mm"):  # tuples whatever was given: geometries are compared
             object.__setattr__(self, name, tuple(checks.numbers(name, getattr(self, name), (2,)).tolist()))

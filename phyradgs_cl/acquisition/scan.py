@@ -274,11 +274,13 @@ def applied_facts(flats: int, darks: int) -> dict[str, object]:
     return {name: count for name, count in zip(APPLIED, (flats, darks), strict=True) if count}
 
 
-def check_others(others: Iterable[str]) -> None:
-    """InputError for a keyword that is none of the fields of a scan that whoever has frames may add."""
+def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
+    """InputError for a keyword that is none of the fields of a scan that whoever has frames may add; ``arguments`` are
+    keywords that the caller knows besides."""
+    known = (*arguments, *_OTHERS)
     for name in others:
         if name not in _OTHERS:
-            raise InputError(name, "no such option", ", ".join(_OTHERS), near_miss(name, _OTHERS, "leave it out"))
+            raise InputError(name, "no such option", ", ".join(known), near_miss(name, known, "leave it out"))
 
 
 def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:

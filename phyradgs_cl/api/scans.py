@@ -1,8 +1,9 @@
 """Scans from arrays: frames, a geometry and angles are enough."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,7 @@ def fly_scan(
     Raises InputError for shapes that do not fit, numbers out of range or implausible, words that contradict each other, and
     angles that turn against the exposure.
     """
+    check_others(others, _keywords(fly_scan))
     axis, direction = readout_order(first, readout, readout_direction, lambda name: _ARGUMENTS.get(name, name))
     readout, readout_direction = axis or "rows", 1 if direction is None else direction
     checks.one_of("readout", readout, AXES)
@@ -126,6 +128,7 @@ def static_scan(
 
     Raises InputError for shapes that do not fit and numbers out of range.
     """
+    check_others(others, _keywords(static_scan))
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     angle_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     angle_rad = np.deg2rad(angle_deg)
@@ -139,6 +142,11 @@ def _warn_of_transmission(frames: np.ndarray) -> None:
     border, brighter = np.median(frames[..., [0, -1]]), np.count_nonzero(frames > 1 + _AIR_SLACK)
     if abs(border - 1) < _AIR_SLACK and brighter < 0.01 * frames.size and np.min(frames) < 1 - _AIR_SLACK:
         log.warning('frames: 1 at their borders, and less within: are they transmissions? quantity="transmission"')
+
+
+def _keywords(function: Callable[..., Scan]) -> list[str]:
+    """Names of what a function takes by name only."""
+    return [one.name for one in signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
 
 
 def _pixels(
@@ -185,7 +193,6 @@ def _scan(
     pixels: LineIntegrals, orbit: CircularOrbit, shutter: Shutter, start_s: np.ndarray, grid: Grid | None, is_fly: bool,
     others: dict[str, Any], called: Mapping[str, str] = _ARGUMENTS,
 ) -> Scan:  # fmt: skip
-    check_others(others)
     if "pixel_mask" in others:
         raise InputError("pixel_mask", "an option of Scan itself", "mask", "write mask=")
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly

@@ -363,17 +363,18 @@ def _ask(problem: Reduced, least: float, search: _Search) -> None:
 
 
 def _corrections(search: _Search) -> dict[str, float]:
-    """The parameters that differ from what is stated by three deviations, with the values that they then have together; all
-    that are known, where those would take over by more than a deviation what the others are off by."""
+    """The parameters that differ from what is stated by three deviations, with the values that they have together while all
+    others stay as stated: what then differs by less is left out as well."""
     values, deviations = search.found()
-    off = np.abs(values) > DEVIATIONS * deviations
-    names = tuple(name for name, is_off in zip(search.known, off, strict=True) if is_off)
-    if search.problem is None or not names:
-        return {}
-    alone = search.problem.only(names).step()
-    if np.any(np.abs(alone - values[off]) > deviations[off]):
-        return dict(zip(search.known, map(float, values), strict=True))
-    return dict(zip(names, map(float, alone), strict=True))
+    names, kept = search.known, values
+    while search.problem is not None and names:
+        of_names = deviations[[search.known.index(name) for name in names]]
+        off = np.abs(kept) > DEVIATIONS * of_names
+        if off.all():
+            break
+        names = tuple(name for name, is_off in zip(names, off, strict=True) if is_off)
+        kept = search.problem.only(names).step() if names else kept[:0]
+    return dict(zip(names, map(float, kept), strict=True))
 
 
 def _table(scan: Scan, parameters: Sequence[Parameter], search: _Search, kept: Mapping[str, float]) -> list[Found]:

@@ -3,6 +3,8 @@
 from dataclasses import asdict, dataclass
 
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
+PIXEL_SIZES = "x_pixel_size and y_pixel_size (--pixel-size-mm of import)"
+MIRROR_U, MIRROR_V = "--column-0 (left or right)", "--row-0 (top or bottom)"  # of import
 FEWEST_COLUMNS = 8  # four gave false alarms, five did not
 
 

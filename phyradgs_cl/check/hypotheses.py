@@ -9,7 +9,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.check.coarse import coarse_grid
-from phyradgs_cl.check.finding import FEWEST_COLUMNS
+from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
 from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped
 from phyradgs_cl.check.variants import (
     Path,
@@ -28,6 +28,10 @@ _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (i
 _FANS = (0.02, 3.0)  # the panel's width over its distance from the source, of scans that there are
 _NEAR = 3.0  # times as large as what the panel sees: from there a stated grid does not belong to the hypothesis
 _APART = 1.0  # coarse pixels
+_TRANSPOSED = (
+    "transpose the frames (numpy: .T of each) or turn them by 90° (numpy: rot90) and import them again: the two differ by "
+    "a mirror that no frame shows, so that one gives a mirror image; only a feature whose side is known tells which"
+)
 REDUNDANT = 0.5  # share of columns that see a ray twice in a full turn: frames that see it once fit with anything
 
 
@@ -61,7 +65,7 @@ def _fans(scan: Scan, stated: Scan) -> Iterator[Cause]:
         if not _FANS[0] < factor * fan < _FANS[1]:
             continue
         sizes, distances = _times("pixel sizes", factor), _times("distances", 1 / factor)
-        correct_sizes, correct_distances = "correct x_pixel_size and y_pixel_size", "correct the distances"
+        correct_sizes, correct_distances = f"correct {PIXEL_SIZES}", "correct the distances"
         moved_px = np.abs(np.array(geometry.detector_offset_mm) / geometry.pixel_size_mm) * abs(1 - 1 / factor)
         if (moved_px < _APART * np.array(path_of(scan).blocks)).all():
             text = f"frames fit with {sizes}, or with {distances}: they do not tell which"
@@ -82,18 +86,18 @@ def _times(what: str, factor: float) -> str:
 
 
 def _images(scan: Scan, stated: Scan) -> Iterator[Cause]:
-    advice = "turn the frames as the panel saw them, import them again and check again"
+    advice = "import again with the other {}, and check again"
     offset_v_mm, offset_u_mm = stated.geometry.detector_offset_mm
     if offset_u_mm or stated.shutter.axis == "columns":
         text = "frames fit if they are mirrored in u (or with rotation, detector_offset and readout the other way)"
-        yield Cause(text, advice, partial(mirrored, scan, "u"))
+        yield Cause(text, advice.format(MIRROR_U), partial(mirrored, scan, "u"))
     if offset_v_mm:
         text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
-        yield Cause(text, advice, partial(mirrored, scan, "v"))
+        yield Cause(text, advice.format(MIRROR_V), partial(mirrored, scan, "v"))
     if scan.geometry.detector_shape[0] >= FEWEST_COLUMNS:
         text = "frames fit if they are transposed, rows and columns exchanged (or turned by 90°"
-        yield Cause(f"{text})", advice, partial(transposed, scan, False))
-        yield Cause(f"{text}: more likely)", advice, partial(transposed, scan, True))
+        yield Cause(f"{text})", _TRANSPOSED, partial(transposed, scan, False))
+        yield Cause(f"{text}: more likely)", _TRANSPOSED, partial(transposed, scan, True))
 
 
 def _under(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
@@ -179,11 +183,11 @@ def _arcs(scan: Scan) -> Iterator[Cause]:
 def _sizes(scan: Scan) -> Iterator[Cause]:
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
-        text, advice = "pixel sizes fit if v and u are exchanged", "exchange x_pixel_size and y_pixel_size"
+        text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
         yield Cause(text, advice, partial(stretched, scan, u / v, v / u))
     for factor in (0.5, 0.8, 0.9, 1.1, 1.25, 2.0):
         text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
-        advice = "correct pixel sizes (binning? unit?) or distances (unit? source to panel?)"
+        advice = f"correct {PIXEL_SIZES} (binning? unit?) or distances (unit? source to panel?)"
         yield Cause(text, advice, partial(nearly_sized, scan, factor))
 
 

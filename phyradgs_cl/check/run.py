@@ -14,7 +14,7 @@ from phyradgs_cl.check.questions.angles import check_angles
 from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
 from phyradgs_cl.check.questions.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
-from phyradgs_cl.check.questions.distances import DISTANCES, check_distances
+from phyradgs_cl.check.questions.distances import DISTANCES, UNVERIFIED, check_distances
 from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
 from phyradgs_cl.check.questions.gain import GAIN, check_gain
 from phyradgs_cl.check.questions.offset import (
@@ -68,6 +68,8 @@ def check(
     found: list[Finding] = []
 
     def add(finding: Finding) -> Finding:
+        if finding.question == DISTANCES and finding.verdict == CANNOT_TELL:
+            finding = replace(finding, text=f"{finding.text}; {UNVERIFIED}")
         found.append(finding)
         report(len(found), len(names), names[len(found)] if len(found) < len(names) else "")
         return finding

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-from phyradgs_cl.check import SUSPICIOUS, CheckResult, CountReader, check
+from phyradgs_cl.check import CANNOT_TELL, CheckResult, CountReader, check
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Device, Scan
@@ -20,6 +20,7 @@ from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_
 
 EXAMPLE = "Example: phyradgs check scan.h5"
 SUSPICIOUS_STATUS = 10
+_NOT_ASKED = "not asked: which end of the panel is up (row 0; --row-0 of import), as no frame can tell"
 _FIX_OFFSET = "Write a copy of the scan (-o) with the centre-of-rotation offset that was found."
 
 
@@ -85,8 +86,10 @@ def _as_text(found: CheckResult) -> str:
         if finding.advice:
             lines.append(f"{'':33s}-> {finding.advice}")
     count = len(found.suspicious)
-    unsure = sum(finding.verdict not in ("ok", SUSPICIOUS) for finding in found.findings)
-    lines.append(f"{count} of {len(found.findings)} questions suspicious, {unsure} cannot be told")
+    unsure = [finding.question for finding in found.findings if finding.verdict == CANNOT_TELL]
+    lines.append(_NOT_ASKED)
+    named = f": {', '.join(unsure)}" if unsure else ""
+    lines.append(f"{count} of {len(found.findings)} questions suspicious, {len(unsure)} cannot be told{named}")
     return "\n".join(lines)
 
 

@@ -62,6 +62,9 @@ def test_lists_and_arrays_make_the_same_geometry() -> None:
     for kind in (list, np.array):
         same = ConeGeometry(785.0, 1200.0, kind(shape), kind(pixels), kind(offsets))
         assert same == GEOMETRY and hash(same) == hash(GEOMETRY)
+    for side in (0.5, np.float32(0.5), 1):  # one number is a square pixel
+        square = ConeGeometry(785.0, 1200.0, (7, 10), side)
+        assert square == ConeGeometry(785.0, 1200.0, (7, 10), (side, side)) and square.pixel_size_mm == (side, side)
 
 
 def test_nonsense_is_refused_by_name() -> None:
@@ -70,7 +73,7 @@ def test_nonsense_is_refused_by_name() -> None:
     for name, value in [
         ("source_to_axis_mm", 0.0), ("source_to_axis_mm", math.nan), ("source_to_detector_mm", 0.0),
         ("source_to_detector_mm", -1.0), ("detector_shape", (0, 5)), ("pixel_size_mm", (0.5, 0.0)),
-        ("pixel_size_mm", (0.5,)), ("detector_offset_mm", (math.inf, 0.0)),
+        ("pixel_size_mm", (0.5,)), ("pixel_size_mm", 0.0), ("detector_offset_mm", (math.inf, 0.0)),
     ]:  # fmt: skip
         with pytest.raises(InputError, match=name):
             replace(small, **{name: value})

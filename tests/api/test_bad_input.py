@@ -148,6 +148,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
         (lambda: fly(flats=FRAMES[:, :3]), r"flats: found shape \(4, 3, 8\)"),
         (lambda: fly(mask=np.ones((8, 6))), r"mask: found shape \(8, 6\); expected \(6, 8\) or \(4, 6, 8\)"),
         (lambda: fly(detektor_model="log"), "detektor_model: .*did you mean 'detector_model'"),
+        (lambda: fly(readout_s=62), "readout_s: .*exposure_s, .*readout_ms, .*detector_model.*did you mean 'readout_ms'"),
         (lambda: fly(detector_model="linear"), "detector_model: found 'linear'"),
         (lambda: fly(grid=16), "grid: found 16; expected a Grid"),
         (lambda: fly(pixel_mask=FRAMES[0]), "pixel_mask: .*write mask="),
@@ -156,6 +157,7 @@ CASES: dict[str, list[tuple[Callable[[], object], str]]] = {
     "static_scan": [
         (lambda: static_scan(FRAMES, CONE, ANGLES[:2]), r"angles_deg: found shape \(2,\)"),
         (lambda: static_scan(FRAMES, CONE, ANGLES, exposure_deg=3.0), "exposure_deg: found no such option"),
+        (lambda: static_scan(FRAMES, CONE, ANGLES, flat=1), "flat: .*quantity, .*did you mean 'flats'"),
         (lambda: static_scan(FRAMES, CONE, ANGLES, lag=2.0), "lag: found 2.0"),
         (lambda: static_scan(FRAMES + 4e4, CONE, ANGLES), "frames: found values of up to 40000 without flats"),
     ],

@@ -12,6 +12,8 @@ from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, Calibration, c
 from phyradgs_cl.calibrate.level import Level
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, evenly_lit, moved
 from phyradgs_cl.calibrate.parameters import in_words
+from phyradgs_cl.calibrate.reduced import Reduced
+from phyradgs_cl.calibrate.run import _corrections, _Search
 from phyradgs_cl.calibrate.views import SPLINES, find_sway, find_wobble
 from phyradgs_cl.calibrate.wobble import (
     numbers_of_sway,
@@ -71,6 +73,26 @@ def test_a_right_scan_stays_as_it_is(rt, right) -> None:
     assert found.scan.trajectory is right.trajectory and found.scan.geometry is right.geometry
     assert by_name(found)["offset-u"].share > 0.5 > by_name(found)["readout"].share
     assert found.residual_rms[0] == found.residual_rms[1]
+
+
+@pytest.mark.parametrize("tilt, names", [(0.0, {"offset-u"}), (1.8, {"offset-u"}), (9.0, {"offset-u", "tilt-v"})])
+def test_what_differs_by_less_than_three_deviations_is_not_corrected_along(tilt, names) -> None:
+    """Signals of an offset and a tilt that resemble each other, the tilt off by so many of its deviations."""
+    rng = np.random.default_rng(2)
+    one, other, noise = (values / np.linalg.norm(values) for values in rng.normal(size=(3, 2000)))
+    signals = np.array([one, 0.95 * one + 0.3 * other])
+    noise -= noise @ np.linalg.pinv(signals) @ signals
+    count = len(signals)
+    problem = Reduced(("offset-u", "tilt-v"), np.ones(count), signals, np.ones(count), np.eye(count), 1e-2 * noise, 20, 1e-3)
+    deviation = problem.deviations()
+    wrong = np.array([40.0, tilt]) * deviation @ signals
+    known = ("offset-u", "tilt-v")
+    shares = dict(zip(known, problem.shares.tolist(), strict=True))
+    kept = _corrections(_Search({}, {}, known, shares, [], replace(problem, residual=problem.residual + wrong)))
+    assert set(kept) == names
+    alone = problem.only(tuple(sorted(names)))
+    expected = replace(alone, residual=problem.residual + wrong).step()
+    assert list(kept.values()) == pytest.approx(expected.tolist())
 
 
 def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch, caplog) -> None:

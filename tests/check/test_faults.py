@@ -70,7 +70,9 @@ def test_strips_of_a_panel_raise_no_false_alarm(rt, scan_of, rows, columns, verd
 def test_a_mirror_image_in_a_narrow_fan_cannot_be_told(rt, scan_of) -> None:
     narrow = ConeGeometry(500.0, 700.0, (32, 32), (0.125, 0.125))
     scan = scan_of(narrow, views=15, exposure_deg=24.0, readout_ratio=0.5)
-    assert verdicts(check(scan, rt))["distances"] == CANNOT_TELL  # only the fan shows them
+    distances = next(one for one in check(scan, rt).findings if one.question == "distances")
+    assert distances.verdict == CANNOT_TELL  # only the fan shows them
+    assert "neither pixel sizes nor distances are verified" in distances.text and "--pixel-size-mm" in distances.advice
     for one in (scan, negative(scan)):
         found = verdicts(check(one, rt))
         assert found["sign of rotation"] == found["sign of readout"] == CANNOT_TELL
@@ -142,9 +144,10 @@ def test_distances_in_another_unit_are_no_offset(rt, aside, factor) -> None:
 def test_frames_that_are_transposed_or_mirrored(rt, aside) -> None:
     """A mirror in u turns the offset round, and that is no second finding."""
     for change in (lambda p: p.swapaxes(1, 2), lambda p: np.rot90(p, axes=(1, 2))):
-        assert "transposed" in only_alarm(check(imported(aside, change), rt))
+        said = only_alarm(check(imported(aside, change), rt))
+        assert "transposed" in said and "one gives a mirror image" in said and "whose side is known" in said
     said = only_alarm(check(imported(aside, lambda p: p[:, :, ::-1]), rt))
-    assert "mirrored in u" in said
+    assert "mirrored in u" in said and "--column-0" in said
     assert ("look the same" in said) == (aside.geometry.detector_offset_mm[1] == 0)
     found = check(imported(aside, lambda p: p[:, ::-1]), rt)
     assert set(suspected(found)) <= {"sign of readout"}
@@ -284,7 +287,8 @@ def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     write_scan(path, clean)
     assert cli.run(["check", str(path)]) == 0
     text = capsys.readouterr().out
-    assert text.count("\n") >= 12 and "0 of 12 questions suspicious" in text
+    assert text.count("\n") >= 12 and "not asked: which end of the panel is up" in text
+    assert text.endswith("0 of 12 questions suspicious, 2 cannot be told: sign of readout, exposure\n")
     write_scan(path, negative(clean))
     assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
     facts = json.loads(capsys.readouterr().out)

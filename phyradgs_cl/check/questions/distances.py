@@ -1,7 +1,7 @@
 """Do the frames say how far the panel is from the source?"""
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.finding import CANNOT_TELL, OK, Finding
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, PIXEL_SIZES, Finding
 from phyradgs_cl.check.hypotheses import nearly_sized
 from phyradgs_cl.check.questions.offset import free_offset
 from phyradgs_cl.check.residual import fitted
@@ -11,6 +11,7 @@ from phyradgs_cl.runtime import Runtime
 _OTHERS = (0.8, 1.25)
 _OK_RATIO, _ERRORS = 1.05, 4.0
 DISTANCES = "distances"
+UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
 
 
 def check_distances(rt: Runtime, scan: Scan) -> Finding:
@@ -26,5 +27,5 @@ def check_distances(rt: Runtime, scan: Scan) -> Finding:
     best = min(ratios, key=lambda factor: ratios[factor])
     text = f"pixels over the panel's distance {best:g} times as large leave {ratios[best]:.3g} times the squared residual"
     fit_worse = all(ratios[f] >= _OK_RATIO and t_statistic(stated, others[f]) >= _ERRORS for f in _OTHERS)
-    advice = "" if fit_worse else "compare distances and pixel sizes with the scanner's log"
+    advice = "" if fit_worse else f"compare distances and {PIXEL_SIZES} with the scanner's log"
     return Finding(DISTANCES, OK if fit_worse else CANNOT_TELL, ratios[best], _OK_RATIO, "share", text, advice)

@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import CANNOT_TELL, MIRROR_U, MIRROR_V, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.residual import fitted
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 from phyradgs_cl.check.variants import at_rest, read, reversed_readout
@@ -73,9 +73,9 @@ def _others(scan: Scan) -> dict[str, Scan]:
 
 def _advice(scan: Scan, name: str) -> str:
     if name == _OTHER_WAY:
-        mirror = "v" if scan.shutter.axis == "rows" else "u"
+        mirror, switch = ("v", MIRROR_V) if scan.shutter.axis == "rows" else ("u", MIRROR_U)
         other = f"set readout_direction to {-scan.shutter.direction}, or import with --readout-direction"
-        return f"{other}; frames mirrored in {mirror} look the same: mirror those instead"
+        return f"{other}; frames mirrored in {mirror} look the same: then import with the other {switch}"
     if name == _AT_REST:
         return "did the gantry stop for every view? Then import without a frame time (stop-and-shoot)"
     return "check the readout's axis, direction and time: the frames fit better otherwise"

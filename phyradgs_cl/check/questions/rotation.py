@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import CANNOT_TELL, MIRROR_U, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.questions.offset import Offset
 from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 
@@ -37,10 +37,10 @@ def blamed(finding: Finding, moved_px: float, stated_px: float, tolerance_px: fl
     opposite of the stated offset than to it. An offset below the tolerance does not tell."""
     if abs(stated_px) < tolerance_px:
         text = f"{finding.text}; frames mirrored in u would look the same"
-        advice = "change the sign of the angles ('gantry' for 'sample'), or mirror the columns of the frames"
+        advice = f"change the sign of the angles ('gantry' for 'sample'), or import with the other {MIRROR_U}"
     elif abs(moved_px + 2 * stated_px) < abs(moved_px):
         text = f"frames are mirrored in u: {finding.text}, with detector_offset of the other sign"
-        advice = "mirror the columns of the frames (or change the signs of the angles and of detector_offset along u)"
+        advice = f"import with the other {MIRROR_U}, or change the signs of the angles and of detector_offset along u"
     else:
         text = f"{finding.text}, with detector_offset as stated"
         advice = "change the sign of the angles ('gantry' for 'sample')"
