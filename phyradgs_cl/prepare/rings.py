@@ -19,6 +19,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.dead import axis_column
 from phyradgs_cl.prepare.masked import unmasked_frames
+from phyradgs_cl.prepare.single_gains import find_single_gains
 from phyradgs_cl.prepare.step import Facts, MakeModel
 
 METHODS = ("mean", "fitted")
@@ -67,9 +68,11 @@ def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_
     along the row, between columns that mirror each other at ``axis_column`` (None: the middle). On an arc, ``full_turn``
     False, the sets are its halves, which see the object differently.
     """
-    half = (len(frames) + 1) // 2
-    sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
-    one, other = (_rough(_antisymmetric(part.mean(axis=0, dtype=np.float64), axis_column)) for part in sets)
+    return _strength(_means(frames, full_turn), axis_column)
+
+
+def _strength(means: np.ndarray, axis_column: float | None) -> Strength:
+    one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
     noise, rows = _variance(one - other) / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
@@ -93,16 +96,26 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
         expected = f"no more than the panel's {frames.shape[2]} columns"
         raise InputError("rings.window", str(options.window), expected, "state fewer pixels")
     column, full_turn = axis_column(scan), is_full_turn(scan)
-    strength = ring_strength(frames, axis_column=column, full_turn=full_turn)
-    measured = {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
+    means, mirrored = _means(frames, full_turn), _mirror(frames.shape[2], column)
+    usable = np.full(frames.shape[1:], scan.frames >= _LEAST_FRAMES) & (scan.valid.mean(axis=0) > 0.5)
+    single = find_single_gains(means, mirrored, usable, full_turn)
+    if single.found:
+        frames, means = frames - single.offset, means - single.offset
+        scan = replace(scan, projections=scan.projections - single.offset)
+    strength = _strength(means, column)
+    facts: Facts = {"result": "removed" if single.found else "nothing to do", **({"single": single.words} if single.found else {})}
+    facts |= {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
     if scan.frames < _LEAST_FRAMES or not strength.is_certain:
-        return scan, {"result": "nothing to do", **measured}
+        return scan, facts
     pattern = _pattern(frames, strength, options.window, column if full_turn else np.inf)
     if options.method == "fitted":
         model = make_model(scan)
         left = frames - pattern
         pattern = pattern + (left - model.frames(model.regularised(left))).mean(axis=0)
-    facts = {"result": "removed", **measured, "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
+    facts |= {"result": "removed", "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
+    remaining = find_single_gains(means - pattern, mirrored, usable, full_turn)
+    if remaining.found:
+        facts["left"] = remaining.words
     return replace(scan, projections=frames - pattern), facts
 
 
@@ -112,6 +125,13 @@ def is_full_turn(scan: Scan) -> bool:
     sources = np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0][:3] for f in range(scan.frames)])
     distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
     return bool(distance.max() < _EQUALLY_FAR * distance.min())
+
+
+def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
+    """The means (2, v, u) of two independent sets of views."""
+    half = (len(frames) + 1) // 2
+    sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
+    return np.stack([part.mean(axis=0, dtype=np.float64) for part in sets])
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:

@@ -94,6 +94,39 @@ def test_most_of_what_rings_cost_comes_back(rt, make, name, share, rings) -> Non
     assert prepared.provenance[TOLD][-1]["spread"] == pytest.approx(rings, rel=0.15)
 
 
+def _spoilt(clean: Scan, rows: slice, columns: slice, gain: float) -> Scan:
+    frames = clean.projections.copy()
+    frames[:, rows, columns] -= np.float32(np.log(gain))
+    return replace(clean, projections=frames)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize(
+    ("rows", "columns", "gain", "words"),
+    [
+        (slice(None), slice(8, 9), 1.01, "1 column, gain off by 1.0 %"),
+        (slice(None), slice(31, 32), 1.03, "1 column, gain off by 3.0 %"),
+        (slice(20, 23), slice(5, 8), 1.05, "9 pixels, gain off by 5."),
+    ],
+)
+def test_a_single_gain_is_regained_and_nothing_else_changes(rt, make, name, rows, columns, gain, words) -> None:
+    clean = make(name, CONE)
+    prepared = prepare(_spoilt(clean, rows, columns, gain), "rings", device=rt)
+    left = np.abs((prepared.projections - clean.projections).mean(axis=0))
+    assert left[rows, columns].mean() < 0.2 * np.log(gain)
+    left[rows, columns] = 0
+    assert not left.any()
+    assert prepared.provenance[TOLD][-1]["single"].startswith(words)
+
+
+def test_what_mirrors_itself_or_stands_at_the_axis_is_the_objects(rt, make) -> None:
+    """A line at both sides of the axis, and one beside the axis, could be the object's: they stay."""
+    clean = make("head", CONE)
+    both = _spoilt(_spoilt(clean, slice(None), slice(8, 9), 1.03), slice(None), slice(39, 40), 1.03)
+    for scan in (both, _spoilt(clean, slice(None), slice(24, 25), 1.03)):
+        np.testing.assert_array_equal(prepare(scan, "rings", device=rt).projections, scan.projections)
+
+
 def test_a_gap_that_moves_on_is_no_spark(rt, make) -> None:
     """A bright pixel that the frames before and after show too is the object's; in a single frame it is a spark."""
     clean = make("head", CONE)
