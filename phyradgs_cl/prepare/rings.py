@@ -103,7 +103,9 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
         frames, means = frames - single.offset, means - single.offset
         scan = replace(scan, projections=scan.projections - single.offset)
     strength = _strength(means, column)
-    facts: Facts = {"result": "removed" if single.found else "nothing to do", **({"single": single.words} if single.found else {})}
+    facts: Facts = {"result": "removed" if single.found else "nothing to do"}
+    if single.found:
+        facts["single"] = single.words
     facts |= {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
     if scan.frames < _LEAST_FRAMES or not strength.is_certain:
         return scan, facts

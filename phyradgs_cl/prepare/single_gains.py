@@ -42,8 +42,8 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Single gains by the means (2, v, u) of two sets of views. mirrored: mirror images of the columns that have one, in a row
-    (others are left alone). usable: (v, u) bool, pixels that are not masked."""
+    """Single gains by the means (2, v, u) of two sets of views. mirrored: mirror images of the columns that have one (others
+    are left alone). usable: (v, u) bool, pixels that are not masked."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
@@ -52,7 +52,7 @@ def find_single_gains(
     means = means[..., mirrored[::-1]]
     unlike = _apart(means - means[..., ::-1])
     medians = [np.median(of, axis=1, keepdims=True) for of in (_apart(means), unlike)]
-    lines = _standing_out(*medians, usable.mean(axis=0, keepdims=True) > 0.5)
+    lines = _standing_out(medians[0], medians[1], usable.mean(axis=0, keepdims=True) > 0.5)
     means = means - lines
     pixels = np.zeros(usable.shape)
     if full_turn:  # single pixels on an arc cannot be told from edges of the object

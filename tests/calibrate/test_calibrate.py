@@ -23,6 +23,7 @@ from phyradgs_cl.calibrate.wobble import (
     without_smooth_gauges,
     without_sway_gauges,
 )
+from phyradgs_cl.calibrate.work import Work
 from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -33,6 +34,8 @@ from phyradgs_cl.simulation import simulate as simulate_frames
 from phyradgs_cl.workflow import load_scan
 
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
+
+SILENT = Work(lambda *progress: None, {})
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +160,7 @@ def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt,
     rng = np.random.default_rng(1)
     planted = without_gauges(right, np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
     off = moved(right, Change(), views_of(-planted))
-    found = find_wobble(rt, off, [(16, 30, 10), (32, 30, 10)], Change())
+    found = find_wobble(rt, off, [(16, 30, 10), (32, 30, 10)], Change(), SILENT)
     assert [one.verdict for one in found.table][1:] == [CORRECTED, CORRECTED]
     left_mm = found.views.shift_mm - planted[:, 1:]
     assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
@@ -172,7 +175,7 @@ def test_turns_of_a_smooth_object_on_which_levels_differ_are_left(rt) -> None:
     scan = simulate_frames(scene.source, geometry, scene.grid, SimulationOptions(plan, noise="beer", dose=1e5))
     planted = np.zeros((40, 3))
     planted[:, 0] = np.radians(np.sin(4 * np.pi * np.arange(40) / 40))
-    found = find_wobble(rt, moved(scan, Change(), views_of(planted)), [(24, 40, 15), (48, 40, 12)], Change())
+    found = find_wobble(rt, moved(scan, Change(), views_of(planted)), [(24, 40, 15), (48, 40, 12)], Change(), SILENT)
     turn = found.table[0]
     assert turn.verdict == AGREES and found.views is None, found.table
 
@@ -189,7 +192,7 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     off = moved(scan, Change(), views_of(-planted))
     left = []
     for splines in (0, 6):
-        found = find_wobble(rt, off, [(18, 40, 15), (36, 40, 12)], Change(), splines)
+        found = find_wobble(rt, off, [(18, 40, 15), (36, 40, 12)], Change(), SILENT, splines)
         left.append(np.sqrt(np.mean((np.c_[found.views.turn_rad, found.views.shift_mm] - planted) ** 2, axis=0)))
     assert [one.verdict for one in found.table] == [CORRECTED] * 3
     most = np.array([0.4, 0.05, 0.05]) * np.sqrt(np.mean(planted**2, axis=0))
@@ -271,7 +274,7 @@ def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, ri
 
 
 def test_a_still_object_stays_still(rt, right) -> None:
-    found = find_sway(rt, right, [(16, 30, 10), (32, 30, 10)], Change())
+    found = find_sway(rt, right, [(16, 30, 10), (32, 30, 10)], Change(), SILENT)
     shifts_mm = np.zeros(1) if found.views is None else found.views.coefficients[:, 3:]
     assert np.abs(shifts_mm).max() < 0.02
 
