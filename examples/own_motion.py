@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phyradgs_cl.api import PerRow, Scan, TimeCells, compare, load_scan, reconstruct, save_scan, simulate
+from phyradgs_cl.api import OwnTimes, Scan, TimeCells, compare, load_scan, reconstruct, save_scan, simulate
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class ReadoutOf:
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         shutter = replace(scan.shutter, readout_s=self.ratio * scan.shutter.exposure_s)
-        return PerRow(3).cells(replace(scan, shutter=shutter), frame)
+        return OwnTimes(3).cells(replace(scan, shutter=shutter), frame)
 
 
 @dataclass(frozen=True)

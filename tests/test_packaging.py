@@ -12,7 +12,7 @@ import pytest
 from phyradgs_cl.resources import resource
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-MOST_BYTES = 800_000  # kernels, code and small TOML files; nothing measured or rendered
+MOST_BYTES = 850_000  # kernels, code and small TOML files; nothing measured or rendered
 
 
 def tracked(folder: str, pattern: str) -> set[str]:

@@ -124,7 +124,7 @@ CONVERGED = 1e-3  # relative distance of a long run's objective from its minimum
 # Frames' gradients are rounded to float32 before they are added, a few times 2^-24; measured 1e-7 to 4e-7.
 RANK_GRADIENT = 1e-6
 # Voxel methods on several ranks, which add up their own frames first; measured up to 7e-7 after 8 iterations.
-RANK_VOLUME = 1e-5
+RANK_VOLUME = 1e-4  # sums in another order; TV descents of asd-pocs enlarge that: 4e-5 with intensities, others 1e-5
 
 # --- voxel methods on the device -------------------------------------------------------------------------------
 # relative L2 to the same lines over NumPy's arrays: rounding of single operations (1e-7), which steps of a fixed length

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Exact, Motion, Scan
+from phyradgs_cl.acquisition import Exact, Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition.motion import STILL, check_motion, check_own_motion, motion_of
 from phyradgs_cl.api.arrays import Values, computed, placed
 from phyradgs_cl.api.devices import Device, runtime_of
@@ -103,6 +103,8 @@ def splat_operator(
     Raises InputError for what is no Scan, for a motion that there is not, and a cutoff out of range.
     """
     model = _checked(scan, motion, (*STILL, Exact()))
+    if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
+        model = OwnTimes(model.sub_intervals)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)
 

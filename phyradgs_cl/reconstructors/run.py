@@ -66,7 +66,7 @@ def reconstruct(
     if asked.margin_mm is not None:
         report = _showing(asked.of(scan.grid), report)
     fitting = naming_size_that_fits(rt, ready, method_name(method), chosen)
-    with fitting, _naming_margin(asked, ready.grid), naming_host_memory():
+    with _naming_margin(asked, ready.grid), fitting, naming_host_memory():
         if asked.tune:
             result = tuned(asked.tune, run, seen, chosen, rt, report, **extra)
         else:

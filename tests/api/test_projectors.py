@@ -16,6 +16,7 @@ from phyradgs_cl.api import (
     Gaussians,
     MicroViews,
     Operator,
+    OwnTimes,
     PerRow,
     Scan,
     as_torch,
@@ -124,7 +125,7 @@ def test_splats_are_the_twin_in_millimetres(rt, scan, cloud) -> None:
 
 
 def test_intensity_is_what_the_detector_averages(rt, scan, cloud) -> None:
-    motion = PerRow(3)
+    motion = OwnTimes(3)
     volume = voxelise(cloud, scan.grid, device=rt) * 20
     ones, weights = layered([motion.cells(scan, f) for f in range(scan.frames)])
     parts = [ray_operator(scan, _Given(tables), device=rt)(volume) for tables in ones]

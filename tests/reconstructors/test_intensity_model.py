@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import ConeGeometry, MicroViews, PerRow, Protocol, Scan, Static
+from phyradgs_cl.acquisition import ConeGeometry, MicroViews, OwnTimes, PerRow, Protocol, Scan, Static
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.phantoms import shepp_logan
@@ -63,7 +63,7 @@ def test_the_scan_says_which_model_unless_it_is_told(rt, scan, method) -> None:
 
 
 def test_of_one_pose_a_line_both_models_are_the_mean(rt, scan) -> None:
-    for motion in (Static(), PerRow(sub_intervals=1)):
+    for motion in (Static(), OwnTimes(sub_intervals=1)):
         assert System.of_scan(rt, scan, motion, "scan").intensity is None
     assert System.of_scan(rt, scan, MicroViews(2, 2), "scan").intensity is not None
     assert System.of_scan(rt, scan, MicroViews(2, 2), "log").intensity is None

@@ -93,6 +93,8 @@ class RayMemory:
         self.frames(frames)
         if self._columns_bytes and self._columns is None:
             self._columns = self.rt.zeros(self._columns_bytes // 4)
+        if self.slot_frames:
+            self.slots()
         return True
 
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
