@@ -106,7 +106,7 @@ def test_frames_are_rows_of_the_whole(operator_and_x) -> None:
 @pytest.mark.parametrize("which", ["rows", "columns"])
 def test_gaussians_and_their_voxels_make_the_same_frames(rt, scan, columns_scan, cloud, which) -> None:
     scan = scan if which == "rows" else columns_scan
-    motion, grid = PerRow(sub_intervals=4), Grid.cube(120, 2.4)
+    motion, grid = OwnTimes(sub_intervals=4), Grid.cube(120, 2.4)
     volume = voxelise(cloud, grid, cutoff_sigma=0.0, device=rt)
     rays = ray_operator(scan, motion, grid=grid, device=rt)
     splats = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt)
