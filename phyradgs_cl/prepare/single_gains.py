@@ -7,7 +7,7 @@ or pixel is therefore what its neighbours do not have, nor the mirrored ones, in
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter, median_filter, minimum_filter
+import scipy
 
 _NORMAL_MAD = 1.4826
 _DEVIATIONS = 8.0  # least distance in robust standard deviations, in both sets
@@ -65,7 +65,7 @@ def find_single_gains(
 
 def _apart(means: np.ndarray) -> np.ndarray:
     """Means (set, v, u) less the median of their neighbours along the row."""
-    return means - median_filter(means, (1, 1, _NEIGHBOURS))
+    return means - scipy.ndimage.median_filter(means, (1, 1, _NEIGHBOURS))
 
 
 def _standing_out(apart: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
@@ -73,10 +73,10 @@ def _standing_out(apart: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> 
     between mirrored columns."""
     around = (1, 3, 3)
     mirrored = apart[..., ::-1]
-    low, high = minimum_filter(mirrored, around), maximum_filter(mirrored, around)
+    low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)
     beyond = apart - np.clip(apart, low, high)
-    usual = _NORMAL_MAD * median_filter(np.abs(unlike), (1, 1, _NEAR))
-    noise = _NORMAL_MAD * median_filter(np.abs(unlike[0] - unlike[1]), (5, 3 if usable.shape[0] > 1 else 5))
+    usual = _NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike), (1, 1, _NEAR))
+    noise = _NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike[0] - unlike[1]), (5, 3 if usable.shape[0] > 1 else 5))
     sigma = np.maximum(usual, noise).max(axis=0)
     offset, size = unlike.mean(axis=0), np.abs(unlike).min(axis=0)
     found = usable & (size > np.maximum(_DEVIATIONS * sigma, _LEAST)) & (unlike[0] * unlike[1] > 0)
