@@ -1,4 +1,4 @@
-"""Checks for the public doors: each raises InputError with the culprit's name, or returns nothing."""
+"""Checks for the public doors: each raises InputError with the subject's name, or returns nothing."""
 
 import importlib
 import math
@@ -14,22 +14,22 @@ from phyradgs_cl.text import near_miss
 _LONGEST_SHOWN = 80
 
 
-def positive(culprit: str, value: float) -> None:
+def positive(subject: str, value: float) -> None:
     """Raise InputError unless the scalar `value` is finite and above zero."""
     if not (_is_finite(value) and value > 0):
-        raise InputError(culprit, shown(value), "a finite number above 0")
+        raise InputError(subject, shown(value), "a finite number above 0")
 
 
-def at_least(culprit: str, value: float, minimum: float) -> None:
+def at_least(subject: str, value: float, minimum: float) -> None:
     """Raise InputError unless the scalar `value` is finite and not below `minimum`."""
     if not (_is_finite(value) and value >= minimum):
-        raise InputError(culprit, shown(value), f"a finite number, at least {minimum}")
+        raise InputError(subject, shown(value), f"a finite number, at least {minimum}")
 
 
-def within(culprit: str, value: float, lowest: float, highest: float) -> None:
+def within(subject: str, value: float, lowest: float, highest: float) -> None:
     """Raise InputError unless the scalar `value` is finite and between two bounds, both included."""
     if not (_is_finite(value) and lowest <= value <= highest):
-        raise InputError(culprit, shown(value), f"a number from {lowest} to {highest}")
+        raise InputError(subject, shown(value), f"a number from {lowest} to {highest}")
 
 
 def fields_within(prefix: str, options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -40,57 +40,57 @@ def fields_within(prefix: str, options: object, ranges: Mapping[str, tuple[float
             within(prefix + name, number, lowest, highest)
 
 
-def one_of(culprit: str, value: object, allowed: Iterable[object]) -> None:
+def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError unless `value` is among `allowed`, which the message lists."""
     choices = list(allowed)
     if value not in choices:
         remedy = near_miss(value, (choice for choice in choices if isinstance(choice, str)), "")
-        raise InputError(culprit, shown(value), "one of " + ", ".join(repr(choice) for choice in choices), remedy)
+        raise InputError(subject, shown(value), "one of " + ", ".join(repr(choice) for choice in choices), remedy)
 
 
-def finite(culprit: str, array: ArrayLike) -> None:
+def finite(subject: str, array: ArrayLike) -> None:
     """Raise InputError if any element of `array` (any shape) is NaN or infinite; names the first."""
     good = np.isfinite(np.asarray(array))
     if not good.all():
         count = int(good.size - np.count_nonzero(good))
         first = tuple(int(i) for i in np.unravel_index(int(np.argmin(good)), good.shape))
-        raise InputError(culprit, f"{count} NaN or infinite values, first at {first}", "finite values")
+        raise InputError(subject, f"{count} NaN or infinite values, first at {first}", "finite values")
 
 
-def shape(culprit: str, array: ArrayLike, expected: Sequence[int | None]) -> None:
+def shape(subject: str, array: ArrayLike, expected: Sequence[int | None]) -> None:
     """Raise InputError unless `array` has the shape `expected`, in which None stands for any length."""
     found = np.shape(array)
     fits = len(found) == len(expected) and all(e in (None, f) for f, e in zip(found, expected, strict=True))
     if not fits:
         wanted = ", ".join("any" if e is None else str(e) for e in expected)
-        raise InputError(culprit, f"shape {found}", f"shape ({wanted})")
+        raise InputError(subject, f"shape {found}", f"shape ({wanted})")
 
 
-def numbers(culprit: str, value: ArrayLike, expected: Sequence[int | None] | None = None) -> NDArray[np.float64]:
+def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | None = None) -> NDArray[np.float64]:
     """``value`` as float64; InputError unless it is real, finite and, where ``expected`` is given, of that shape."""
-    array = real_array(culprit, value)
+    array = real_array(subject, value)
     if expected is not None:
-        shape(culprit, array, expected)
-    finite(culprit, array)
+        shape(subject, array, expected)
+    finite(subject, array)
     return array.astype(np.float64)
 
 
-def real_array(culprit: str, value: ArrayLike) -> np.ndarray:
+def real_array(subject: str, value: ArrayLike) -> np.ndarray:
     """``value`` as an array of its own real type; InputError for what holds anything else than real numbers."""
     try:
         array = np.asarray(value)
     except ValueError as error:  # NumPy's words for it are long
-        raise InputError(culprit, "lists of unequal length", "an array of numbers") from error
+        raise InputError(subject, "lists of unequal length", "an array of numbers") from error
     if array.dtype.kind not in "iuf":
-        raise InputError(culprit, shown(value), "numbers")
+        raise InputError(subject, shown(value), "numbers")
     return array
 
 
-def whole(culprit: str, value: float, lowest: int, highest: int) -> None:
+def whole(subject: str, value: float, lowest: int, highest: int) -> None:
     """Raise InputError unless the scalar `value` is a whole number between two bounds, both included."""
-    within(culprit, value, lowest, highest)
+    within(subject, value, lowest, highest)
     if value != int(value):
-        raise InputError(culprit, shown(value), f"a whole number from {lowest} to {highest}")
+        raise InputError(subject, shown(value), f"a whole number from {lowest} to {highest}")
 
 
 def package(name: str, use: str, install: str) -> ModuleType:

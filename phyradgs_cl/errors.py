@@ -1,4 +1,4 @@
-"""The package's exceptions: each names the culprit, what was found, what was expected and what to do, in one line.
+"""The package's exceptions: each names the subject, what was found, what was expected and what to do, in one line.
 
 Exit statuses are told apart by scripts (docs/trouble.md); 1 is Python's own, for a defect of this program.
 """
@@ -14,15 +14,15 @@ _ELSEWHERE = {"with": "others", "readout": "readout_axis"}  # options whose argu
 
 
 class PhyradgsError(Exception):
-    """Base of every error that this package raises on purpose. culprit: what is wrong: an option, a file with its HDF5
+    """Base of every error that this package raises on purpose. subject: what is wrong: an option, a file with its HDF5
     path, a device; found: the value or state met there; expected: what would have been right; remedy: what to do about it,
     as an imperative. ``exit_code``: the command line's status."""
 
     exit_code = 2
 
-    def __init__(self, culprit: str, found: str = "", expected: str = "", remedy: str = "") -> None:
-        super().__init__(culprit, found, expected, remedy)  # all four, so that pickling keeps them
-        self.culprit = culprit
+    def __init__(self, subject: str, found: str = "", expected: str = "", remedy: str = "") -> None:
+        super().__init__(subject, found, expected, remedy)  # all four, so that pickling keeps them
+        self.subject = subject
         self.found = found
         self.expected = expected
         self.remedy = remedy
@@ -31,7 +31,7 @@ class PhyradgsError(Exception):
         found = f"found {self.found}" if self.found else ""
         expected = f"expected {self.expected}" if self.expected else ""
         details = "; ".join(part for part in (found, expected, self.remedy) if part)
-        text = f"{self.culprit}: {details}" if details else self.culprit
+        text = f"{self.subject}: {details}" if details else self.subject
         return plain_text(" ".join(text.split()))  # messages of other libraries bring line breaks along
 
 
@@ -73,9 +73,9 @@ def naming_arguments() -> Iterator[None]:
     try:
         yield
     except PhyradgsError as error:
-        told = error.culprit, error.found, error.expected, error.remedy
+        told = error.subject, error.found, error.expected, error.remedy
         error.args = tuple(_OPTION.sub(_argument, text) for text in told)
-        error.culprit, error.found, error.expected, error.remedy = error.args
+        error.subject, error.found, error.expected, error.remedy = error.args
         raise
 
 

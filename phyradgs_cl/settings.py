@@ -52,13 +52,13 @@ class RunSettings:
         try:
             yield
         except PhyradgsError as error:
-            culprit = _origin_of(error.culprit, self.origins)
-            if culprit is None:
+            subject = _origin_of(error.subject, self.origins)
+            if subject is None:
                 raise
             found = error.found
             if found == "no such option" and self.method:
                 found += f" of --method {self.method}"
-            raise type(error)(culprit, found, error.expected, error.remedy) from error
+            raise type(error)(subject, found, error.expected, error.remedy) from error
 
 
 def run_settings(
@@ -130,10 +130,10 @@ def _device_and_memory(settings: dict[str, Any], origins: Mapping[str, str]) -> 
     return wish, None if memory is None else bytes_of(memory, origins.get("memory", "--memory"))
 
 
-def _origin_of(culprit: str, origins: Mapping[str, str]) -> str | None:
-    """Where the option that ``culprit`` names stands, with the way into its table; None where nobody gave it."""
-    options = re.findall(r"option ([\w-]+)", culprit)
-    words = options or re.sub(r"\(.*\)", "", culprit).split()[-1:]
+def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
+    """Where the option that ``subject`` names stands, with the way into its table; None where nobody gave it."""
+    options = re.findall(r"option ([\w-]+)", subject)
+    words = options or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
     if origin is None or origin.startswith("--"):
@@ -166,13 +166,13 @@ def merge(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
             settings[key] = value
 
 
-def device_wish(value: object, culprit: str = "--device") -> str | None:
+def device_wish(value: object, subject: str = "--device") -> str | None:
     """The device asked for, or None; an empty wish would otherwise pass for none, or for any."""
     if value is None:
         return None
     if not isinstance(value, str) or not value.strip():
         remedy = "see 'phyradgs devices', or leave it out for the best device"
-        raise InputError(culprit, checks.shown(value), "an index, cpu, gpu or part of a name", remedy)
+        raise InputError(subject, checks.shown(value), "an index, cpu, gpu or part of a name", remedy)
     return value
 
 
@@ -209,9 +209,9 @@ def _word(settings: dict[str, Any], key: str, origins: Mapping[str, str]) -> str
     return value
 
 
-def _seed(value: object, culprit: str) -> int:
+def _seed(value: object, subject: str) -> int:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_SEED:
-        raise InputError(culprit, checks.shown(value), f"a whole number from 0 to {LARGEST_SEED}")
+        raise InputError(subject, checks.shown(value), f"a whole number from 0 to {LARGEST_SEED}")
     return value

@@ -9,7 +9,7 @@ from phyradgs_cl import checks, errors
 from phyradgs_cl.errors import InputError, NumericalError, PhyradgsError
 
 
-def test_message_names_culprit_found_expected_and_remedy_on_one_line() -> None:
+def test_message_names_subject_found_expected_and_remedy_on_one_line() -> None:
     error = InputError("scan.h5:/entry/data", "shape\n(3, 4)", "three axes", "store (F, v, u)")
     assert str(error) == "scan.h5:/entry/data: found shape (3, 4); expected three axes; store (F, v, u)"
     for arguments, text in (

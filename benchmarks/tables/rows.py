@@ -59,8 +59,8 @@ class Row:
         try:
             return method_options(self.method, None, changes)
         except InputError as error:
-            culprit = f"row {self.label!r}: {error.culprit}"
-            raise InputError(culprit, error.found, error.expected, "choose other rows with --rows") from error
+            subject = f"row {self.label!r}: {error.subject}"
+            raise InputError(subject, error.found, error.expected, "choose other rows with --rows") from error
 
     @property
     def is_splatting(self) -> bool:

@@ -205,18 +205,18 @@ def check_own_motion(motion: object, scan: Scan) -> None:
     """
     if motion is None or isinstance(motion, MODELS):
         return
-    culprit, made = f"motion {type(motion).__name__}", motion.cells(scan, 0)  # type: ignore[attr-defined]
+    subject, made = f"motion {type(motion).__name__}", motion.cells(scan, 0)  # type: ignore[attr-defined]
     if not isinstance(made, TimeCells):
-        raise InputError(culprit, f"a {type(made).__name__} from cells(scan, frame)", "TimeCells")
+        raise InputError(subject, f"a {type(made).__name__} from cells(scan, frame)", "TimeCells")
     if (made.lines, made.axis) != (scan.lines, scan.shutter.axis):
         found, expected = f"cells for {made.lines} {made.axis}", f"{scan.lines} {scan.shutter.axis}"
-        raise InputError(culprit, found, expected)
-    checks.shape(f"{culprit}: pose", made.pose, (made.count, POSE_LENGTH))
+        raise InputError(subject, found, expected)
+    checks.shape(f"{subject}: pose", made.pose, (made.count, POSE_LENGTH))
     for name in ("time_s", "line_start", "line_stop"):
-        checks.shape(f"{culprit}: {name}", getattr(made, name), (made.count,))
+        checks.shape(f"{subject}: {name}", getattr(made, name), (made.count,))
     if made.line_share is not None:
-        checks.shape(f"{culprit}: line_share", made.line_share, (made.count, made.lines))
+        checks.shape(f"{subject}: line_share", made.line_share, (made.count, made.lines))
     weights = made.line_weights()
     worst = float(weights[np.argmax(np.abs(weights - 1))])
     if abs(worst - 1) > _WHOLE:
-        raise InputError(culprit, f"line weights that sum to {worst:.6g}", "1 for every line", "divide them by their sum")
+        raise InputError(subject, f"line weights that sum to {worst:.6g}", "1 for every line", "divide them by their sum")

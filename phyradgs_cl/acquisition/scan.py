@@ -260,10 +260,10 @@ class Scan:
             if not place:
                 return
             places.add(place)
-        culprit = getattr(self.trajectory, "culprit", "trajectory")
+        subject = getattr(self.trajectory, "subject", "trajectory")
         if places == {"behind the panel"}:
             remedy = "are the source's distances to axis and panel exchanged?"
-            raise InputError(culprit, "the grid behind the panel in every frame", "it between source and panel", remedy)
+            raise InputError(subject, "the grid behind the panel in every frame", "it between source and panel", remedy)
         box_mm = np.round(self.grid.box_mm, 3).tolist()
         found = f"a box in {box_mm} mm (z, y, x) that no ray meets in any frame"
         raise InputError("grid", found, "one that the panel sees", "correct its offset or unit, or the poses")

@@ -49,13 +49,13 @@ class Shutter:
             expected = f"a pulse that meets the frame's window, 0 to {self.span_s:g} s"
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
-    def check_resolved(self, frame_start_s: np.ndarray, culprit: str = "exposure_s") -> None:
+    def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
         """InputError for an exposure that frames' opening times (F,) cannot tell from none: its angles would be noise."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
         shortest_s = _STEPS * float(np.spacing(latest_s))
         if 0 < self.exposure_s < shortest_s:
             expected = f"0, or at least the {shortest_s:.2g} s that times of up to {latest_s:.3g} s can tell apart"
-            raise InputError(culprit, f"{self.exposure_s:.6g} s", expected, "correct the value or its unit")
+            raise InputError(subject, f"{self.exposure_s:.6g} s", expected, "correct the value or its unit")
 
     @property
     def readout(self) -> Readout:

@@ -111,6 +111,6 @@ def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.nd
     return table.reshape(frames, length)
 
 
-def _refuse(culprit: str, values: np.ndarray, expected: str) -> None:
+def _refuse(subject: str, values: np.ndarray, expected: str) -> None:
     if np.any(values):
-        raise InputError(culprit, checks.shown(float(values[np.nonzero(values)][0])), expected)
+        raise InputError(subject, checks.shown(float(values[np.nonzero(values)][0])), expected)

@@ -84,20 +84,20 @@ class EncoderTable:
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
-    culprit: str = "encoder table"
+    subject: str = "encoder table"
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         wanted = "two equal 1D arrays of at least 2 samples"
-        time_s, table = _checked_table(self.culprit, self.time_s, self.angle_rad_table, (), "angles", wanted)
+        time_s, table = _checked_table(self.subject, self.time_s, self.angle_rad_table, (), "angles", wanted)
         object.__setattr__(self, "time_s", time_s)
         object.__setattr__(self, "angle_rad_table", table)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Angles (...) in rad at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
-        _check_covered(self.culprit, frame, t, self.time_s)
+        _check_covered(self.subject, frame, t, self.time_s)
         return np.interp(t, self.time_s, self.angle_rad_table)
 
 
@@ -169,17 +169,17 @@ class PoseTable:
 
     time_s: np.ndarray
     table: np.ndarray
-    culprit: str = "pose table"
+    subject: str = "pose table"
     _frames: np.ndarray = field(init=False, repr=False)
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         expected, row = "times (T,) and poses (T, 12), T at least 2", (POSE_LENGTH,)
-        time_s, table = _checked_table(self.culprit, self.time_s, self.table, row, "poses", expected)
+        time_s, table = _checked_table(self.subject, self.time_s, self.table, row, "poses", expected)
         normal = np.cross(table[:, 6:9], table[:, 9:12])
         if np.any(np.linalg.norm(normal, axis=1) <= 0):
-            raise InputError(self.culprit, "parallel pixel steps", "û·du and v̂·dv that span a plane")
+            raise InputError(self.subject, "parallel pixel steps", "û·du and v̂·dv that span a plane")
         object.__setattr__(self, "time_s", time_s)
         object.__setattr__(self, "table", table)
         object.__setattr__(self, "_frames", _body_frames(table))
@@ -187,7 +187,7 @@ class PoseTable:
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
-        _check_covered(self.culprit, frame, t, self.time_s)
+        _check_covered(self.subject, frame, t, self.time_s)
         in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp knows no slack
         body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
@@ -197,13 +197,13 @@ class PoseTable:
         return turned.reshape(*t.shape, POSE_LENGTH)
 
 
-def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, culprit: str = "poses") -> PoseTable:
+def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses") -> PoseTable:
     """A gantry that stops for every frame, as a table: poses (F, 12), each held for a span about its frame's middle (F,)
     in s.
     """
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
-    return PoseTable(time_s, np.repeat(poses, 2, axis=0), culprit)
+    return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject)
 
 
 def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
@@ -245,8 +245,8 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
 
 def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
     """Poses (T, 12) of a trajectory at times (T,) s; InputError for one of somebody's own that gives no such numbers."""
-    culprit = f"trajectory {type(trajectory).__name__}"
-    return checks.numbers(culprit, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
+    subject = f"trajectory {type(trajectory).__name__}"
+    return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
 
 def _check_finite(kinematics: ConstantSpeed | SpeedRamp) -> None:
@@ -255,14 +255,14 @@ def _check_finite(kinematics: ConstantSpeed | SpeedRamp) -> None:
 
 
 def _checked_table(
-    culprit: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
+    subject: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rising times (T,) and finite rows (T, *row), float64."""
-    time_s, table = checks.numbers(f"{culprit} times", times), checks.numbers(f"{culprit} {what}", rows)
+    time_s, table = checks.numbers(f"{subject} times", times), checks.numbers(f"{subject} {what}", rows)
     if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
-        raise InputError(culprit, f"shapes {time_s.shape} and {table.shape}", expected)
+        raise InputError(subject, f"shapes {time_s.shape} and {table.shape}", expected)
     if np.any(np.diff(time_s) <= 0):
-        raise InputError(culprit, "times that do not increase", "strictly increasing times in s")
+        raise InputError(subject, "times that do not increase", "strictly increasing times in s")
     return time_s, table
 
 
@@ -274,10 +274,10 @@ def _body_frames(table: np.ndarray) -> np.ndarray:
     return np.stack([u_hat, np.cross(normal, u_hat), normal], -1)
 
 
-def _check_covered(culprit: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
+def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
     """A measured table is never extrapolated; a nanosecond of slack absorbs rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"
         expected = f"a table that covers it (it runs from {table_s[0]:.6g} to {table_s[-1]:.6g} s)"
-        raise InputError(culprit, found, expected, "extend the table or drop the frame; are both in s?")
+        raise InputError(subject, found, expected, "extend the table or drop the frame; are both in s?")

@@ -16,7 +16,7 @@ Values = np.ndarray | DeviceArray
 def entered(rt: Runtime, name: str, values: Any, shape: Sequence[int | None]) -> Values:
     """A user's array as float32 in C order, where it lies; copied only if it is neither.
 
-    Raises InputError, of which ``name`` is the culprit, for what is no array of numbers or has another shape.
+    Raises InputError, of which ``name`` is the subject, for what is no array of numbers or has another shape.
     """
     array = adopted(name, values, rt.queue) if is_cl_array(values) else on_host(name, values)
     checks.shape(name, array, shape)  # type: ignore[arg-type]

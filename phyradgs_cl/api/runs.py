@@ -269,11 +269,11 @@ def _checked_path(path: object) -> Path:
     return Path(path)
 
 
-def check_scan(scan: object, culprit: str = "scan") -> None:
+def check_scan(scan: object, subject: str = "scan") -> None:
     """InputError for what is no Scan."""
     if not isinstance(scan, Scan):
         remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
-        raise InputError(culprit, checks.shown(scan), "a Scan", remedy)
+        raise InputError(subject, checks.shown(scan), "a Scan", remedy)
 
 
 def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object, seed: int) -> None:

@@ -57,7 +57,7 @@ class Pool:
                 remedy = "try fewer --workers"
                 raise DeviceError("local workers", found, "processes that stay", remedy) from error
             expected = "the address of a Dask scheduler that runs, or its scheduler file"
-            raise InputError(self._culprit, found, expected, "start one with 'dask scheduler'") from error
+            raise InputError(self._subject, found, expected, "start one with 'dask scheduler'") from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -137,7 +137,7 @@ class Pool:
     # --- the scheduler --------------------------------------------------------------------------------
 
     @property
-    def _culprit(self) -> str:
+    def _subject(self) -> str:
         return "local workers" if self.workers.is_local else f"--scheduler {self.workers.scheduler}"
 
     def _connected(self) -> Any:
@@ -160,12 +160,12 @@ class Pool:
         return sum(int(worker.get("resources", {}).get(RESOURCE, 0)) for worker in workers)
 
     def _scheduler_gone(self) -> InputError:
-        return InputError(self._culprit, "gone", "a scheduler", "start it, and repeat the command to go on")
+        return InputError(self._subject, "gone", "a scheduler", "start it, and repeat the command to go on")
 
     def _revive(self, times: int) -> None:
         """A nanny whose worker was killed as it started does not try again."""
         if times > _REVIVALS:
-            raise DeviceError(self._culprit, "all gone", "processes that stay", "try fewer --workers")
+            raise DeviceError(self._subject, "all gone", "processes that stay", "try fewer --workers")
         log.warning("no local worker is left: starting them anew")
         self.__exit__()
         self.__enter__()

@@ -14,12 +14,12 @@ def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> A
     return typer.Option(*flags, help=help, show_default=default, **more)
 
 
-def file_parser(culprit: str) -> Callable[[str], Path]:
-    """Reads the file name given for ``culprit``; an empty one would pass for the current folder."""
+def file_parser(subject: str) -> Callable[[str], Path]:
+    """Reads the file name given for ``subject``; an empty one would pass for the current folder."""
 
     def file(text: str) -> Path:
         if not text.strip():
-            raise InputError(culprit, repr(text), "a file name", "name a file")
+            raise InputError(subject, repr(text), "a file name", "name a file")
         return Path(text)
 
     return file

@@ -57,12 +57,12 @@ def export_volume(
 
 
 def export_stored(
-    stored: StoredVolume, to: str, target: Path, culprit: str, mu_water_per_mm: float | None = None,
+    stored: StoredVolume, to: str, target: Path, subject: str, mu_water_per_mm: float | None = None,
     labels: DicomLabels | None = None,
 ) -> None:  # fmt: skip
-    """Write a volume as ``export_volume`` does; ``culprit``: where it comes from."""
+    """Write a volume as ``export_volume`` does; ``subject``: where it comes from."""
     if to in CLOUDS:
-        CLOUDS[to](target, gaussians_of(stored, culprit))
+        CLOUDS[to](target, gaussians_of(stored, subject))
     elif to == "dicom":
         write_dicom(target, placed(stored, mu_water_per_mm), labels)
     else:
@@ -80,15 +80,15 @@ def default_output(path: Path, to: str) -> Path:
     return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
 
 
-def format_of(output: str | Path | None, culprit: str = "--to") -> str:
+def format_of(output: str | Path | None, subject: str = "--to") -> str:
     """The one of ``EXPORTS`` whose suffix an output's name has; InputError, which lists them, for any other."""
     for to in EXPORTS:
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to
     known = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))
     found = "neither a format nor an output" if output is None else f"output {output}"
-    remedy = "name the output so, or say --to, for dicom always" if culprit == "--to" else "or .h5, which holds everything"
-    raise InputError(culprit, found, f"a suffix of {known}", remedy)
+    remedy = "name the output so, or say --to, for dicom always" if subject == "--to" else "or .h5, which holds everything"
+    raise InputError(subject, found, f"a suffix of {known}", remedy)
 
 
 def _suffixes(to: str) -> tuple[str, ...]:

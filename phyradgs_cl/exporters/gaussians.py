@@ -13,11 +13,11 @@ _PLY_NAMES = (
 )
 
 
-def gaussians_of(stored: StoredVolume, culprit: str) -> dict[str, np.ndarray]:
+def gaussians_of(stored: StoredVolume, subject: str) -> dict[str, np.ndarray]:
     """mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in 1/mm; float32."""
     if stored.gaussians is None:
         remedy = "reconstruct with --method phyradgs or r2"
-        raise InputError(f"{culprit}:/entry/gaussians", "nothing there", "Gaussians", remedy)
+        raise InputError(f"{subject}:/entry/gaussians", "nothing there", "Gaussians", remedy)
     return vars(stored.gaussians)
 
 

@@ -114,12 +114,12 @@ class GridChoice:
         shape = self._whole(np.maximum(np.ceil(high - _TYPED) - start, 1))
         return grid.part(triple(int(n) for n in start), shape)
 
-    def _whole(self, shape: np.ndarray, culprit: str = "") -> tuple[int, int, int]:
+    def _whole(self, shape: np.ndarray, subject: str = "") -> tuple[int, int, int]:
         if np.prod(shape) > MOST_VOXELS:
             implied = "--voxel-mm" if self.voxel_mm is not None else "--size" if self.size is not None else "--roi-mm"
-            culprit = culprit or implied
+            subject = subject or implied
             found = " × ".join(f"{n:.6g}" for n in shape)
-            raise InputError(culprit, f"a grid of {found}", f"at most {MOST_VOXELS:.3g} voxels")
+            raise InputError(subject, f"a grid of {found}", f"at most {MOST_VOXELS:.3g} voxels")
         return triple(int(n) for n in shape)
 
 

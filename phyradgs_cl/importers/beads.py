@@ -35,7 +35,7 @@ def load_beads(path: Path) -> EllipsoidPhantom:
 
 
 def _bodies(top: Fields, kind: str) -> list[Fields]:
-    return [Fields(one.culprit, one.values, _KEYS[kind]) for one in top.tables(kind)]
+    return [Fields(one.subject, one.values, _KEYS[kind]) for one in top.tables(kind)]
 
 
 def _place(body: Fields, key: str) -> tuple[float, float, float]:

@@ -41,8 +41,8 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
         try:
             scan: Scan = getattr(room, function)(path, options or ImportOptions())
         except InputError as error:
-            if not error.culprit.startswith("grid "):
+            if not error.subject.startswith("grid "):
                 raise
-            raise InputError(f"{path} {error.culprit}", error.found, error.expected, error.remedy) from error
+            raise InputError(f"{path} {error.subject}", error.found, error.expected, error.remedy) from error
         scan.check_timing()
     return scan

@@ -49,7 +49,7 @@ class StoredTiming:
 
 
 def make_timing(
-    culprit: str, frames: int, options: ImportOptions, stored: StoredTiming | None = None
+    subject: str, frames: int, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
     """Timing of ``frames`` frames; the options win over what is stored. Start times, or the time from frame to frame,
     say that the gantry turned all the while, which needs an exposure. Without them every frame is taken at rest, and
@@ -69,18 +69,18 @@ def make_timing(
     except InputError as error:
         if pulse_s is None:
             raise
-        raise InputError(f"{culprit} [beam] pulse_start", error.found, error.expected, error.remedy) from error
+        raise InputError(f"{subject} [beam] pulse_start", error.found, error.expected, error.remedy) from error
     angle_at = angle_at or "start"
     frame_time_s = _first(options.frame_time_s, stored.frame_time_s)
     if options.frame_time_s is None and stored.start_s is not None:
         start_s: np.ndarray = np.asarray(stored.start_s, np.float64)
-        checks.shape(f"{culprit} start times", start_s, (frames,))
+        checks.shape(f"{subject} start times", start_s, (frames,))
     elif frame_time_s is not None:
         start_s = np.arange(frames) * frame_time_s
     else:
-        _check_rest(culprit, shutter, options, stored)
+        _check_rest(subject, shutter, options, stored)
         return Timing(shutter, np.arange(frames) * max(shutter.span_s, 1.0), False, angle_at)
-    _check_flight(culprit, shutter, start_s, options)
+    _check_flight(subject, shutter, start_s, options)
     return Timing(shutter, start_s, True, angle_at, assumed)
 
 
@@ -101,7 +101,7 @@ def _first(*values: float | None) -> float | None:
     return next((value for value in values if value is not None), None)
 
 
-def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
+def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses what a user says of a turn without the time from frame to frame; warns where a file has an exposure."""
     asked = [options.called(name) for name in options.given(_OF_A_TURN)]
     frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
@@ -110,15 +110,15 @@ def _check_rest(culprit: str, shutter: Shutter, options: ImportOptions, stored: 
         raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")
     if shutter.exposure_s > 0:
         text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; say %s if the gantry did not stop"
-        _log.warning(text, culprit, shutter.exposure_s, frame_time)
+        _log.warning(text, subject, shutter.exposure_s, frame_time)
 
 
-def _check_flight(culprit: str, shutter: Shutter, start_s: np.ndarray, options: ImportOptions) -> None:
+def _check_flight(subject: str, shutter: Shutter, start_s: np.ndarray, options: ImportOptions) -> None:
     if shutter.exposure_s <= 0:
         found = "none, with a gantry that does not stop"
         remedy = f"say {options.named('exposure_s')}, or leave the frame time out for frames taken at rest"
-        raise InputError(f"{culprit} exposure", found, "a time above 0 s", remedy)
-    checks.finite(f"{culprit} start times", start_s)
+        raise InputError(f"{subject} exposure", found, "a time above 0 s", remedy)
+    checks.finite(f"{subject} start times", start_s)
     if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):
         found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"
-        raise InputError(f"{culprit} start times", found, "at least two frames, one after the other in time")
+        raise InputError(f"{subject} start times", found, "at least two frames, one after the other in time")

@@ -29,13 +29,13 @@ def check_writable(path: str | Path) -> None:
     _remove(_create_beside(_target(path)))
 
 
-def make_folder(folder: Path, culprit: Path) -> None:
-    """Makes a folder, and those above it; OutputError about ``culprit`` where that cannot be."""
+def make_folder(folder: Path, subject: Path) -> None:
+    """Makes a folder, and those above it; OutputError about ``subject`` where that cannot be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         found = error.strerror or str(error)
-        raise OutputError(str(culprit), found, "a folder that can be written") from error
+        raise OutputError(str(subject), found, "a folder that can be written") from error
 
 
 @contextmanager

@@ -22,39 +22,39 @@ _MOST_TOML_BYTES = 16 << 20
 _COUNTS = {2: "two", 3: "three"}
 
 
-def read_toml(path: Path, culprit: str = "") -> dict[str, Any]:
-    """The content of a TOML file. Raises InputError, about ``culprit`` or the path, where there is none or no TOML."""
-    culprit = culprit or str(path)
+def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
+    """The content of a TOML file. Raises InputError, about ``subject`` or the path, where there is none or no TOML."""
+    subject = subject or str(path)
     try:
-        return tomllib.loads(read_regular(path, culprit, _MOST_TOML_BYTES, "a TOML file").decode("utf-8-sig"))
+        return tomllib.loads(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file").decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
-        raise InputError(culprit, f"text that is not TOML ({error})", "a TOML file") from error
+        raise InputError(subject, f"text that is not TOML ({error})", "a TOML file") from error
 
 
-def refuse_unknown(culprit: str, found: Collection[str], known: Collection[str], what: str = "a key") -> None:
+def refuse_unknown(subject: str, found: Collection[str], known: Collection[str], what: str = "a key") -> None:
     """InputError for the first name that is not known, with the one that it nearly is."""
     for key in found:
         if key not in known:
             remedy = near_miss(key, known, "remove it")
-            raise InputError(f"{culprit} {key}", f"{what} that is not known", ", ".join(known), remedy)
+            raise InputError(f"{subject} {key}", f"{what} that is not known", ", ".join(known), remedy)
 
 
 class Fields:
     """A mapping and the name to blame: values are taken out one by one, each checked. ``known``: the only names that it
     may have; None for a table that may have more than is read of it."""
 
-    def __init__(self, culprit: str, values: object, known: Collection[str] | None = None) -> None:
+    def __init__(self, subject: str, values: object, known: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
-            raise InputError(culprit, described(values), "a table of names and values")
+            raise InputError(subject, described(values), "a table of names and values")
         if known is not None:
-            refuse_unknown(culprit, values, known)
-        self.culprit = culprit
+            refuse_unknown(subject, values, known)
+        self.subject = subject
         self.values = values
-        self._joint = " " if known is not None or culprit.endswith(":") else "."
+        self._joint = " " if known is not None or subject.endswith(":") else "."
 
     def name(self, key: str) -> str:
         """How messages name a value of the table."""
-        return f"{self.culprit}{self._joint}{key}"
+        return f"{self.subject}{self._joint}{key}"
 
     def error(self, key: str, found: str, expected: str, remedy: str = "") -> InputError:
         """What to raise about a value of the table."""

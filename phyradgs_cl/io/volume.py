@@ -282,9 +282,9 @@ def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -
 
 
 def _read_bare(source: Hdf5Source) -> np.ndarray:
-    dataset, culprit = source.dataset(_BARE), source.name(_BARE)
+    dataset, subject = source.dataset(_BARE), source.name(_BARE)
     if dataset.ndim != 3 or 0 in dataset.shape:
-        raise InputError(culprit, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
+        raise InputError(subject, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
     raw = read_values(source, _BARE, dataset)
     if raw.dtype.kind in "iu":
         return (raw / np.float32(np.iinfo(raw.dtype).max)).astype(np.float32)
@@ -293,7 +293,7 @@ def _read_bare(source: Hdf5Source) -> np.ndarray:
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))
     if bad:
         found = f"{bad} voxels that are NaN, infinite or too large"
-        raise InputError(culprit, found, "finite float32 values")
+        raise InputError(subject, found, "finite float32 values")
     return volume
 
 

@@ -21,7 +21,7 @@ def has_accelerator() -> bool:
     return torch_device("auto").type != "cpu"
 
 
-def require_torch(culprit: str) -> None:
+def require_torch(subject: str) -> None:
     """Raise InputError that says what to install, unless PyTorch is there."""
     if not has_torch():
-        raise InputError(culprit, "no PyTorch", "the package torch", INSTALL)
+        raise InputError(subject, "no PyTorch", "the package torch", INSTALL)

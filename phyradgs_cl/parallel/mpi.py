@@ -29,9 +29,9 @@ def launched_ranks(launch: Launch | None = None) -> Communicator:
     try:
         from mpi4py import MPI
     except ImportError as error:
-        culprit = f"rank {found.rank} of {found.size}"
+        subject = f"rank {found.rank} of {found.size}"
         remedy = 'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
-        raise InputError(culprit, "no package mpi4py", "the extra mpi", remedy) from error
+        raise InputError(subject, "no package mpi4py", "the extra mpi", remedy) from error
     world = MPI.COMM_WORLD
     if world.size != found.size:
         remedy = "start it with the mpiexec that mpi4py was built for (with srun: --mpi=pmi2 or pmix)"

@@ -55,14 +55,14 @@ def own_method(name: str, function: Any) -> Method:
 
     Raises InputError for what is no such function, or options that need a value.
     """
-    culprit = f"--method {name}"
+    subject = f"--method {name}"
     try:
         parameters = inspect.signature(function).parameters
     except (TypeError, ValueError):
-        raise InputError(culprit, checks.shown(function), _FORM) from None
+        raise InputError(subject, checks.shown(function), _FORM) from None
     by_place = [p for p in parameters.values() if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if len(by_place) < 3:
-        raise InputError(culprit, f"{function!r} with {len(by_place)} parameters", _FORM)
+        raise InputError(subject, f"{function!r} with {len(by_place)} parameters", _FORM)
     takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     takes = {key for key in ("seed", "report", "resume") if takes_all or key in parameters}
 
@@ -75,14 +75,14 @@ def own_method(name: str, function: Any) -> Method:
         made = function(scan, options, rt, **{key: value for key, value in told.items() if key in takes})
         seconds = time.perf_counter() - started
         facts = {"method": name, "options": _plain(option_facts(options)), "seconds": seconds}
-        result = _result(culprit, made, scan)
+        result = _result(subject, made, scan)
         return replace(result, facts={**facts, **result.facts})
 
-    presets = {"default": _default_options(culprit, function, by_place[1])}
+    presets = {"default": _default_options(subject, function, by_place[1])}
     return Method(run, presets, is_resumable="resume" in takes)
 
 
-def imported(text: str, culprit: str = "--method") -> Any:
+def imported(text: str, subject: str = "--method") -> Any:
     """What ``package.module:name`` names, found as by ``python -m`` in the present folder too."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
@@ -91,14 +91,14 @@ def imported(text: str, culprit: str = "--method") -> Any:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         remedy = "start in its folder, or add that to PYTHONPATH"
-        raise InputError(culprit, f"{text}: {error}", "package.module:function", remedy) from error
+        raise InputError(subject, f"{text}: {error}", "package.module:function", remedy) from error
     except Exception as error:  # whatever a module does as it is imported
         found_there = f"{text}: {type(error).__name__}: {error}"
-        raise InputError(culprit, found_there, "a module that can be imported") from error
+        raise InputError(subject, found_there, "a module that can be imported") from error
     try:
         return operator.attrgetter(name)(found)
     except AttributeError:
-        raise InputError(culprit, text, f"a function {name} in {module}") from None
+        raise InputError(subject, text, f"a function {name} in {module}") from None
 
 
 def _plain(value: Any) -> Any:
@@ -108,7 +108,7 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, int | float | str | None) else repr(value)
 
 
-def _default_options(culprit: str, function: Any, parameter: inspect.Parameter) -> Any:
+def _default_options(subject: str, function: Any, parameter: inspect.Parameter) -> Any:
     """The options of a function as they are by themselves."""
     try:
         kind = typing.get_type_hints(function).get(parameter.name)
@@ -119,17 +119,17 @@ def _default_options(culprit: str, function: Any, parameter: inspect.Parameter) 
     try:
         return kind()
     except TypeError as error:
-        raise InputError(culprit, f"{kind.__name__}: {error}", "options that all have a default") from error
+        raise InputError(subject, f"{kind.__name__}: {error}", "options that all have a default") from error
 
 
-def _result(culprit: str, made: object, scan: Scan) -> Reconstruction:
+def _result(subject: str, made: object, scan: Scan) -> Reconstruction:
     """What a function of somebody's own has given, checked."""
     if not isinstance(made, Reconstruction):
         if not isinstance(made, np.ndarray) or made.shape != scan.grid.shape:
             found = f"an array of shape {made.shape}" if isinstance(made, np.ndarray) else f"a {type(made).__name__}"
             expected = f"a Reconstruction, or a volume of shape {scan.grid.shape}"
-            raise InputError(culprit, f"{found} as its result", expected)
+            raise InputError(subject, f"{found} as its result", expected)
         made = Reconstruction(made.astype(np.float32), scan.grid)
     if not np.isfinite(made.volume).all():
-        raise NumericalError(culprit, "a volume with NaN or infinity", "finite numbers")
+        raise NumericalError(subject, "a volume with NaN or infinity", "finite numbers")
     return made

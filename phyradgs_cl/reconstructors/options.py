@@ -114,21 +114,21 @@ def _motion_options(options: Any) -> list[str]:
     return ["motion", *(key for key in _COUNTS if any(_has(m, key) for m in _models(options).values()))]
 
 
-def _changed(options: Any, changes: Mapping[str, Any], culprit: str) -> Any:
-    """``options`` with ``changes`` by name; ``culprit`` is the method, or the table that they belong to."""
+def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
+    """``options`` with ``changes`` by name; ``subject`` is the method, or the table that they belong to."""
     known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
             names = [*known, *_motion_options(options)]
             remedy = near_miss(key, names, _having(key) or "leave it out")
-            raise InputError(f"{culprit}: option {key}", "no such option", ", ".join(names), remedy)
+            raise InputError(f"{subject}: option {key}", "no such option", ", ".join(names), remedy)
         is_function = callable(value) and key in getattr(options, "FUNCTIONS", ())
-        values[key] = value if is_function else _converted(known[key], value, f"{culprit}: option {key}")
+        values[key] = value if is_function else _converted(known[key], value, f"{subject}: option {key}")
     try:
         return replace(options, **values)
     except (TypeError, ValueError) as error:  # of options of one's own, which check in their own way
-        raise InputError(culprit, str(error), "values that its options take") from error
+        raise InputError(subject, str(error), "values that its options take") from error
 
 
 def _having(option: str) -> str:
@@ -138,7 +138,7 @@ def _having(option: str) -> str:
     return f"--method {' or '.join(having)} has it" if having else ""
 
 
-def _converted(current: Any, value: Any, culprit: str) -> Any:
+def _converted(current: Any, value: Any, subject: str) -> Any:
     """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
     if current is None:  # the options check it themselves
         return value.item() if isinstance(value, np.generic) else value
@@ -146,17 +146,17 @@ def _converted(current: Any, value: Any, culprit: str) -> Any:
         value = value.tolist()
     if is_dataclass(current):
         if not isinstance(value, Mapping):
-            raise InputError(culprit, checks.shown(value), "a table")
-        return _changed(current, value, culprit)
+            raise InputError(subject, checks.shown(value), "a table")
+        return _changed(current, value, subject)
     if isinstance(current, tuple):
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
-            raise InputError(culprit, checks.shown(value), f"a list of {len(current)} numbers")
-        return tuple(_converted(c, v, culprit) for c, v in zip(current, value, strict=True))
+            raise InputError(subject, checks.shown(value), f"a list of {len(current)} numbers")
+        return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
     if type(current) not in _EXPECTED:  # of options of one's own
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
-        raise InputError(culprit, checks.shown(value), expected)
+        raise InputError(subject, checks.shown(value), expected)
     return type(current)(value)
 
 

@@ -141,7 +141,7 @@ def _check_ranks(method: str, rt: Runtime) -> None:
         raise InputError(f"--method {method}", found, f"one, or one of {sharing}", "start it without mpiexec")
     device, first = rt.device.name, rt.ranks.bcast(rt.device.name)
     if device != first:
-        culprit = f"device of rank {rt.ranks.rank}"
+        subject = f"device of rank {rt.ranks.rank}"
         raise InputError(
-            culprit, device, f"that of rank 0, {first}", "choose devices of one kind with --device"
+            subject, device, f"that of rank 0, {first}", "choose devices of one kind with --device"
         )

@@ -119,16 +119,16 @@ class MemoryLedger:
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
         """Raises MemoryShortage for a buffer that is too large, or that would pass the limit."""
-        culprit, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
+        subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:
-            raise MemoryShortage(culprit, found, f"at most {mebibytes(largest_bytes)}", remedy)
+            raise MemoryShortage(subject, found, f"at most {mebibytes(largest_bytes)}", remedy)
         if self.held_bytes + nbytes > self.limit_bytes:
             rest = mebibytes(max(self.limit_bytes - self.held_bytes, 0))
             expected = f"at most {rest}, what is left of {mebibytes(self.limit_bytes)}"
             if self.is_asked:
                 remedy = f"allow more with --memory or {MEMORY_VARIABLE}, or {remedy}"
-            raise MemoryShortage(culprit, found, expected, remedy)
+            raise MemoryShortage(subject, found, expected, remedy)
 
     def refused(self, what: str, error: Exception) -> MemoryShortage:
         """What a driver's refusal is to the rest of the program."""
@@ -153,14 +153,14 @@ def memory_limit(wish: str | int | None) -> int | None:
     return bytes_of(text, MEMORY_VARIABLE) if text else None
 
 
-def bytes_of(wish: str | int, culprit: str) -> int:
+def bytes_of(wish: str | int, subject: str) -> int:
     """2GiB, 1.5 GB, 512M or a plain number of bytes; K, M, G and T alone are powers of 1024, as with iB."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
     if match is None or factor is None or not 0 < float(match.group(1)) * factor < 2**63:
         expected, remedy = "a size above 0, in bytes or with a unit", "write for example 2GiB, 1.5GB or 512M"
-        raise InputError(culprit, repr(wish), expected, remedy)
+        raise InputError(subject, repr(wish), expected, remedy)
     return max(int(float(match.group(1)) * factor), 1)
 
 
@@ -189,7 +189,7 @@ def is_cl_array(value: object) -> bool:
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
     """A float32 Array of pyopencl (C order) as a DeviceArray on its own memory; a part of another is copied on the device.
 
-    Raises InputError for one of another context, queue or type, of which ``name`` is the culprit.
+    Raises InputError for one of another context, queue or type, of which ``name`` is the subject.
     """
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:

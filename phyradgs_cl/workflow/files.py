@@ -46,7 +46,7 @@ def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
             raise InputError(str(path), _KINDS[found], expected, remedy) from error
         if "scan" in kinds and _is_foreign_scan(Path(path)):
             remedy = f"a scan of another program is read by 'phyradgs import {path} -o scan.h5'"
-            raise InputError(error.culprit, error.found, error.expected, remedy) from error
+            raise InputError(error.subject, error.found, error.expected, remedy) from error
         raise
 
 

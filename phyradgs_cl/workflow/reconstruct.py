@@ -296,7 +296,7 @@ def go_on(
             return run_reconstruction(replace(job, resume=True), make_runtime, report)
         except InputError as error:
             named = ("--resume", str(checkpoint))
-            if error.culprit not in named and not error.culprit.startswith("checkpoint"):
+            if error.subject not in named and not error.subject.startswith("checkpoint"):
                 raise
     return run_reconstruction(replace(job, resume=False), make_runtime, report)
 

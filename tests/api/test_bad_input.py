@@ -1,4 +1,4 @@
-"""Bad input at every name of the API: one line with culprit and remedy, an InputError, and nothing half done."""
+"""Bad input at every name of the API: one line with subject and remedy, an InputError, and nothing half done."""
 
 import pickle
 import re

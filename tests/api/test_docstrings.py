@@ -31,7 +31,7 @@ def parameters(thing: Any) -> list[inspect.Parameter]:
     ):
         return []
     found = inspect.signature(thing).parameters.values()
-    return [p for p in found if p.name not in ("self", "culprit") and not p.name.startswith("_")]
+    return [p for p in found if p.name not in ("self", "subject") and not p.name.startswith("_")]
 
 
 def members(name: str) -> Iterator[tuple[str, Any]]:

@@ -86,7 +86,7 @@ def test_gauges_are_left_out(scan) -> None:
 
 
 def test_what_does_not_fit_is_named(rt, scan, cloud) -> None:
-    for call, culprit in (
+    for call, subject in (
         (lambda: move_views(scan, np.zeros((2, 3))), "views"),
         (lambda: pose_gradient(scan, cloud, np.zeros((2, 3)), device=rt), "by_frames"),
         (lambda: pose_gradient(scan, cloud.rows(), weights(scan), device=rt), "x: .*from_rows"),
@@ -94,7 +94,7 @@ def test_what_does_not_fit_is_named(rt, scan, cloud) -> None:
         (lambda: pose_gradient(scan, scan.reference, np.zeros((2, 3)), device=rt), "by_frames"),
         (lambda: splat_operator(scan, device=rt).intensity.by_poses(cloud, weights(scan)), "by_poses"),
     ):
-        with pytest.raises(InputError, match=culprit):
+        with pytest.raises(InputError, match=subject):
             call()
 
 

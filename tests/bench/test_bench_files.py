@@ -190,7 +190,7 @@ def test_neural_rows_run_where_their_machine_is(
 
 def test_wrong_jobs_are_refused(tmp_path: Path) -> None:
     job = BenchJob("table1", tmp_path, rows=["FDK"])
-    for changes, culprit in (
+    for changes, subject in (
         ({"kind": "table3"}, "benchmark: found 'table3'"),
         ({"protocols": ["static"]}, "--protocols: found 'static'"),
         ({"seeds": (-1,)}, "--seeds: found -1"),
@@ -201,7 +201,7 @@ def test_wrong_jobs_are_refused(tmp_path: Path) -> None:
         ({"names": ["hand"]}, r"--names \(without --volumes\): found 'hand'"),
         ({"kind": "phantom", "names": ["foot"]}, "given for phantom"),
     ):
-        with pytest.raises(InputError, match=culprit):
+        with pytest.raises(InputError, match=subject):
             plan_runs(replace(job, **changes))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="voxels of a benchmark size"):
         BenchSize("T", 1, 8, 1)

@@ -26,8 +26,8 @@ def test_projections_are_compared_at_true_scale_over_the_whole_stack() -> None:
     alone = peak_signal_noise_ratio(truth, truth * 0, data_range=truth.max())
     assert compare_projections(1.1 * truth, truth)["psnr_2d_db"] == pytest.approx(alone + 20, rel=1e-9)
     assert compare_projections(truth, truth)["ssim_2d"] == pytest.approx(1.0)
-    for shapes, culprit in (((truth[1:], truth), "result"), ((truth[0], truth[0]), "reference")):
-        with pytest.raises(InputError, match=f"{culprit}: found shape"):
+    for shapes, subject in (((truth[1:], truth), "result"), ((truth[0], truth[0]), "reference")):
+        with pytest.raises(InputError, match=f"{subject}: found shape"):
             compare_projections(*shapes)
 
 

@@ -1,4 +1,4 @@
-"""Bad input: one line that names the culprit, exit status 2, nothing written, an existing output untouched."""
+"""Bad input: one line that names the subject, exit status 2, nothing written, an existing output untouched."""
 
 import shlex
 import shutil
@@ -32,7 +32,7 @@ def kept(refused, tmp_path):
 def test_damaged_scans(kept, scan, tmp_path) -> None:
     """Through the command; tests/io has all that a scan can have wrong."""
     path = tmp_path / "scan.h5"
-    for address, value, culprit in (
+    for address, value, subject in (
         ("instrument/detector/data", None, "detector/data"),
         ("instrument/detector/distance", np.nan, "detector/distance"),
         ("phyradgs/reference/volume", np.zeros((2, 2, 2)), "reference"),
@@ -45,7 +45,7 @@ def test_damaged_scans(kept, scan, tmp_path) -> None:
             del file[f"entry/{address}"]
             if value is not None:
                 file.create_dataset(f"entry/{address}", data=value).attrs.update(attributes)
-        kept(["reconstruct", path, "--iterations", "2"], culprit)
+        kept(["reconstruct", path, "--iterations", "2"], subject)
 
 
 # what the line must name: options after `reconstruct SCAN`
@@ -116,11 +116,11 @@ def test_wrong_options(kept, scan, tmp_path, command) -> None:
             "--size: found 0": ("import {scan} --size 0",),
         }),
     }[command]  # fmt: skip
-    for culprit, many in table.items():
+    for subject, many in table.items():
         for options in many:
             begun = start.replace(" --method phyradgs", "") if "method" in options else start
             words = shlex.split(f"{begun} {options}".format(tmp=tmp_path, scan=scan, text=text))
-            kept(words, culprit)
+            kept(words, subject)
 
 
 ABSURD_VALUES = {
@@ -178,11 +178,11 @@ CONFIGS = {
 
 def test_wrong_configs(kept, scan, tmp_path) -> None:
     config = tmp_path / "run.toml"
-    for culprit, texts in CONFIGS.items():
+    for subject, texts in CONFIGS.items():
         for text in texts:
             config.write_text(text)
             method = [] if text.startswith("method") else ["--method", "phyradgs"]
-            kept(["reconstruct", scan, "--config", config, *method], culprit)
+            kept(["reconstruct", scan, "--config", config, *method], subject)
 
 
 def test_outputs_that_cannot_be_written(refused, scan, tmp_path) -> None:

@@ -26,9 +26,9 @@ def test_centres_are_symmetric_about_the_offset() -> None:
 
 
 def test_impossible_grids_are_refused() -> None:
-    for culprit, *arguments in [
+    for subject, *arguments in [
         ("shape", (0, 3, 4), (1, 1, 1)), ("shape", (3, 4), (1, 1, 1)), ("voxel_size", (2, 3, 4), (1, 0, 1)),
         ("voxel_size", (2, 3, 4), (1, np.nan, 1)), ("offset", (2, 3, 4), (1, 1, 1), (0, np.inf, 0)),
     ]:  # fmt: skip
-        with pytest.raises(InputError, match=culprit):
+        with pytest.raises(InputError, match=subject):
             Grid(*arguments)

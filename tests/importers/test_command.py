@@ -109,7 +109,7 @@ def test_nothing_that_is_read_is_overwritten(run, tmp_path, make_truth) -> None:
     assert len(before) >= 2
     for victim in before:
         done = run(folder, out=victim, ok=False)
-        assert isinstance(done.exception, InputError) and done.exception.culprit == "--output"
+        assert isinstance(done.exception, InputError) and done.exception.subject == "--output"
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     for _ in range(2):
         run(folder, out=folder / "scan.h5")

@@ -46,7 +46,7 @@ def value_of(path: Path) -> float:
 def refusal_of(path: Path) -> str:
     with pytest.raises(InputError) as error, open_hdf5(path):
         pass
-    assert error.value.culprit == str(path)
+    assert error.value.subject == str(path)
     return error.value.found
 
 

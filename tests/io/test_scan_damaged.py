@@ -251,7 +251,7 @@ def refuses(path: Path, address: str, words: Sequence[str]) -> None:
     text = str(caught.value)
     assert text.startswith(f"{path}:{address}" if address else f"{path}"), text
     if address:
-        rest = caught.value.culprit.removeprefix(f"{path}:{address}")
+        rest = caught.value.subject.removeprefix(f"{path}:{address}")
         assert rest == "" or rest.startswith(" ("), text  # a remark, not another path
     assert all(word in text for word in words), text
     assert len(text.splitlines()) == 1

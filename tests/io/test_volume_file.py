@@ -119,7 +119,7 @@ def test_damage_is_named(stored, case) -> None:
         damage(file)
     with pytest.raises(InputError) as caught:
         read_volume(path)
-    assert caught.value.culprit == f"{path}:/{address}"
+    assert caught.value.subject == f"{path}:/{address}"
     assert "\n" not in str(caught.value)
 
 

@@ -83,14 +83,14 @@ def test_bricks(any_rt, axis) -> None:
 def test_what_does_not_fit_is_said(rt) -> None:
     operator = RayOperator(rt, UPRIGHT, SHAPE, tables("static", SHAPE))
     x = rt.zeros(UPRIGHT.shape)
-    for culprit, call in {
+    for subject, call in {
         "volume": lambda: operator.forward(rt.zeros((1, 2, 3))),
         "float32": lambda: operator.forward(rt.zeros(UPRIGHT.shape, np.int32)),
         "frames": lambda: operator.adjoint(x),
         "shape": lambda: operator.forward(x, x),
         "elsewhere": lambda: operator.forward(x, np.zeros(operator.frames_shape, np.float32)),
     }.items():
-        with pytest.raises(InputError, match=culprit):
+        with pytest.raises(InputError, match=subject):
             call()
 
 

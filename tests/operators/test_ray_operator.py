@@ -205,6 +205,6 @@ def test_refusals(rt) -> None:
         "subset": lambda: operator.subset([]), "tables": lambda: RayOperator(rt, GRID, SHAPE, []),
         "frame 3": lambda: RayOperator(rt, GRID, SHAPE, [*cells, *tables("static", axis="columns")]),
     }
-    for culprit, call in wrong.items():
-        with pytest.raises(InputError, match=culprit):
+    for subject, call in wrong.items():
+        with pytest.raises(InputError, match=subject):
             call()

@@ -36,8 +36,8 @@ def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
         title = read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
     turned = {name: oriented(stack, options, "top") for name, stack in stacks.items()}
-    culprit, flats, darks = f"{path}:{_EXCHANGE}/data", turned.get("white"), turned.get("dark")
-    integrals = line_integrals(culprit, oriented(frames, options, "top"), options, flats=flats, darks=darks)
+    subject, flats, darks = f"{path}:{_EXCHANGE}/data", turned.get("white"), turned.get("dark")
+    integrals = line_integrals(subject, oriented(frames, options, "top"), options, flats=flats, darks=darks)
     trajectory = turning(geometry, hdf5_frames.gantry_sign(options, "sample") * theta_rad, timing)
     return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 

@@ -123,18 +123,18 @@ def _with_flat(options: ImportOptions, frames: np.ndarray) -> ImportOptions:
     return replace(options, flat_value=brightest)
 
 
-def _pitch(options: ImportOptions, culprit: str) -> tuple[float, float]:
+def _pitch(options: ImportOptions, subject: str) -> tuple[float, float]:
     if options.pixel_size_mm is None:
         remedy = f"say {options.named('pixel_size_mm')}"
-        raise InputError(f"{culprit} pixel size", "nothing", "a length in mm along v and along u", remedy)
+        raise InputError(f"{subject} pixel size", "nothing", "a length in mm along v and along u", remedy)
     return options.pixel_size_mm
 
 
-def _timing(culprit: str, detector: Circle, options: ImportOptions) -> Timing:
+def _timing(subject: str, detector: Circle, options: ImportOptions) -> Timing:
     """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
-    ratio = synthetic.readout_ratio(culprit, closed - first, done - closed)
+    ratio = synthetic.readout_ratio(subject, closed - first, done - closed)
     shutter = Shutter(exposure_s, ratio * exposure_s)
     start_s = synthetic.start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
     least_s = shutter.span_s * (1 + _GAP)

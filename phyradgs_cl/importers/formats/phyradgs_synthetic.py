@@ -31,12 +31,12 @@ def import_phyradgs(path: Path, options: ImportOptions) -> Scan:
     return opened.scan(path, entries, CircularOrbit(opened.geometry, sweeps), timing, options)
 
 
-def timing_of_marks(culprit: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
+def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
     """Timing from angles (F, 3): first line's start and end, last line's end. The first stored line is read first:
     column 0, or with a readout along rows the one at the top."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(
-        culprit.culprit, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]
+        subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]
     )
     axis = options.readout_axis or "columns"
     custom = 1 if axis == "columns" else -1
@@ -56,15 +56,15 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
     return exposure_s
 
 
-def readout_ratio(culprit: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
+def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
     """T_ro/T_exp from arcs (F,) of all frames, which must agree on it."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
-        raise InputError(f"{culprit} exposure", found, "arcs that turn one way, none of them 0")
+        raise InputError(f"{subject} exposure", found, "arcs that turn one way, none of them 0")
     ratio = readout_arc / exposure_arc
     if ratio.min() < 0 or np.ptp(ratio) > _SAME * max(1.0, ratio.max()):
         found = f"readout over exposure from {ratio.min():.6g} to {ratio.max():.6g}"
-        raise InputError(f"{culprit} readout", found, "one ratio of at least 0 for all frames")
+        raise InputError(f"{subject} readout", found, "one ratio of at least 0 for all frames")
     return float(np.median(ratio))
 
 

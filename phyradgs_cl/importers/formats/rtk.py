@@ -39,7 +39,7 @@ def import_rtk(path: Path, options: ImportOptions) -> Scan:
 
 
 def _trajectory(
-    rtk: RtkGeometry, stack: Voxels, timing: Timing, culprit: str
+    rtk: RtkGeometry, stack: Voxels, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, ConeGeometry, Turned]:
     """A circular orbit where one describes the file, else a table of poses; and how images have to be turned."""
     panel = (stack.values.shape[1], stack.values.shape[2])
@@ -58,4 +58,4 @@ def _trajectory(
     geometry = plain_geometry(at_frames, panel)
     if rtk.is_circular and stack.steps_mm[0, 1] == stack.steps_mm[1, 0] == 0:
         return turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
-    return table_over_time(poses, timing, culprit), geometry, turn
+    return table_over_time(poses, timing, subject), geometry, turn

@@ -114,20 +114,20 @@ def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _root(path: Path) -> ElementTree.Element:
-    data, culprit = read_bytes(path), str(path)
+    data, subject = read_bytes(path), str(path)
     if _DECLARATIONS.search(data):
         expected, remedy = "plain elements", "nothing outside of the file is read"
-        raise InputError(culprit, "a DOCTYPE with declarations or an external file", expected, remedy)
+        raise InputError(subject, "a DOCTYPE with declarations or an external file", expected, remedy)
     try:
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
-        raise InputError(culprit, f"XML that is not well formed ({error})", f"a {ROOT}") from error
+        raise InputError(subject, f"XML that is not well formed ({error})", f"a {ROOT}") from error
     except (ValueError, LookupError) as error:  # an encoding that nobody knows
-        raise InputError(culprit, f"XML that cannot be read ({error})", f"a {ROOT}") from error
+        raise InputError(subject, f"XML that cannot be read ({error})", f"a {ROOT}") from error
     if root.tag != ROOT:
-        raise InputError(culprit, f"a root element {root.tag[:60]!r}", ROOT)
+        raise InputError(subject, f"a root element {root.tag[:60]!r}", ROOT)
     if (version := root.get("version", "3")) != "3":
-        raise InputError(culprit, f"version {version[:20]!r}", "version 3")
+        raise InputError(subject, f"version {version[:20]!r}", "version 3")
     return root
 
 
@@ -139,12 +139,12 @@ def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
     return values
 
 
-def _number(culprit: str, text: str | None) -> float:
+def _number(subject: str, text: str | None) -> float:
     text = (text or "").strip()
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not abs(value) <= _LARGEST:
-        raise InputError(culprit, repr(text[:40]), "a finite number")
+        raise InputError(subject, repr(text[:40]), "a finite number")
     return value

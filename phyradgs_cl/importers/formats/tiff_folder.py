@@ -74,7 +74,7 @@ def import_tiff(path: Path, options: ImportOptions) -> Scan:
 
 def _subjects(tables: dict[str, Fields]) -> dict[str, str]:
     """How messages call what the file states, where that is no option of an import."""
-    subjects = {"grid": tables[""].name("[volume]"), "angles": tables["angles"].culprit}
+    subjects = {"grid": tables[""].name("[volume]"), "angles": tables["angles"].subject}
     if tables["readout"].has("readout_ms"):
         subjects["readout_s"] = tables["readout"].name("readout_ms")
     return subjects
@@ -121,11 +121,11 @@ def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.
 
 
 def _line_integrals(
-    stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, culprit: str
+    stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, subject: str
 ) -> LineIntegrals:
     turned = {name: oriented(stack, said, "top") for name, stack in stacks.items()}
     stack = turned["projections"]
-    found = line_integrals(culprit, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
+    found = line_integrals(subject, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
     if "mask" not in turned:
         return found
     return replace(found, mask=united(found.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
@@ -190,7 +190,7 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
     """(F,) as stored: a list, a file of one angle per line, or the first with the last or a step."""
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:
-        raise InputError(angles.culprit, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
+        raise InputError(angles.subject, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
     if angles.has("unit") and not angles.has("file"):
         raise angles.error("unit", "no file beside it", "the unit of a file of angles", "leave it out")
     if angles.has("file"):
@@ -205,9 +205,9 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
     return np.deg2rad(np.linspace(first, angles.number("last_deg"), frames))
 
 
-def _mask(stack: np.ndarray, shape: tuple[int, ...], culprit: str) -> np.ndarray:
+def _mask(stack: np.ndarray, shape: tuple[int, ...], subject: str) -> np.ndarray:
     if stack.shape == (1, *shape[1:]):
         return stack[0] != 0
     if stack.shape != shape:
-        raise InputError(culprit, f"shape {stack.shape}", f"one image of {shape[1:]}, or one per frame")
+        raise InputError(subject, f"shape {stack.shape}", f"one image of {shape[1:]}, or one per frame")
     return stack != 0

@@ -51,12 +51,12 @@ def offset(scanner: Fields, key: str, count: int) -> np.ndarray:
     return values[:count]
 
 
-def turned_volume(culprit: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
+def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
     """A stored volume [x, y, z] as (z, y, x) float32 in 1/mm."""
-    checks.shape(culprit, volume, grid.shape[::-1])
-    checks.finite(culprit, volume)
+    checks.shape(subject, volume, grid.shape[::-1])
+    checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
     largest = float(np.abs(turned).max())
     if largest > float(np.finfo(np.float32).max):
-        raise InputError(culprit, f"a density of {largest:.3g} 1/mm", "one that float32 holds", "check the file")
+        raise InputError(subject, f"a density of {largest:.3g} 1/mm", "one that float32 holds", "check the file")
     return np.ascontiguousarray(turned, np.float32)

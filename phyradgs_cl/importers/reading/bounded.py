@@ -17,13 +17,13 @@ _MOST_HEADER_BYTES = 1 << 16
 MOST_INFLATION = 1040  # deflate cannot do more than 1032
 
 
-def check_room(culprit: str, needed_bytes: int) -> None:
+def check_room(subject: str, needed_bytes: int) -> None:
     """InputError for what would take more than its share of this machine's memory."""
     most = HOST_SHARE * host_bytes()
     if needed_bytes > most:
         found, expected = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, most))
         remedy = "import fewer frames at a time, or bin them"
-        raise InputError(culprit, f"{found} to unpack", f"at most {expected} on this machine", remedy)
+        raise InputError(subject, f"{found} to unpack", f"at most {expected} on this machine", remedy)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -69,21 +69,21 @@ def read_numbers(path: Path, count: int, what: str) -> np.ndarray:
 
 def read_npy(path: Path, ndim: int) -> np.ndarray:
     """A numeric array of a .npy file, C order; never a pickle, never larger than the file says."""
-    culprit = str(path)
-    regular_file(path, culprit)
+    subject = str(path)
+    regular_file(path, subject)
     try:
         with open(path, "rb") as file:
             version = np.lib.format.read_magic(file)
             if version not in ((1, 0), (2, 0)):
-                raise InputError(culprit, f"version {version}", "a .npy file of version 1.0 or 2.0")
+                raise InputError(subject, f"version {version}", "a .npy file of version 1.0 or 2.0")
             read = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
             shape, fortran, dtype = read(file)
-            check_array(culprit, shape, dtype, path.stat().st_size - file.tell(), ndim)
+            check_array(subject, shape, dtype, path.stat().st_size - file.tell(), ndim)
             values = np.fromfile(file, dtype, math.prod(shape))
     except (InputError, MemoryError):
         raise
     except Exception as error:  # NumPy hands on whatever Python's parser and tokeniser stumble over
-        raise InputError(culprit, f"a damaged .npy file ({error})", "a NumPy array") from error
+        raise InputError(subject, f"a damaged .npy file ({error})", "a NumPy array") from error
     values = values.reshape(shape, order="F" if fortran else "C")
     return np.ascontiguousarray(values)
 
@@ -113,14 +113,14 @@ def _inflated(path: Path, packed: bytes, size: int) -> bytes:
 
 
 def check_array(
-    culprit: str, shape: tuple[int, ...], dtype: np.dtype, available_bytes: int, ndim: int
+    subject: str, shape: tuple[int, ...], dtype: np.dtype, available_bytes: int, ndim: int
 ) -> None:
     """InputError unless an uncompressed array of numbers fits into the bytes that there are."""
     if dtype.kind not in "iuf" or dtype.itemsize not in (1, 2, 4, 8):
-        raise InputError(culprit, f"type {dtype}", "plain real numbers")
+        raise InputError(subject, f"type {dtype}", "plain real numbers")
     if len(shape) != ndim or min(shape, default=0) < 1:
-        raise InputError(culprit, f"shape {shape}", f"{ndim} axes, none of them empty")
+        raise InputError(subject, f"shape {shape}", f"{ndim} axes, none of them empty")
     needed = math.prod(shape) * dtype.itemsize
     if needed > available_bytes:
         found = f"shape {shape}, {needed} bytes, in {available_bytes} bytes of data"
-        raise InputError(culprit, found, "as many bytes as its header announces", "copy the file again")
+        raise InputError(subject, found, "as many bytes as its header announces", "copy the file again")

@@ -24,15 +24,15 @@ class SafeFolder:
             what = "a file" if self.root.exists() else "nothing there"
             raise InputError(str(self.root), what, "a folder", "check the path")
 
-    def file(self, name: object, culprit: str) -> Path:
-        """The regular file ``name`` below the folder; ``culprit`` says where the name was found."""
-        text = checked_name(name, culprit)
+    def file(self, name: object, subject: str) -> Path:
+        """The regular file ``name`` below the folder; ``subject`` says where the name was found."""
+        text = checked_name(name, subject)
         path = self.root
         for part in PurePosixPath(text).parts:
             path = path / part
             if path.is_symlink():
-                raise InputError(culprit, f"{text!r}, which leads over a symbolic link", "a plain file")
-        regular_file(path, culprit)
+                raise InputError(subject, f"{text!r}, which leads over a symbolic link", "a plain file")
+        regular_file(path, subject)
         return path
 
     def exists(self, name: str) -> bool:
@@ -59,15 +59,15 @@ class SafeFolder:
         return found[0]
 
 
-def checked_name(name: object, culprit: str) -> str:
+def checked_name(name: object, subject: str) -> str:
     """A relative path without "..", with forward slashes; InputError for everything else."""
     if not isinstance(name, str) or not name.strip() or len(name) > _LONGEST_NAME or "\0" in name:
-        raise InputError(culprit, repr(name)[:80], "the name of a file in the same folder")
+        raise InputError(subject, repr(name)[:80], "the name of a file in the same folder")
     text = name.replace("\\", "/")
     outside = PureWindowsPath(name).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if outside:
         expected = "a name inside the folder"
-        raise InputError(culprit, repr(name)[:80], expected, "copy the file into the folder")
+        raise InputError(subject, repr(name)[:80], expected, "copy the file into the folder")
     return text
 
 

@@ -30,7 +30,7 @@ class LineIntegrals:
 
 
 def line_integrals(
-    culprit: str,
+    subject: str,
     frames: np.ndarray,
     options: ImportOptions,
     *,
@@ -39,37 +39,37 @@ def line_integrals(
     custom: str | None = None,
 ) -> LineIntegrals:
     """Line integrals of ``frames`` (P, v, u) of any real type; clipped counts and values that no object has are masked,
-    and said. ``culprit`` names the file; ``flats``, ``darks``: (n, v, u) or None. The options' ``quantity`` wins over
+    and said. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The options' ``quantity`` wins over
     ``custom``, the format's or file's; where neither says, frames with flats are counts and others refused."""
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
     quantity = options.quantity or custom or ("counts" if has_flats else None)
     if quantity is None:
         remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
-        raise InputError(f"{culprit} quantity", "nothing that says it", "what the pixels hold", remedy)
+        raise InputError(f"{subject} quantity", "nothing that says it", "what the pixels hold", remedy)
     saturation = flat = None
     if quantity == "counts":
         if options.flat_value is not None or flats is None or len(flats) == 0:
-            flats = _constant_flat(culprit, frames, options)
+            flats = _constant_flat(subject, frames, options)
         for stack in (flats, darks):
             if stack is not None and len(stack) and stack.shape[1:] != frames.shape[1:]:
                 found = f"flats or darks of {stack.shape[1:]}"
-                raise InputError(culprit, found, f"the projections' {frames.shape[1:]} pixels")
+                raise InputError(subject, found, f"the projections' {frames.shape[1:]} pixels")
         with np.errstate(over="ignore", invalid="ignore"):
             flat = flats.mean(axis=0, dtype=np.float64)
             saturation = find_saturation(frames, flat)
     integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
-        _log.warning(text, culprit, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
+        _log.warning(text, subject, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if flat is not None and saturation is not None and saturation.share > 0:
-        _mask_clipped(culprit, frames, flat, saturation, unusable)
+        _mask_clipped(subject, frames, flat, saturation, unusable)
     is_divided = quantity == "counts" and options.flat_value is None
     counts = [len(stack) if is_divided and stack is not None else 0 for stack in (flats, darks)]
     return LineIntegrals(integrals, compact(unusable), saturation, applied_facts(*counts))
 
 
 def _mask_clipped(
-    culprit: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
+    subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
 ) -> None:
     """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object. Where the
     flat is clipped too the integral is 0: right for air, which is most of it; without air a reconstruction is 2 to 3
@@ -79,7 +79,7 @@ def _mask_clipped(
         bad |= (frame == saturation.level) & brighter
     fate = "masked, each in its own frame" if brighter.any() else "taken as air, for the flats are clipped too"
     text = "%s: %.3g %% of the projections' pixels are clipped at %g counts: %s"
-    _log.warning(text, culprit, 100 * saturation.share, saturation.level, fate)
+    _log.warning(text, subject, 100 * saturation.share, saturation.level, fate)
 
 
 def compact(mask: np.ndarray) -> Mask:
@@ -102,8 +102,8 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
     return array
 
 
-def _constant_flat(culprit: str, frames: np.ndarray, options: ImportOptions) -> np.ndarray:
+def _constant_flat(subject: str, frames: np.ndarray, options: ImportOptions) -> np.ndarray:
     if options.flat_value is None:
         remedy = f"add flat frames, or say {options.named('flat_value')}"
-        raise InputError(f"{culprit} flats", "none", "flat frames to divide counts by", remedy)
+        raise InputError(f"{subject} flats", "none", "flat frames to divide counts by", remedy)
     return np.full((1, *frames.shape[1:]), options.flat_value, np.float32)

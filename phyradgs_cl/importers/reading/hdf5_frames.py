@@ -11,16 +11,16 @@ from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
 
 def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:
     """Frames (F, v, u) in their own type; with ``panel``, all of that shape, and one alone may come as (v, u)."""
-    dataset, culprit = source.dataset(address), source.name(address)
+    dataset, subject = source.dataset(address), source.name(address)
     if dataset.dtype.kind not in "iuf":
-        raise InputError(culprit, f"type {dataset.dtype}", "real numbers")
+        raise InputError(subject, f"type {dataset.dtype}", "real numbers")
     if panel is not None and dataset.shape == panel:
         return read_values(source, address, dataset)[None]
     if dataset.ndim != 3 or min(dataset.shape) < 1:
-        raise InputError(culprit, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
+        raise InputError(subject, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
     if panel is not None and dataset.shape[1:] != panel:
         expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
-        raise InputError(culprit, f"shape {dataset.shape}", expected)
+        raise InputError(subject, f"shape {dataset.shape}", expected)
     return read_values(source, address, dataset)
 
 

@@ -29,34 +29,34 @@ def read_meta_stack(path: Path) -> Voxels:
 def read_meta_image(path: Path) -> Voxels:
     """An image of three axes."""
     header, start = _header(path)
-    culprit = str(path)
+    subject = str(path)
     if header.get("NDims") != "3":
-        raise InputError(f"{culprit} NDims", header.get("NDims", "nothing"), "3 axes")
+        raise InputError(f"{subject} NDims", header.get("NDims", "nothing"), "3 axes")
     if header.get("ElementNumberOfChannels", "1") != "1":
-        raise InputError(f"{culprit} ElementNumberOfChannels", header["ElementNumberOfChannels"], "1")
-    shape = tuple(int(n) for n in header_numbers(culprit, header, "DimSize", 3)[::-1])
+        raise InputError(f"{subject} ElementNumberOfChannels", header["ElementNumberOfChannels"], "1")
+    shape = tuple(int(n) for n in header_numbers(subject, header, "DimSize", 3)[::-1])
     word = header.get("ElementType", "nothing")
     if word not in _TYPES:
-        raise InputError(f"{culprit} ElementType", word[:40], ", ".join(_TYPES))
+        raise InputError(f"{subject} ElementType", word[:40], ", ".join(_TYPES))
     orders = [header[key] for key in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB") if key in header]
     big = orders[:1] and orders[0] in ("True", "true", "1")
     dtype = np.dtype(_TYPES[word]).newbyteorder(">" if big else "<")
     values = _voxels(path, header, start, shape, dtype)
-    spacing = header_numbers(culprit, header, "ElementSpacing", 3, "1 1 1")
+    spacing = header_numbers(subject, header, "ElementSpacing", 3, "1 1 1")
     if spacing.min() <= 0:
-        raise InputError(f"{culprit} ElementSpacing", str(spacing.tolist()), "lengths above 0")
+        raise InputError(f"{subject} ElementSpacing", str(spacing.tolist()), "lengths above 0")
     places = [key for key in ("Offset", "Position", "Origin") if key in header]
-    origin = header_numbers(culprit, header, places[0] if places else "Offset", 3, "0 0 0")
-    steps = spacing[:, None] * _axes(culprit, header)
+    origin = header_numbers(subject, header, places[0] if places else "Offset", 3, "0 0 0")
+    steps = spacing[:, None] * _axes(subject, header)
     return Voxels(values, steps, origin, header.get("Comment", ""))
 
 
-def _axes(culprit: str, header: dict[str, str]) -> np.ndarray:
+def _axes(subject: str, header: dict[str, str]) -> np.ndarray:
     keys = [key for key in ("TransformMatrix", "Rotation", "Orientation") if key in header]
     key = keys[0] if keys else "TransformMatrix"
-    axes = header_numbers(culprit, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
+    axes = header_numbers(subject, header, key, 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
-        raise InputError(f"{culprit} {key}", str(axes.tolist())[:80], "three directions at right angles")
+        raise InputError(f"{subject} {key}", str(axes.tolist())[:80], "three directions at right angles")
     return axes
 
 

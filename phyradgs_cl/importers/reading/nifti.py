@@ -20,21 +20,21 @@ _MOST_EXTENSION = 1 << 24
 
 def read_nifti(path: Path) -> Voxels:
     """An image of three axes; its frame is that of sform, else of qform."""
-    culprit = str(path)
-    size = regular_file(path, culprit).st_size
+    subject = str(path)
+    size = regular_file(path, subject).st_size
     packed = path.suffix.lower() == ".gz"
     try:
         with gzip.open(path) if packed else open(path, "rb") as file:
-            head = _header(culprit, file.read(HEADER.itemsize))
-            start, shape, dtype = _layout(culprit, head)
+            head = _header(subject, file.read(HEADER.itemsize))
+            start, shape, dtype = _layout(subject, head)
             available = size * MOST_INFLATION if packed else size - start
-            check_array(culprit, shape, dtype, available, 3)
+            check_array(subject, shape, dtype, available, 3)
             file.seek(start)
             data = file.read(math.prod(shape) * dtype.itemsize)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(culprit, f"data that cannot be read ({error})", "a NIfTI-1 file") from error
+        raise InputError(subject, f"data that cannot be read ({error})", "a NIfTI-1 file") from error
     if len(data) != math.prod(shape) * dtype.itemsize:
-        raise InputError(culprit, f"{len(data)} bytes of voxels", f"{math.prod(shape) * dtype.itemsize}")
+        raise InputError(subject, f"{len(data)} bytes of voxels", f"{math.prod(shape) * dtype.itemsize}")
     values = np.frombuffer(data, dtype).reshape(shape)
     slope, shift = float(head["scl_slope"]), float(head["scl_inter"])
     if slope not in (0.0, 1.0) or (slope and shift):
@@ -45,26 +45,26 @@ def read_nifti(path: Path) -> Voxels:
     return Voxels(values, steps * RAS * unit_mm, origin * RAS * unit_mm, note)
 
 
-def _header(culprit: str, text: bytes) -> np.void:
+def _header(subject: str, text: bytes) -> np.void:
     """The header in the byte order in which it says how long it is."""
     for stored in (HEADER.newbyteorder("<"), HEADER.newbyteorder(">")):
         if len(text) == HEADER.itemsize:
             head = np.frombuffer(text, stored)[0]
             if head["sizeof_hdr"] == HEADER.itemsize and head["magic"] == b"n+1":
                 return head
-    raise InputError(culprit, "no header of NIfTI-1", "a single-file NIfTI-1 image (.nii, .nii.gz)")
+    raise InputError(subject, "no header of NIfTI-1", "a single-file NIfTI-1 image (.nii, .nii.gz)")
 
 
-def _layout(culprit: str, head: np.void) -> tuple[int, tuple[int, ...], np.dtype]:
+def _layout(subject: str, head: np.void) -> tuple[int, tuple[int, ...], np.dtype]:
     """Where the voxels begin, their shape (k, j, i) and type."""
     axes, counts = int(head["dim"][0]), head["dim"][1:].tolist()
     if not 3 <= axes <= 7 or any(n != 1 for n in counts[3:axes]):
-        raise InputError(f"{culprit} dim", str(head["dim"].tolist()), "three axes")
+        raise InputError(f"{subject} dim", str(head["dim"].tolist()), "three axes")
     code, start = int(head["datatype"]), float(head["vox_offset"])
     if code not in _TYPES:
-        raise InputError(f"{culprit} datatype", str(code), "plain real numbers")
+        raise InputError(f"{subject} datatype", str(code), "plain real numbers")
     if not VOXELS_AT <= start <= _MOST_EXTENSION:
-        raise InputError(f"{culprit} vox_offset", f"{start:g}", f"{VOXELS_AT} to {_MOST_EXTENSION}")
+        raise InputError(f"{subject} vox_offset", f"{start:g}", f"{VOXELS_AT} to {_MOST_EXTENSION}")
     return int(start), tuple(counts[2::-1]), np.dtype(_TYPES[code]).newbyteorder(head.dtype["dim"].base.byteorder)
 
 

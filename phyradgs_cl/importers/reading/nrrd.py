@@ -33,37 +33,37 @@ _SPACES = {
 
 def read_nrrd(path: Path) -> Voxels:
     """An image of three axes; without "space directions" or "spacings" it is bare."""
-    culprit = str(path)
+    subject = str(path)
     header, start = _header(path)
     for key, accepted in (("dimension", ("3",)), ("encoding", ("raw", "gzip", "gz"))):
         if header.get(key, "").lower() not in accepted:
-            raise InputError(f"{culprit} {key}", header.get(key, "nothing")[:40], " or ".join(accepted))
+            raise InputError(f"{subject} {key}", header.get(key, "nothing")[:40], " or ".join(accepted))
     for key in ("data file", "datafile", "line skip", "byte skip"):
         if header.get(key, "0") != "0":
-            raise InputError(f"{culprit} {key}", header[key][:40], "the data behind the header, in one file")
+            raise InputError(f"{subject} {key}", header[key][:40], "the data behind the header, in one file")
     kind = header.get("type", "").lower()
     if kind not in _TYPES:
-        raise InputError(f"{culprit} type", kind[:40] or "nothing", "plain real numbers")
+        raise InputError(f"{subject} type", kind[:40] or "nothing", "plain real numbers")
     dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if header.get("endian", "").lower() == "big" else "<")
-    shape = tuple(int(n) for n in header_numbers(culprit, header, "sizes", 3)[::-1])
+    shape = tuple(int(n) for n in header_numbers(subject, header, "sizes", 3)[::-1])
     values = read_raw(path, start, shape, dtype, header["encoding"].lower() != "raw")
-    return Voxels(values, *_frame(culprit, header), header.get("content", ""))
+    return Voxels(values, *_frame(subject, header), header.get("content", ""))
 
 
-def _frame(culprit: str, header: dict[str, str]) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _frame(subject: str, header: dict[str, str]) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Steps (3, 3), one row per axis, and the place (3,) of voxel (0, 0, 0) in LPS mm, where the header has them."""
     space = header.get("space", "").lower()
     if space not in _SPACES:
-        raise InputError(f"{culprit} space", space[:40], ", ".join(name for name in _SPACES if "-" in name))
+        raise InputError(f"{subject} space", space[:40], ", ".join(name for name in _SPACES if "-" in name))
     unit = header.get("space units", '"mm"').replace('"', " ").split()
     factor = LENGTH.factor(unit[0]) if len(set(unit)) == 1 else None
     if factor is None:
-        raise InputError(f"{culprit} space units", header["space units"][:40], LENGTH.accepted)
+        raise InputError(f"{subject} space units", header["space units"][:40], LENGTH.accepted)
     to_lps = _SPACES[space] * factor
-    origin = header_numbers(culprit, header, "space origin", 3) * to_lps if "space origin" in header else None
+    origin = header_numbers(subject, header, "space origin", 3) * to_lps if "space origin" in header else None
     if "space directions" in header:
-        return header_numbers(culprit, header, "space directions", 9).reshape(3, 3) * to_lps, origin
-    return (np.diag(header_numbers(culprit, header, "spacings", 3)) if "spacings" in header else None), origin
+        return header_numbers(subject, header, "space directions", 9).reshape(3, 3) * to_lps, origin
+    return (np.diag(header_numbers(subject, header, "spacings", 3)) if "spacings" in header else None), origin
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:

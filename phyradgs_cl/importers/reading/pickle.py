@@ -28,25 +28,25 @@ _LATIN1 = ("latin1", "latin-1")
 
 def read_pickle(path: Path) -> object:
     """What a pickle file holds: dicts, lists, tuples, text, numbers, NumPy arrays. InputError for anything else."""
-    culprit = str(path)
-    size = regular_file(path, culprit).st_size
-    check_room(culprit, _BESIDE * size)
-    data = read_regular(path, culprit, size, "a pickle")
+    subject = str(path)
+    size = regular_file(path, subject).st_size
+    check_room(subject, _BESIDE * size)
+    data = read_regular(path, subject, size, "a pickle")
     try:
-        return PlainUnpickler(culprit, data).load()
+        return PlainUnpickler(subject, data).load()
     except InputError:
         raise
     except Exception as error:  # a stranger's opcodes in any order: every failure is the file's
         found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(culprit, found, "a pickle of plain containers and NumPy arrays") from error
+        raise InputError(subject, found, "a pickle of plain containers and NumPy arrays") from error
 
 
 class PlainUnpickler(pickle._Unpickler):
-    """Plain containers, and arrays of real numbers, of the pickle ``data``; ``culprit`` is how errors name it."""
+    """Plain containers, and arrays of real numbers, of the pickle ``data``; ``subject`` is how errors name it."""
 
-    def __init__(self, culprit: str, data: bytes) -> None:
+    def __init__(self, subject: str, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")  # Python 2 wrote an array's bytes as text
-        self._culprit = culprit
+        self._subject = subject
         self._bytes_left = _MOST_COPIES * len(data) + _FREE_BYTES
         self._names = {
             ("numpy", "ndarray"): object(),  # named in the arguments of _reconstruct, never called
@@ -74,7 +74,7 @@ class PlainUnpickler(pickle._Unpickler):
 
     def refuse(self, found: str) -> NoReturn:
         """Raises InputError for what no plain file holds."""
-        raise InputError(self._culprit, found, "plain containers and NumPy arrays", "nothing was executed")
+        raise InputError(self._subject, found, "plain containers and NumPy arrays", "nothing was executed")
 
     def _spend(self, count: int) -> None:
         self._bytes_left -= count

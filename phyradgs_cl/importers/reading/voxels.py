@@ -29,39 +29,39 @@ class Voxels:
     note: str = ""
 
 
-def along_world_axes(culprit: str, stored: Voxels) -> LoadedVolume:
+def along_world_axes(subject: str, stored: Voxels) -> LoadedVolume:
     """The volume (z, y, x) float32 along rising world axes, and its grid; bare integers as shares of their type's
     maximum. InputError: Hounsfield units, axes that are oblique, lengths that are absurd, NaN or infinity."""
     if "HU" in stored.note.split():
-        raise InputError(culprit, "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
+        raise InputError(subject, "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
     values, steps = stored.values, stored.steps_mm
     if steps is None:
         most = np.iinfo(values.dtype).max if values.dtype.kind in "iu" else 1
-        return LoadedVolume(_float32(culprit, values / np.float32(most)), None)
+        return LoadedVolume(_float32(subject, values / np.float32(most)), None)
     sizes = np.abs(steps).max(axis=1)
     for size in sizes:
-        checks.within(f"{culprit}: voxel size (mm)", float(size), 1 / LENGTH.largest, LENGTH.largest)
+        checks.within(f"{subject}: voxel size (mm)", float(size), 1 / LENGTH.largest, LENGTH.largest)
     world = np.abs(steps).argmax(axis=1).tolist()
     across = np.abs(steps).sum(axis=1) - sizes
     if sorted(world) != [0, 1, 2] or np.any(across > _OBLIQUE * sizes):
         found = f"voxel steps {np.round(steps, 4).tolist()} mm"
-        raise InputError(culprit, found, "axes along the world's", "resample it onto such a grid")
+        raise InputError(subject, found, "axes along the world's", "resample it onto such a grid")
     index = [world.index(axis) for axis in (2, 1, 0)]  # of z, y, x among i, j, k
     turned = values.transpose([2 - n for n in index])
     falling = [n for n, axis in zip(index, (2, 1, 0), strict=True) if steps[n, axis] < 0]
     turned = np.flip(turned, tuple(index.index(n) for n in falling))
     size_mm = triple(float(sizes[n]) for n in index)
     if stored.origin_mm is None:
-        return LoadedVolume(_float32(culprit, turned), Grid(turned.shape, size_mm))
+        return LoadedVolume(_float32(subject, turned), Grid(turned.shape, size_mm))
     counts = np.array(values.shape[::-1])
     centre_mm = stored.origin_mm + ((counts - 1) / 2) @ steps
     if not np.all(np.abs(centre_mm) <= LENGTH.largest):
-        raise InputError(f"{culprit}: origin", str(stored.origin_mm.tolist())[:80], "three lengths in mm")
-    return LoadedVolume(_float32(culprit, turned), Grid(turned.shape, size_mm, triple(centre_mm[::-1])))
+        raise InputError(f"{subject}: origin", str(stored.origin_mm.tolist())[:80], "three lengths in mm")
+    return LoadedVolume(_float32(subject, turned), Grid(turned.shape, size_mm, triple(centre_mm[::-1])))
 
 
 def header_numbers(
-    culprit: str, header: Mapping[str, str], key: str, count: int, default: str = "nothing"
+    subject: str, header: Mapping[str, str], key: str, count: int, default: str = "nothing"
 ) -> np.ndarray:
     """(count,) numbers of a text header, with spaces, commas or brackets between."""
     text = header.get(key, default)
@@ -70,12 +70,12 @@ def header_numbers(
     except ValueError:
         values = np.empty(0)
     if len(values) != count or not np.all(np.abs(values) <= LARGEST):
-        raise InputError(f"{culprit} {key}", text[:60] or "nothing", f"{count} numbers")
+        raise InputError(f"{subject} {key}", text[:60] or "nothing", f"{count} numbers")
     return values
 
 
-def _float32(culprit: str, values: np.ndarray) -> np.ndarray:
+def _float32(subject: str, values: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):  # what float32 cannot hold is infinite, and refused
         volume = np.ascontiguousarray(values, np.float32)
-    checks.finite(culprit, volume)
+    checks.finite(subject, volume)
     return volume

@@ -20,18 +20,18 @@ _log = logging.getLogger(__name__)
 
 def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf") -> np.ndarray:
     """All values of a dataset in their own type; InputError unless NumPy's kind of it is in ``kinds``."""
-    culprit = source.name(address)
+    subject = source.name(address)
     try:
         kind = dataset.dtype.kind
         if kind not in kinds:
             wanted = "numbers" if "f" in kinds else "whole numbers"
-            raise InputError(culprit, f"type {dataset.dtype}", wanted, "store them as plain HDF5 numbers")
+            raise InputError(subject, f"type {dataset.dtype}", wanted, "store them as plain HDF5 numbers")
         return np.asarray(_unfolded(dataset))
     except MemoryError as error:
         found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
-        raise OutOfMemoryError(culprit, found, "data that this machine's memory can hold") from error
+        raise OutOfMemoryError(subject, found, "data that this machine's memory can hold") from error
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(culprit, _damage(error), "readable data") from error
+        raise InputError(subject, _damage(error), "readable data") from error
 
 
 def _unfolded(dataset: h5py.Dataset) -> object:
@@ -135,7 +135,7 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
     found = source.find(address)
     if found is None:
         return None
-    culprit = f"{source.name(address)} @{name}"
+    subject = f"{source.name(address)} @{name}"
     try:
         if name not in found.attrs:
             return None
@@ -143,9 +143,9 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
         value = found.attrs[name] if math.prod(shape) == 1 else f"shape {shape}"
         text = as_text(value) if math.prod(shape) == 1 else None
     except (OSError, RuntimeError, TypeError, ValueError, LookupError) as error:
-        raise InputError(culprit, f"an attribute that HDF5 cannot read ({error})", "a string") from error
+        raise InputError(subject, f"an attribute that HDF5 cannot read ({error})", "a string") from error
     if text is None:
-        raise InputError(culprit, checks.shown(value), "a string")
+        raise InputError(subject, checks.shown(value), "a string")
     return text
 
 

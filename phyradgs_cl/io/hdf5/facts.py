@@ -59,18 +59,18 @@ def damage(facts: Mapping[str, object], schema: Schema, required: Collection[str
     return wrong
 
 
-def read_facts(culprit: str, text: str, schema: Schema) -> Facts:
+def read_facts(subject: str, text: str, schema: Schema) -> Facts:
     """The JSON object in ``text`` (else InputError) without its damaged fields, of which the log has a word."""
     try:
         if len(text) > MOST_BYTES:
             raise ValueError(f"{len(text)} characters")
         facts = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(culprit, f"text that is not JSON ({error})", "a JSON object") from error
+        raise InputError(subject, f"text that is not JSON ({error})", "a JSON object") from error
     if not isinstance(facts, dict):
-        raise InputError(culprit, f"JSON {type(facts).__name__}", "a JSON object")
+        raise InputError(subject, f"JSON {type(facts).__name__}", "a JSON object")
     for name, expected in damage(facts, schema).items():
-        _log.warning("%s: %s is left out: expected %s", culprit, checks.shown(name), expected)
+        _log.warning("%s: %s is left out: expected %s", subject, checks.shown(name), expected)
         del facts[name]
     return facts
 

@@ -16,20 +16,20 @@ from phyradgs_cl.io.scan import schema
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
     """The frames' dataset (F, v, u), unread, and what it holds."""
     address = f"{entry}/{schema.DETECTOR}/data"
-    data, culprit = source.dataset(address), source.name(address)
+    data, subject = source.dataset(address), source.name(address)
     if data.ndim != 3 or min(data.shape) < 1:
-        raise InputError(culprit, f"shape {data.shape}", "three axes (frame, v, u), none of them empty")
+        raise InputError(subject, f"shape {data.shape}", "three axes (frame, v, u), none of them empty")
     if (data.dtype.kind, data.dtype.itemsize) not in (("f", 4), ("u", 2)):
-        raise InputError(culprit, f"type {data.dtype}", "float32 or uint16", "convert the frames")
+        raise InputError(subject, f"type {data.dtype}", "float32 or uint16", "convert the frames")
     quantity = h5.read_attribute(source, address, "quantity")
     if quantity is None:
         remedy = "add the attribute to the dataset"
         expected = "one of " + ", ".join(schema.QUANTITIES)
-        raise InputError(f"{culprit} @quantity", "no attribute", expected, remedy)
-    checks.one_of(f"{culprit} @quantity", quantity, schema.QUANTITIES)
+        raise InputError(f"{subject} @quantity", "no attribute", expected, remedy)
+    checks.one_of(f"{subject} @quantity", quantity, schema.QUANTITIES)
     if quantity != "counts" and data.dtype.kind == "u":
         remedy = "store float32, or counts as uint16"
-        raise InputError(culprit, f"{quantity} as {data.dtype}", "float32", remedy)
+        raise InputError(subject, f"{quantity} as {data.dtype}", "float32", remedy)
     return data, quantity
 
 
@@ -99,18 +99,18 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
-    culprit = source.name(address)
+    subject = source.name(address)
     if dataset.shape not in ((), (1,), used.shape):
-        raise InputError(culprit, f"shape {dataset.shape}", f"one number or shape {used.shape}")
+        raise InputError(subject, f"shape {dataset.shape}", f"one number or shape {used.shape}")
     values = h5.read_values(source, address, dataset).astype(np.float64).reshape(-1)
     values = values if values.shape != used.shape else values[used]
-    checks.finite(culprit, values)
+    checks.finite(subject, values)
     values = h5.in_unit(source, address, values, TIME)
     if values.min() < 0:
-        raise InputError(culprit, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
+        raise InputError(subject, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
     if np.ptp(values) > 1e-6 * values.max():
         expected = "one time for all projections"
-        raise InputError(culprit, f"{values.min():.6g} to {values.max():.6g} s", expected)
+        raise InputError(subject, f"{values.min():.6g} to {values.max():.6g} s", expected)
     return float(values[0])
 
 

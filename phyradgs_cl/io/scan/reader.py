@@ -31,7 +31,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     or the conversion calls bad, as everything that is not finite must be.
 
     Raises:
-        InputError: the file is missing, damaged or incomplete; its culprit is "FILE:/hdf5/path".
+        InputError: the file is missing, damaged or incomplete; its subject is "FILE:/hdf5/path".
     """
     with open_hdf5(path) as source:
         header = read_header(source)
@@ -159,7 +159,7 @@ def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None
 
 
 def _convert(
-    culprit: str, header: ScanHeader, data: np.ndarray, to_attenuation: ToAttenuation
+    subject: str, header: ScanHeader, data: np.ndarray, to_attenuation: ToAttenuation
 ) -> tuple[np.ndarray, np.ndarray | None]:
     valid = header.image_key != schema.INVALID
     if not valid.all():
@@ -167,14 +167,14 @@ def _convert(
     try:
         projections, bad = to_attenuation(data, header.image_key[valid], header.quantity)
     except InputError as error:
-        raise InputError(f"{culprit} ({error.culprit})", error.found, error.expected, error.remedy) from error
+        raise InputError(f"{subject} ({error.subject})", error.found, error.expected, error.remedy) from error
     if projections.shape != header.scan.projections.shape:
-        raise InputError(culprit, f"line integrals {projections.shape}", str(header.scan.projections.shape))
-    checks.finite(culprit, projections)
+        raise InputError(subject, f"line integrals {projections.shape}", str(header.scan.projections.shape))
+    checks.finite(subject, projections)
     largest = float(np.abs(projections).max())
     if largest > LARGEST_LINE_INTEGRAL:
         expected = f"at most {LARGEST_LINE_INTEGRAL:g}: nothing shines through more than some tens"
-        raise InputError(culprit, f"a line integral of size {largest:.6g}", expected, "check the quantity")
+        raise InputError(subject, f"a line integral of size {largest:.6g}", expected, "check the quantity")
     return np.ascontiguousarray(projections, dtype=np.float32), bad
 
 

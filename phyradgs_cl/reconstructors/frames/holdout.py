@@ -18,12 +18,12 @@ _SEED = 20
 _FRAMES = 8  # that are projected at one time
 
 
-def held_out(scan: Scan, percent: float, seed: int = _SEED, culprit: str = "--holdout") -> np.ndarray:
+def held_out(scan: Scan, percent: float, seed: int = _SEED, subject: str = "--holdout") -> np.ndarray:
     """Pixels (F, v, u) bool, so many percent of those that may be used, drawn once and for all. InputError for none."""
     drawn = np.random.default_rng(seed).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
-        raise InputError(culprit, f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
+        raise InputError(subject, f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
     return held
 
 

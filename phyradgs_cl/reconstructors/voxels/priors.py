@@ -198,7 +198,7 @@ class OwnPrior(Prior):
     """A user's denoiser on the host, in the place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
 
     def __init__(self, denoiser: Denoiser) -> None:
-        self.denoiser, self.culprit = denoiser, f"--prior {function_name(denoiser)}"
+        self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         before = space.numpy(volume)
@@ -207,6 +207,6 @@ class OwnPrior(Prior):
         except Exception as error:  # whatever somebody's function does
             at = traceback.extract_tb(error.__traceback__)[-1]
             found = f"{type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
-            raise InputError(self.culprit, found, "a function of (volume, noise) that returns a volume") from error
-        cleaned = checks.numbers(self.culprit, made, before.shape).astype(np.float32)
+            raise InputError(self.subject, found, "a function of (volume, noise) that returns a volume") from error
+        cleaned = checks.numbers(self.subject, made, before.shape).astype(np.float32)
         return space.array(np.maximum(cleaned, 0) if nonnegative else cleaned)

@@ -186,8 +186,8 @@ def _setting(values: dict[str, Any], where: str) -> Setting:
         return _checked(values)
     except PhyradgsError as error:
         told = ", ".join(f"{name}={checks.shown(value)}" for name, value in values.items())
-        culprit = f"{where} ({told}): {error.culprit}"
-        raise type(error)(culprit, error.found, error.expected, error.remedy) from error
+        subject = f"{where} ({told}): {error.subject}"
+        raise type(error)(subject, error.found, error.expected, error.remedy) from error
 
 
 def _checked(values: dict[str, Any]) -> Setting:

@@ -15,7 +15,7 @@ _WILD = frozenset("*?[")
 class Search:
     """Looks at ``most`` entries of folders, and no deeper than ``deepest`` of them; links to folders only where named."""
 
-    culprit: str
+    subject: str
     most: int = 100_000
     deepest: int = 16
 
@@ -57,7 +57,7 @@ class Search:
                     self.most -= 1
                     if self.most < 0:
                         remedy = "name the folders of the scans"
-                        raise InputError(self.culprit, "a pattern that covers too many files", "fewer", remedy)
+                        raise InputError(self.subject, "a pattern that covers too many files", "fewer", remedy)
                     found.append(entry)
         except OSError:  # no folder, or one that cannot be read
             return []
