@@ -1,13 +1,12 @@
-"""Motion models: how a reconstruction turns a frame of a scan into time cells.
+"""Motion models: each turns a frame of a scan into time cells.
 
-A model is a frozen class with ``cells(scan, frame)``; one of your own works in every method (docs/methods.md). A scan
-that is not a fly-scan has one pose per frame in all of these.
+A model is a frozen class with ``cells(scan, frame)``. A class of your own works in every method (docs/methods.md).
+On a stop-and-shoot scan every model of this module gives one pose per frame.
 """
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any
-from typing import Protocol as Interface
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -21,14 +20,16 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
 
-_WHOLE = 1e-3  # how far a line's weights may be from 1, where they are somebody else's
+RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
+"""The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
+_WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
 
 
-class Motion(Interface):
-    """What methods ask of a model. Its ``name``, if it has one, and a dataclass's fields go into the result's facts."""
+class Motion(Protocol):
+    """The interface of a motion model. ``name``, where there is one, and dataclass fields go into a result's provenance."""
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The time cells of one frame, whose line weights sum to 1."""
+        """Returns the time cells of one frame. The weights of every line sum to 1."""
         ...
 
 
@@ -38,30 +39,33 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 
 @dataclass(frozen=True)
 class Static:
-    """One pose per frame, at the middle of its lit span: a gantry that stands still."""
+    """One pose per frame, at the middle of its lit span: ignores the motion of the gantry."""
 
+    operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: one, at mid-window."""
+        """Returns the ``TimeCells`` of one frame: one cell, at the middle of the lit span."""
         return cells.static_cells(*_place(scan, frame))
 
 
 @dataclass(frozen=True)
 class StaticStart:
-    """One pose per frame, its first."""
+    """One pose per frame, at first light: the volume is rotated by half the span against ``static``."""
 
+    operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static-start", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: one, at the frame's opening."""
+        """Returns the ``TimeCells`` of one frame: one cell, at first light."""
         return cells.static_start_cells(*_place(scan, frame))
 
 
 @dataclass(frozen=True)
 class MicroViews:
-    """M ``strips`` × N ``sub_intervals`` poses per frame, as in the paper. Raises InputError for counts below 1."""
+    """M ``strips`` of lines × N ``sub_intervals`` poses per frame (paper, Eq. 2). Raises InputError for counts below 1."""
 
+    operators: ClassVar = (RAYS, SPLATS)
     name: str = field(default="micro-views", init=False, repr=False)
     strips: int = 8
     sub_intervals: int = 5
@@ -71,7 +75,7 @@ class MicroViews:
         checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: strips × sub-intervals of them."""
+        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.micro_view_cells(*_place(scan, frame), self.strips, self.sub_intervals)
@@ -79,11 +83,12 @@ class MicroViews:
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line over its own window, at times that all lines of a frame share: ``sub_intervals`` to an exposure.
+    """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure.
 
-    A line weighs each time by the share of its window that lies there. Raises InputError for a count below 1.
+    The weight of a line in a cell is the share of its window that lies there. Raises InputError for a count below 1.
     """
 
+    operators: ClassVar = (RAYS,)
     name: str = field(default="per-row", init=False, repr=False)
     sub_intervals: int = 5
 
@@ -91,7 +96,7 @@ class PerRow:
         checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: an exposure / sub-intervals each, from first light to last."""
+        """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals, from first light to last."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = scan.trajectory, scan.shutter, frame, scan.frame_start_s, scan.lines
@@ -100,11 +105,12 @@ class PerRow:
 
 @dataclass(frozen=True)
 class OwnTimes:
-    """Every line at ``sub_intervals`` times of its own exposure, as in the simulator: ``per-row`` is faster and as exact.
+    """Every line has ``sub_intervals`` poses of its own in its exposure, as in the simulator.
 
-    Raises InputError for a count below 1.
+    ``per-row`` is faster and equally exact. Raises InputError for a count below 1.
     """
 
+    operators: ClassVar = (RAYS,)
     name: str = field(default="own-times", init=False, repr=False)
     sub_intervals: int = 5
 
@@ -112,7 +118,7 @@ class OwnTimes:
         checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: sub-intervals for every line."""
+        """Returns the ``TimeCells`` of one frame: sub-intervals cells for every line."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.per_line_cells(*_place(scan, frame), self.sub_intervals)
@@ -120,23 +126,25 @@ class OwnTimes:
 
 @dataclass(frozen=True)
 class LineMiddles:
-    """Every line at the middle of its own exposure: ``per-row`` of a method that has one pose per line."""
+    """Every line has one pose, at the middle of its own exposure: the ``per-row`` of filtered backprojection."""
 
+    operators: ClassVar = (LINE_POSES,)
     name: str = field(default="per-row", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: one for every line."""
+        """Returns the ``TimeCells`` of one frame: one cell for every line."""
         return OwnTimes(1).cells(scan, frame)
 
 
 @dataclass(frozen=True)
 class Exact:
-    """``segments`` of a frame, in which splats move while every line integrates over its own window.
+    """``segments`` per frame in which splats move; every line integrates over its own window.
 
-    0 segments chooses the number so that the error stays below ``time_error`` (dimensionless: a share of a frame's RMS),
-    which also bounds the rules that average over time. Raises InputError for numbers out of range.
+    With 0 segments their number keeps the error of a frame below ``time_error``, relative to the frame's RMS. ``time_error``
+    also bounds the error of quadrature over time. Raises InputError for numbers out of range.
     """
 
+    operators: ClassVar = (SPLATS,)
     name: str = field(default="exact", init=False, repr=False)
     segments: int = 0
     time_error: float = 0.005
@@ -146,7 +154,7 @@ class Exact:
         checks.within("time_error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """The ``TimeCells`` of one frame of a scan: its segments. intensity_peak: as for ``segments_for``."""
+        """Returns the ``TimeCells`` of one frame: its segments. intensity_peak: as in ``segments_for``."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -154,15 +162,18 @@ class Exact:
         return cells.exact_cells(*where, segments)
 
 
-STILL = (Static(), StaticStart(), MicroViews(), PerRow(), OwnTimes())
-"""The models whose cells stand still, as they are by themselves."""
 MODELS = (Static, StaticStart, MicroViews, PerRow, OwnTimes, Exact, LineMiddles)
 MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
 """The names of the models."""
 
 
+def motions_for(*operators: str) -> tuple[Motion, ...]:
+    """Returns the models that one of these kinds of operator can take, each with its default numbers."""
+    return tuple(model() for model in MODELS if set(operators) & set(model.operators))
+
+
 def motion_of(motion: str | Motion) -> Motion:
-    """A model by its name, as it is by itself; a model as it is."""
+    """Returns the model of a name, with its default numbers; a model is returned unchanged. InputError: unknown name."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
@@ -171,52 +182,48 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def motion_facts(motion: Motion) -> dict[str, object]:
-    """Name and fields of a model, for a result's facts; what JSON has no word for as Python prints it."""
-    own: dict[str, Any] = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
-    own = {key: value.item() if isinstance(value, np.generic) else value for key, value in own.items()}
-    plain = {key: value if isinstance(value, int | float | str) else repr(value) for key, value in own.items()}
+    """Returns a model's name and fields for the provenance. Values that JSON cannot hold become their ``repr``."""
+    values: dict[str, Any] = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
+    values = {key: value.item() if isinstance(value, np.generic) else value for key, value in values.items()}
+    plain = {key: value if isinstance(value, int | float | str) else repr(value) for key, value in values.items()}
     return {"name": str(getattr(motion, "name", type(motion).__name__)), **plain}
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """The inverse of ``motion_facts``; None for a model that is not ours, whose fields are passed over. InputError and
-    TypeError for values that a model does not take."""
-    name = facts.get("name")
+    """Inverts ``motion_facts``. Returns None for a model of the user's own. InputError or TypeError: values out of range."""
     for model in MODELS:
-        own = [f.name for f in fields(model) if f.init]
-        if model.name == name and all(key in facts for key in own):
-            return model(**{key: facts[key] for key in own})  # type: ignore[arg-type]
+        keys = [f.name for f in fields(model) if f.init]
+        if model.name == facts.get("name") and all(key in facts for key in keys):
+            return model(**{key: facts[key] for key in keys})  # type: ignore[arg-type]
     return None
 
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
-    """InputError unless a model is of a class in ``taken``, or somebody's own."""
+    """Raises InputError for one of ``MODELS`` whose class is not in ``taken``, and for values that are no model."""
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):
         raise InputError("--motion", checks.shown(motion), "a model with cells(scan, frame)")
-    if isinstance(motion, MODELS) and type(motion) not in {type(own) for own in taken}:
+    if isinstance(motion, MODELS) and type(motion) not in {type(model) for model in taken}:
         raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")
 
 
-def check_own_motion(motion: object, scan: Scan) -> None:
-    """InputError where a model of somebody's own gives no cells for a scan's first frame, or cells that do not fit its
-    lines.
-    """
+def check_own_motion(motion: Motion | None, scan: Scan) -> None:
+    """Raises InputError where the cells that a user's own model gives for the first frame do not fit the scan."""
     if motion is None or isinstance(motion, MODELS):
         return
-    subject, made = f"motion {type(motion).__name__}", motion.cells(scan, 0)  # type: ignore[attr-defined]
-    if not isinstance(made, TimeCells):
-        raise InputError(subject, f"a {type(made).__name__} from cells(scan, frame)", "TimeCells")
-    if (made.lines, made.axis) != (scan.lines, scan.shutter.axis):
-        found, expected = f"cells for {made.lines} {made.axis}", f"{scan.lines} {scan.shutter.axis}"
-        raise InputError(subject, found, expected)
-    checks.shape(f"{subject}: pose", made.pose, (made.count, POSE_LENGTH))
+    subject, table = f"motion {type(motion).__name__}", motion.cells(scan, 0)
+    if not isinstance(table, TimeCells):
+        raise InputError(subject, f"a {type(table).__name__} from cells(scan, frame)", "TimeCells")
+    if (table.lines, table.axis) != (scan.lines, scan.shutter.axis):
+        raise InputError(subject, f"cells for {table.lines} {table.axis}", f"{scan.lines} {scan.shutter.axis}")
+    checks.shape(f"{subject}: pose", table.pose, (table.count, POSE_LENGTH))
     for name in ("time_s", "line_start", "line_stop"):
-        checks.shape(f"{subject}: {name}", getattr(made, name), (made.count,))
-    if made.line_share is not None:
-        checks.shape(f"{subject}: line_share", made.line_share, (made.count, made.lines))
-    weights = made.line_weights()
+        checks.shape(f"{subject}: {name}", getattr(table, name), (table.count,))
+    if table.line_share is not None:
+        checks.shape(f"{subject}: line_share", table.line_share, (table.count, table.lines))
+    weights = table.line_weights()
     worst = float(weights[np.argmax(np.abs(weights - 1))])
-    if abs(worst - 1) > _WHOLE:
-        raise InputError(subject, f"line weights that sum to {worst:.6g}", "1 for every line", "divide them by their sum")
+    if abs(worst - 1) > _WEIGHT_TOLERANCE:
+        found, remedy = f"line weights that sum to {worst:.6g}", "divide them by their sum"
+        raise InputError(subject, found, "1 for every line", remedy)

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Exact, Motion, OwnTimes, PerRow, Scan
-from phyradgs_cl.acquisition.motion import STILL, check_motion, check_own_motion, motion_of
+from phyradgs_cl.acquisition import Motion, OwnTimes, PerRow, Scan
+from phyradgs_cl.acquisition.motion import (
+    RAYS,
+    SPLATS,
+    check_motion,
+    check_own_motion,
+    motion_of,
+    motions_for,
+)
 from phyradgs_cl.api.arrays import Values, computed, placed
 from phyradgs_cl.api.devices import Device, runtime_of
 from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
@@ -47,7 +54,7 @@ def ray_operator(
 
     Raises InputError for what is no Scan or Grid, and for a motion that there is not or that moves within a cell.
     """
-    model, voxels = _checked(scan, motion, STILL), scan.grid if grid is None else _a_grid(grid)
+    model, voxels = _checked(scan, motion, motions_for(RAYS)), scan.grid if grid is None else _a_grid(grid)
     rt = runtime_of(device)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
     return _rays(RayOperator(rt, voxels, scan.geometry.detector_shape, tables))
@@ -102,7 +109,7 @@ def splat_operator(
 
     Raises InputError for what is no Scan, for a motion that there is not, and a cutoff out of range.
     """
-    model = _checked(scan, motion, (*STILL, Exact()))
+    model = _checked(scan, motion, motions_for(RAYS, SPLATS))
     if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
         model = OwnTimes(model.sub_intervals)
     _check_cutoff(cutoff_sigma)

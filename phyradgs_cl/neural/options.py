@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Static
-from phyradgs_cl.acquisition.motion import STILL, check_motion
+from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
 
@@ -58,7 +58,7 @@ class NeuralOptions:
     torch_device: where PyTorch works.
     """
 
-    MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
+    MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
     motion: Motion = Static()
     detector_model: str = "scan"

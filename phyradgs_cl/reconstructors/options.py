@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Exact, Motion
-from phyradgs_cl.acquisition.motion import MODELS, STILL
+from phyradgs_cl.acquisition import Motion
+from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.frames.preprocess import InputOptions
 from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
@@ -18,7 +18,7 @@ from phyradgs_cl.text import near_miss
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
-_ALL = (*STILL, Exact())  # of methods of one's own
+_ALL = motions_for(RAYS, SPLATS)  # of methods of one's own
 
 
 def method_options(

@@ -29,13 +29,16 @@ from phyradgs_cl.acquisition.cells import (
     static_start_cells,
 )
 from phyradgs_cl.acquisition.motion import (
+    LINE_POSES,
     MODELS,
     MOTIONS,
-    STILL,
+    RAYS,
+    SPLATS,
     check_own_motion,
     motion_facts,
     motion_from_facts,
     motion_of,
+    motions_for,
 )
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -149,11 +152,19 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
         assert START_S <= first_s <= last_s <= START_S + 1.1
     with pytest.raises(InputError, match="micro-views"):
         motion_of("micro-view")
-    assert [motion_of(name).name for name in MOTIONS] == list(MOTIONS) and motion_of(STILL[2]) is STILL[2]
+    assert [motion_of(name).name for name in MOTIONS] == list(MOTIONS) and motion_of(model := MicroViews(3)) is model
     for model in MODELS:  # a name is no field that anybody sets
         assert "name" not in repr(model())
         with pytest.raises(TypeError, match="name"):
             model(name="mine")
+
+
+def test_a_model_states_the_operators_that_take_it() -> None:
+    still = [Static(), StaticStart(), MicroViews(), PerRow(), OwnTimes()]
+    assert list(motions_for(RAYS)) == still and list(motions_for(LINE_POSES)) == [Static(), StaticStart(), LineMiddles()]
+    assert list(motions_for(SPLATS)) == [Static(), StaticStart(), MicroViews(), Exact()]
+    for motion in MODELS:  # rays and lines need cells that stand still
+        assert motion().cells(scan(True), 1).is_moving is (motion.operators == (SPLATS,))
 
 
 def test_facts_of_a_model_are_the_model() -> None:

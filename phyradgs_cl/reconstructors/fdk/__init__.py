@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import LineMiddles, Motion, Scan, Static, StaticStart
-from phyradgs_cl.acquisition.motion import check_motion
+from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition.motion import LINE_POSES, check_motion, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
@@ -48,7 +48,7 @@ class FdkOptions:
     object wider than the panel go on beyond it, one of ``WAYS``.
     """
 
-    MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), StaticStart(), LineMiddles())
+    MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
 
     window: str = "ram-lak"
     motion: Motion = Static()

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Static, StaticStart
-from phyradgs_cl.acquisition.motion import check_motion
+from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Static
+from phyradgs_cl.acquisition.motion import SPLATS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
@@ -48,7 +48,7 @@ class SplatOptions:
     rates × √batch. The same batch gives the same bits on any number of ranks (docs/cluster.md).
     """
 
-    MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), StaticStart(), MicroViews(), Exact())
+    MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(SPLATS)
 
     motion: Motion = Exact()
     affine: bool = False

@@ -14,7 +14,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
-from phyradgs_cl.acquisition.motion import STILL, check_motion
+from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.checkpoint import check_like, count_of
@@ -50,7 +50,7 @@ class IterativeOptions:
     noise_stop: ClassVar[float] = 0.0
     """Times the noise, the residual at which the run ends; likewise."""
 
-    MOTIONS: ClassVar[tuple[Motion, ...]] = STILL
+    MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
     motion: Motion = Static()
     iterations: int = 20
