@@ -20,7 +20,7 @@ QUICK = (
     "faults/test_disk.py::test_no_room_at_any",
     "importers/test_hostile.py", "io/test_scan_damaged.py::test_damage", "io/test_hdf5_trial.py::test_a_file_that",
     "corpus/test_fuzz_readers.py::test_what_once_went_wrong",
-    "api/test_bad_input.py", "api/test_docstrings.py", "test_layers.py", "test_errors.py",
+    "api/test_bad_input.py", "api/test_docstrings.py", "test_gate.py", "test_layers.py", "test_errors.py",
 )  # fmt: skip
 
 
