@@ -1,4 +1,4 @@
-"""A scan's numbers in two lines, and a refusal or warning of those that no scanner has, most of them in a wrong unit."""
+"""Summarises a scan in two lines; refuses or warns of numbers that no scanner has, most often a wrong unit."""
 
 import logging
 import math
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _WIDEST_DEG = 120.0  # of a panel seen from the source; dental scanners reach 30, nano-CT 60
-_WRONG_UNIT = 100.0  # frames that one readout takes: ms for s makes it some hundreds
+_WRONG_UNIT = 100.0  # readout over frame time: seconds given as milliseconds make it some hundreds
+_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # real panels take some ms for hundreds of lines
+_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves so far between frames takes them faster
 _TIMES = 17  # of an exposure: between two of them no gantry turns by half a turn
 _SLACK = 1e-3  # relative: times and angles come rounded
 _MANY_FRAMES = 10  # fewer may lie within a few degrees on purpose
@@ -25,12 +27,12 @@ _OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels th
 
 
 def summary(scan: "Scan") -> str:
-    """Returns both lines. Values that the scan's provenance lists as assumed are marked as such."""
+    """Returns a line of the timing and a line of the sizes. Marks values that the provenance lists as assumed."""
     return f"{_timing(scan)}\n{_sizes(scan)}"
 
 
 def _cone_deg(geometry: ConeGeometry) -> tuple[float, float]:
-    """Full angles (cone along v, fan along u) in degrees under which the source sees the panel."""
+    """Returns the full angles (cone along v, fan along u) in degrees that the panel spans at the source."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     ends_mm = [[offset - count * pitch / 2, offset + count * pitch / 2] for count, pitch, offset in sides]
     low, high = np.rad2deg(np.arctan2(ends_mm, geometry.source_to_detector_mm)).T
@@ -39,12 +41,12 @@ def _cone_deg(geometry: ConeGeometry) -> tuple[float, float]:
 
 
 def _frame_time_s(scan: "Scan") -> float:
-    """Median time from frame to frame; NaN of a single frame."""
+    """Returns the median time from frame to frame; NaN for a single frame."""
     return float(np.median(np.diff(scan.frame_start_s))) if scan.frames > 1 else math.nan
 
 
 def _source_angle_rad(scan: "Scan") -> np.ndarray:
-    """(F, T): angle of the source about the axis at T times of each frame's exposure, without jumps of a turn in a row."""
+    """Returns the source's angle (F, T) about the axis at T times of each frame's exposure, unwrapped within a frame."""
     delay_s = np.linspace(0.0, scan.shutter.exposure_s, _TIMES)
     source = np.stack([scan.trajectory.pose(f, t + delay_s)[:, :2] for f, t in enumerate(scan.frame_start_s)])
     angle_rad: np.ndarray = np.unwrap(np.arctan2(source[..., 1], source[..., 0]))
@@ -95,16 +97,22 @@ def _joined(values: tuple[float, ...]) -> str:
     return " × ".join(f"{value:.4g}" for value in values)
 
 
-def check_plausible(scan: "Scan", named: Named = str) -> None:
-    """InputError for pixels, voxels and times that no scanner has; warnings for angles that look like radians and line
-    integrals that look like counts. ``named``: how messages call ``pixel_size_mm``, ``grid``, ``readout_s``, ``exposure_s``,
-    ``angles`` and ``quantity``."""
+def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> None:
+    """Raises InputError for pixels, voxels and times that no scanner has.
+
+    Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that look like
+    counts. ``named`` translates ``pixel_size_mm``, ``grid``, ``readout_s``, ``exposure_s``, ``frame_time_s``, ``angles`` and
+    ``quantity`` to the caller's names. ``is_timed``: False where nobody stated a time, so that a frame rate means nothing.
+    """
     _check_panel(scan.geometry, named("pixel_size_mm"))
     _check_voxels(scan.grid, scan.geometry, named("grid"))
-    looks_like_radians = _warn_of_radians(np.rad2deg(np.unwrap(_source_angle_rad(scan)[:, 0])), named("angles"))
+    angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan)[:, 0]))
+    looks_like_radians = _warn_of_radians(angle_deg, named("angles"))
     if scan.is_fly and scan.frames > 1 and not looks_like_radians:
-        for what in ("readout", "exposure"):
-            _check_time(named(f"{what}_s"), what, getattr(scan.shutter, f"{what}_s"), _frame_time_s(scan))
+        _check_exposure(scan, named("exposure_s"))
+        _check_readout(scan, named("readout_s"))
+        if is_timed:
+            _warn_of_slow_frames(_frame_time_s(scan), angle_deg, named("frame_time_s"))
     opaque = sum(np.count_nonzero(frame[valid] > _OPAQUE) for frame, valid in zip(scan.projections, scan.valid, strict=True))
     if opaque > _FEW * scan.projections.size:
         text = "line integrals of up to %.3g: no panel sees through more than %g; are they counts? say %s"
@@ -112,7 +120,7 @@ def check_plausible(scan: "Scan", named: Named = str) -> None:
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
-    """Whether angles (F,) of many frames lie within 2π degrees, which is warned of."""
+    """Returns whether the angles (F,) of many frames lie within 2π degrees, and warns of it."""
     span_deg = float(np.ptp(angle_deg))
     looks_so = len(angle_deg) >= _MANY_FRAMES and 0 < span_deg <= 2 * np.pi * (1 + _SLACK)
     if looks_so:
@@ -140,10 +148,31 @@ def _check_voxels(grid: Grid, geometry: ConeGeometry, subject: str) -> None:
         raise InputError(subject, found, expected, "correct the number of voxels, or the unit of a length")
 
 
-def _check_time(subject: str, what: str, time_s: float, frame_s: float) -> None:
-    frames = time_s / frame_s
-    found = f"{what} of {time_s:.4g} s, {frames:.3g} times the {frame_s:.3g} s from frame to frame"
-    if frames > _WRONG_UNIT:
-        raise InputError(subject, found, "at most one frame's time", "correct its unit, or the frame time's")
-    if frames > 1 + _SLACK:
-        log.warning("%s: %s: a line would open again while it is open or read; is its unit right?", subject, found)
+def _check_exposure(scan: "Scan", subject: str) -> None:
+    exposure_s, frame_s = scan.shutter.exposure_s, _frame_time_s(scan)
+    if exposure_s > (1 + _SLACK) * frame_s:
+        raise _longer_than_a_frame(subject, f"exposure of {exposure_s:.4g} s", exposure_s, frame_s)
+
+
+def _check_readout(scan: "Scan", subject: str) -> None:
+    readout_s, frame_s = scan.shutter.readout_s, _frame_time_s(scan)
+    refusal = _longer_than_a_frame(subject, f"readout of {readout_s:.4g} s", readout_s, frame_s)
+    if readout_s > _WRONG_UNIT * frame_s:
+        raise refusal
+    if readout_s > (1 + _SLACK) * frame_s:
+        log.warning("%s: %s: a line would open again before it is read; is its unit right?", subject, refusal.found)
+    if 0 < readout_s < _SHORT_READOUT_S and scan.lines >= _MANY_LINES:
+        text = "%s: readout of %.3g ms for %d lines: panels take some milliseconds; is its unit right?"
+        log.warning(text, subject, 1000 * readout_s, scan.lines)
+
+
+def _longer_than_a_frame(subject: str, stated: str, time_s: float, frame_s: float) -> InputError:
+    found = f"{stated}, {time_s / frame_s:.3g} times the {frame_s:.3g} s from frame to frame"
+    return InputError(subject, found, "at most one frame's time", "correct its unit, or the frame time's")
+
+
+def _warn_of_slow_frames(frame_s: float, angle_deg: np.ndarray, subject: str) -> None:
+    """Warns of a low frame rate where the gantry turns far from frame to frame, between the angles (F,)."""
+    step_deg = float(np.median(np.abs(np.diff(angle_deg))))
+    if _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:
+        log.warning("%s: %.3g fps and %.3g° from frame to frame; is the rate right?", subject, 1 / frame_s, step_deg)

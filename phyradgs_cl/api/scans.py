@@ -81,6 +81,7 @@ def fly_scan(
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     turned_deg = np.unwrap(start_deg, period=360.0)
     readout_ratio = readout_ratio_of(readout_ms, readout_ratio, fps, exposure_s)
+    is_timed = exposure_s is not None
     exposure_deg, exposure_s = exposure_of(exposure_deg, exposure_s, fps, turned_deg)
     readout_s = readout_ms / 1000 if readout_ms is not None else (readout_ratio or 0.0) * exposure_s
     steps = np.diff(turned_deg) / exposure_deg
@@ -98,8 +99,10 @@ def fly_scan(
     last_rad = first_rad + np.deg2rad(exposure_deg)
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first_rad, last_rad))
     _warn_of_exposure(steps)
-    called = _ARGUMENTS if readout_ms is None else {**_ARGUMENTS, "readout_s": "readout_ms"}
-    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called)
+    called = {**_ARGUMENTS, "frame_time_s": "exposure_s" if fps is None else "fps"}
+    called |= {"readout_s": "readout_ms"} if readout_ms is not None else {}
+    called |= {"exposure_s": "exposure_s"} if is_timed else {}
+    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, is_timed)
 
 
 def _warn_of_exposure(steps: np.ndarray) -> None:
@@ -191,14 +194,14 @@ def _pixels(
 
 def _scan(
     pixels: LineIntegrals, orbit: CircularOrbit, shutter: Shutter, start_s: np.ndarray, grid: Grid | None, is_fly: bool,
-    others: dict[str, Any], called: Mapping[str, str] = _ARGUMENTS,
+    others: dict[str, Any], called: Mapping[str, str] = _ARGUMENTS, is_timed: bool = True,
 ) -> Scan:  # fmt: skip
     if "pixel_mask" in others:
         raise InputError("pixel_mask", "an option of Scan itself", "mask", "write mask=")
     where = orbit.geometry, orbit, shutter, start_s, grid or default_grid(orbit.geometry), is_fly
     facts = {**pixels.applied, **others.pop("provenance", {})}
     scan = Scan(pixels.values, *where, pixel_mask=pixels.mask, saturation=pixels.saturation, provenance=facts, **others)
-    check_plausible(scan, lambda name: called.get(name, name))
+    check_plausible(scan, lambda name: called.get(name, name), is_timed)
     return scan
 
 

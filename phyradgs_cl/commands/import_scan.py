@@ -8,7 +8,17 @@ import numpy as np
 
 from phyradgs_cl.commands.console import remark, say
 from phyradgs_cl.commands.files import file_argument, file_option, option
-from phyradgs_cl.commands.options import Axis, DetectorModel, First, RoiMm, Size, VoxelMm, lengths, pitches
+from phyradgs_cl.commands.options import (
+    DETECTOR_OFFSET,
+    Axis,
+    DetectorModel,
+    First,
+    RoiMm,
+    Size,
+    VoxelMm,
+    lengths,
+    pitches,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
@@ -71,7 +81,7 @@ def import_command(
     source_to_axis_mm: Annotated[float | None, option("Source to rotation axis, mm.", _FILE)] = None,
     source_to_detector_mm: Annotated[float | None, option("Source to detector, mm.", _FILE)] = None,
     pixel_size_mm: Annotated[Any, pitches("--pixel-size-mm", "Pixel's side, or height and width, mm.", _FILE)] = None,
-    detector_offset_mm: Annotated[Any, lengths("--detector-offset", "Detector offset V,U in mm.", _FILE)] = None,
+    detector_offset_mm: Annotated[Any, lengths("--detector-offset", DETECTOR_OFFSET, _FILE)] = None,
     unit_mm: Annotated[float, option("Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
     rotates: Annotated[Rotates | None, option("What the stored angles turn.", _FORMAT)] = None,
     row_0: Annotated[Row0 | None, option("Where the first stored row is.", _FORMAT, "--row-0")] = None,

@@ -31,6 +31,8 @@ _STEPS = f"What to undo in the frames first, of {', '.join(STEPS)} (docs: prepar
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 
+DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
+
 # where many runs are made
 _SCHEDULER = "Dask scheduler to send the runs to: its address or its JSON file; local starts workers here."
 Scheduler = Annotated[str | None, option(_SCHEDULER, metavar="ADDRESS|local")]

@@ -6,7 +6,16 @@ from typing import Annotated, Any, Literal
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.files import file_option, option
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, First, Memory, Output, lengths
+from phyradgs_cl.commands.options import (
+    DETECTOR_OFFSET,
+    Axis,
+    DetectorModel,
+    Device,
+    First,
+    Memory,
+    Output,
+    lengths,
+)
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
@@ -105,7 +114,7 @@ def simulate_command(
         option("Detector columns, rows in proportion; the panel's size stays.", "scanner's"),
     ] = None,
     detector_offset: Annotated[
-        Any, lengths("--detector-offset", "Detector offset V,U in mm.", "scanner's")
+        Any, lengths("--detector-offset", DETECTOR_OFFSET, "scanner's")
     ] = None,
     size: Annotated[
         int | None,

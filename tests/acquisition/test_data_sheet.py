@@ -83,7 +83,18 @@ def test_numbers_that_no_scanner_has_are_refused() -> None:
         "^readout_ms: found readout of 62 s, 930 times the 0.0667 s from frame to frame": lambda: fly_scan(
             FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62000
         ),
+        "^exposure_s: found exposure of 6 s, 90 times the 0.0667 s from frame to frame": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, fps=15, exposure_s=6.0
+        ),
+        "^exposure_deg: found exposure of 1 s, 1.33 times the 0.75 s from frame to frame": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, exposure_deg=40.0
+        ),
     })  # fmt: skip
+
+
+def _tall() -> tuple[np.ndarray, ConeGeometry]:
+    """Frames of a panel with 120 rows, and its geometry."""
+    return np.full((12, 120, 8), 0.5, np.float32), ConeGeometry(500.0, 800.0, (120, 8), (0.4, 0.4))
 
 
 def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
@@ -93,6 +104,12 @@ def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
         "line integrals of up to 60: .* counts": lambda: static_scan(opaque, CONE, TURN_DEG, quantity="attenuation"),
         "^readout_ms: readout of 0.1 s, 1.5 times": lambda: fly_scan(
             FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=100
+        ),
+        "^readout_ms: readout of 0.062 ms for 120 lines: .*unit": lambda: fly_scan(
+            *_tall(), TURN_DEG, fps=15, exposure_s=0.06, readout_ms=0.062
+        ),
+        "^fps: 1.5 fps and 30° from frame to frame": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, fps=1.5, exposure_s=0.06, readout_ms=62
         ),
         "": lambda: fly_scan(FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62),
     }.items():
