@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.cluster import Lost, Pool, PoolState, Workers, runtime_of_process
+from phyradgs_cl.cluster import Lost, Pool, Workers, runtime_of_process
 from phyradgs_cl.io import only_run
 from phyradgs_cl.reconstructors import ignore_progress
 from phyradgs_cl.runtime import Runtime
@@ -47,13 +47,13 @@ def run_bench_at_workers(
         tasks = _tasks(job, work)
         devices = 1
 
-        def look(state: PoolState) -> None:
+        def count(running: int, at_workers: int) -> None:
             nonlocal devices
-            devices = max(1, state.devices)
+            devices = max(1, at_workers)
 
         with Pool(workers) as pool:
             told(pool.dashboard)
-            for name, found in pool.results(make_lines, tasks, look):
+            for name, found in pool.results(make_lines, tasks, count):
                 run = tasks[name].run
                 lines = [{**run.facts, "error": found.reason}] if isinstance(found, Lost) else found
                 for line in lines:
@@ -79,13 +79,13 @@ _last_case: dict[tuple[Any, ...], Case] = {}
 
 def make_lines(task: BenchTask) -> list[Line]:
     """The lines of a run, its own the last; in a worker, which keeps the last case that it has made."""
-    with runtime_of_process() as rt:
-        case = _case_of(task, rt)
-        lines: list[Line] = []
-        if task.is_first:
-            write_slices(task.job.output, truth_of(task.run.facts), case.slices(case.truth))
-            lines += reference_lines(task.job, task.run, case, rt, Present(task.known))
-        return [*lines, one_run(task.job, task.run, case, rt, ignore_progress)]
+    rt = runtime_of_process()
+    case = _case_of(task, rt)
+    lines: list[Line] = []
+    if task.is_first:
+        write_slices(task.job.output, truth_of(task.run.facts), case.slices(case.truth))
+        lines += reference_lines(task.job, task.run, case, rt, Present(task.known))
+    return [*lines, one_run(task.job, task.run, case, rt, ignore_progress)]
 
 
 def _case_of(task: BenchTask, rt: Runtime) -> Case:

@@ -14,7 +14,6 @@ from tables import RESULTS, BenchJob, BenchSize, run_bench, run_bench_at_workers
 from tables.results import read_lines
 
 from phyradgs_cl.cluster import Lost, Pool, Workers
-from phyradgs_cl.cluster import pool as pool_module
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime
 
@@ -38,12 +37,13 @@ def refuse(number: int) -> int:
 def test_each_worker_has_a_device_and_gets_one_run_at_a_time() -> None:
     with Pool(Workers(count=2, device="cpu,0")) as pool:
         assert pool.dashboard.startswith("http://127.0.0.1:")
-        states = []
-        found = dict(pool.results(device_of, {f"run-{n}": n for n in range(8)}, states.append))
+        running: list[int] = []
+        arguments = {f"run-{n}": n for n in range(8)}
+        found = dict(pool.results(device_of, arguments, lambda now, devices: running.append(now)))
     assert [found[f"run-{n}"][0] for n in range(8)] == list(range(8))
     assert {device for _, device, _ in found.values()} == {"cpu", "0"}
     assert len({pid for _, _, pid in found.values()}) == 2  # processes that stay
-    assert max(state.running for state in states) <= 2 and states[-1].waiting == 0
+    assert max(running) == 2
 
 
 def test_a_run_that_kills_every_worker_is_given_up_and_the_others_are_made() -> None:
@@ -111,16 +111,3 @@ def test_workers_without_the_resource_are_waited_for(sweep_folder, start, tmp_pa
     wait_until(lambda: sweep.poll() is not None, 90, log.read_text)
     assert sweep.returncode == 0, log.read_text()
     shutil.rmtree(tmp_path / "out")
-
-
-def test_local_workers_that_are_all_gone_are_started_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As when workers are killed while they start: their nannies give up."""
-    monkeypatch.setattr(pool_module, "_WITHOUT_WORKERS_S", 1.0)
-    with Pool(Workers(count=1, device="cpu")) as pool:
-        found = pool.results(device_of, {f"run-{n}": n for n in range(3)})
-        first = next(found)[1]
-        for nanny in pool._cluster.workers.values():
-            pool._cluster.sync(nanny.close)
-        rest = [value for _, value in found]
-    assert sorted([first[0], *(number for number, _, _ in rest)]) == [0, 1, 2]
-    assert rest[-1][2] != first[2]

@@ -15,8 +15,7 @@ from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.files import load_scan
 from phyradgs_cl.workflow.sweep import RESULTS, plan_sweep, read_grid
-from phyradgs_cl.workflow.sweep.plan import is_sound
-from phyradgs_cl.workflow.sweep.tables import write_tables
+from phyradgs_cl.workflow.sweep.tables import is_sound, write_tables
 
 DEEP = json.loads("[" * 400 + "]" * 400)
 ABSURD = {
@@ -109,7 +108,7 @@ def test_a_sweep_s_lines_of_another_type_are_left_out(plan, tmp_path, caplog) ->
             (tmp_path / RESULTS).write_text(f"{json.dumps(bad)}\n{json.dumps(good)}\n")
             lines = read_lines(tmp_path / RESULTS, is_sound)
             assert good in lines, (name, case)
-            write_tables(tmp_path, lines, plan)
+            write_tables(tmp_path, lines, [run.facts for run in plan])
 
 
 def test_a_benchmark_s_lines_of_another_type_are_left_out(tmp_path) -> None:

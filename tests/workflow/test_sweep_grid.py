@@ -97,24 +97,21 @@ def test_what_is_wrong_is_named_at_once(read) -> None:
         (GRID + '[[runs]]\ndevice = "gpu"\n', "device.*say it as --device"),
         (GRID + "[[runs]]\n[options]\niteratoins = 5\n", "iteratoins.*did you mean 'iterations'"),
         (GRID + "[options]\nrates = 1\n[[runs]]\nrates.position = [2e-4, 2e-5]\n", "found rates=1 too"),
-        (GRID + f"[[grid]]\nrates{'.a' * 3000} = 1\n", "found tables in tables in tables"),
-        (GRID + f"[[grid]]\niterations = {MANY}\ngaussians = {MANY}\n", "combinations; expected at most"),
+        (GRID + f"[[grid]]\niterations = {MANY}\ngaussians = {MANY}\n", "runs; expected at most"),
     ):
         with pytest.raises(InputError, match=message):
             read(text)
 
 
-def test_patterns_are_bounded_and_meet_regular_files_only(read, tmp_path) -> None:
-    """All files of a machine have no end; a pipe is waited for."""
-    for pattern in ("/**/*", "/**/*.h5", "/*/*/*/*/*"):
-        with pytest.raises(InputError, match="covers too many files|found a file that|not HDF5|empty"):
-            read(f'scans = ["{pattern}"]\n[[runs]]\n')
+def test_patterns_meet_regular_files_only(read, tmp_path) -> None:
+    """A pipe is waited for; links to folders may go round in a circle."""
     (tmp_path / "below/deep").mkdir(parents=True)
     (tmp_path / "below/loop").symlink_to(tmp_path)
     shutil.copy(tmp_path / "a.h5", tmp_path / "below/deep/c.h5")
     os.mkfifo(tmp_path / "below/pipe.h5")
-    found = read('scans = ["**/*.h5", "./b*/d?ep/[c].h5", "a.h5"]\n[[runs]]\n')
-    assert [path.name for path in found.scans] == ["a.h5", "b.h5", "c.h5"]
+    grid = read('scans = ["**/*.h5", "./b*/d?ep/[c].h5", "a.h5"]\n[[runs]]\n')
+    assert [path.name for path in grid.scans] == ["a.h5", "b.h5", "c.h5"]
+    assert read(f'scans = ["{tmp_path}/*/*/c.h5"]\n[[runs]]\n').scans == grid.scans[2:]
     with pytest.raises(InputError, match="not a regular file"):
         read('scans = ["below/pipe.h5"]\n[[runs]]\n')
     with pytest.raises(InputError, match="no file for"):

@@ -5,6 +5,8 @@ import json
 import os
 import shutil
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -23,8 +25,8 @@ from phyradgs_cl.workflow.sweep import (
     plan_sweep,
     read_grid,
     run_sweep,
-    task,
 )
+from phyradgs_cl.workflow.sweep import run as sweep_run
 from phyradgs_cl.workflow.sweep.tables import comma_separated, markdown
 
 TEXT = """
@@ -123,15 +125,15 @@ def test_a_sweep_goes_on_where_it_was_stopped(job) -> None:
 def test_a_result_that_was_lost_on_its_way_is_not_made_again(job) -> None:
     run = plan_sweep(job.grid, job.folder)[0]
     run.job.output.parent.mkdir(parents=True)
-    first = task.make_run(run)
+    first = sweep_run.make_run(run)
     made_ns = run.job.output.stat().st_mtime_ns
-    assert task.make_run(run) == first and run.job.output.stat().st_mtime_ns == made_ns
+    assert sweep_run.make_run(run) == first and run.job.output.stat().st_mtime_ns == made_ns
     run.job.output.unlink()  # whoever removes a volume wants it anew
-    assert task.make_run(run)["finished"] >= first["finished"] and run.job.output.exists()
+    assert sweep_run.make_run(run)["finished"] >= first["finished"] and run.job.output.exists()
 
 
 def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
-    original = task.go_on
+    original = sweep_run.go_on
 
     def failing(given, *rest):
         if given.method == "fdk" and given.seed == 1:
@@ -140,7 +142,7 @@ def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
             raise ZeroDivisionError("a defect")
         return original(given, *rest)
 
-    monkeypatch.setattr(task, "go_on", failing)
+    monkeypatch.setattr(sweep_run, "go_on", failing)
     _, failed = run_sweep(job)
     errors = [line["error"] for line in lines_of(job) if "error" in line]
     assert failed == 4 and set(errors) == {"ZeroDivisionError: a defect", "scan: found no good | at all"}
@@ -155,20 +157,15 @@ def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
 def test_a_run_waits_for_one_that_its_scheduler_lost_sight_of(job, monkeypatch) -> None:
     run = plan_sweep(job.grid, job.folder)[0]
     run.job.output.parent.mkdir(parents=True)
-    monkeypatch.setattr(task, "_BUSY_EVERY_S", 0.01)
-    monkeypatch.setattr(task, "_BUSY_S", 0.03)
-    with only_run(run.job.output):
-        assert "another run" in task.make_run(run)["error"]
-    original, asked = task.go_on, []
-
-    def busy_at_first(*arguments):
-        asked.append(1)
-        if len(asked) == 1:
-            raise BusyError("volume", "another run is at work on it")
-        return original(*arguments)
-
-    monkeypatch.setattr(task, "go_on", busy_at_first)
-    assert "error" not in task.make_run(run) and len(asked) == 2
+    monkeypatch.setattr(sweep_run, "_BUSY_S", 0.03)
+    with only_run(run.record):
+        assert "another run" in sweep_run.make_run(run)["error"]
+    monkeypatch.setattr(sweep_run, "_BUSY_S", 60.0)
+    with ThreadPoolExecutor() as threads, only_run(run.record):
+        waiting = threads.submit(sweep_run.make_run, run)
+        time.sleep(0.5)
+        assert not waiting.done()
+    assert "error" not in waiting.result()
 
 
 def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, job, no_dask, refused, capfd) -> None:
@@ -193,7 +190,7 @@ def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, job, no_dask
 
 
 def test_failed_runs_show_in_the_status(cli, job, no_dask, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(task, "go_on", lambda *_: 1 / 0)
+    monkeypatch.setattr(sweep_run, "go_on", lambda *_: 1 / 0)
     assert cli.run(["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]) == 2
     assert f"{RUNS} runs failed" in capsys.readouterr().err
 
@@ -202,8 +199,8 @@ def test_devices_are_given_out_in_turn_and_contradictions_refused() -> None:
     assert Workers(device="cpu,0", count=3).devices() == ["cpu", "0", "cpu"]
     assert len(Workers(device="cpu").devices()) == 1
     for options, message in (
-        ({"scheduler": "tcp://a:1", "count": 2}, "--workers: found 2 beside --scheduler"),
-        ({"scheduler": "tcp://a:1", "device": "0"}, "--device: found '0' beside --scheduler"),
+        ({"scheduler": "tcp://a:1", "count": 2}, "--workers: found 2 together with --scheduler"),
+        ({"scheduler": "tcp://a:1", "device": "0"}, "--device: found '0' together with --scheduler"),
         ({"count": 0}, "--workers"),
         ({"scheduler": " "}, "--scheduler"),
         ({"device": "cpu,"}, "--device"),
@@ -213,13 +210,13 @@ def test_devices_are_given_out_in_turn_and_contradictions_refused() -> None:
 
 
 def test_lines_are_json_without_nan(job, monkeypatch) -> None:
-    original = task.go_on
+    original = sweep_run.go_on
 
     def perfect(*arguments):
         result, metrics = original(*arguments)
         return result, {**metrics, "psnr_db": float("inf")}
 
-    monkeypatch.setattr(task, "go_on", perfect)
+    monkeypatch.setattr(sweep_run, "go_on", perfect)
     run_sweep(job)
     rows = (job.folder / RESULTS).read_text().splitlines()
     lines = [json.loads(row, parse_constant=pytest.fail) for row in rows]

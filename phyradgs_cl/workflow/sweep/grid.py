@@ -1,4 +1,4 @@
-"""What a sweep's file asks for: scans by pattern, settings by product and one by one, seeds; checked whole."""
+"""The file of a sweep: scans by pattern, settings by product and one by one, seeds. It is checked before any run."""
 
 import itertools
 import math
@@ -24,11 +24,9 @@ from phyradgs_cl.reconstructors import (
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
-from phyradgs_cl.workflow.sweep.patterns import Search
 
 MOST_RUNS = 100_000
 _LARGEST_SEED = 2**63
-_DEEPEST = 8  # tables in tables: no option is deeper than two
 _KEYS = ("scans", "seeds", "options", "grid", "runs")
 _ELSEWHERE = {
     "seed": "write seeds = [0, 1] at the top",
@@ -40,7 +38,7 @@ Table = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Setting:
-    """A method with its preset and the options that differ from it; ``before`` is done to the frames first."""
+    """A method, its preset, the options that differ from the preset, and the preprocessing of the frames."""
 
     method: str
     preset: str
@@ -48,17 +46,18 @@ class Setting:
     before: Table
 
     def options(self) -> Any:
-        """The method's options, checked."""
+        """Returns the checked options of the method."""
         return method_options(self.method, self.preset, self.changes, str(self.before.get("tune", "")))
 
     @property
     def label(self) -> str:
-        """The setting in a line: the preset where it is not the method's first, options with dotted names."""
-        usual = usual_preset(self.method)
-        named = [] if self.preset == usual else [f"preset={self.preset}"]
+        """A short text: the method, the preset where it is not the usual one, options by dotted name."""
+        words = [self.method]
+        if self.preset != usual_preset(self.method):
+            words.append(f"preset={self.preset}")
         for name, value in flat({**self.before, **self.changes}):
-            named.append(f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
-        return " ".join([self.method, *named])
+            words.append(f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
+        return " ".join(words)
 
 
 @dataclass(frozen=True)
@@ -71,14 +70,16 @@ class SweepGrid:
 
 
 def read_grid(document: Table, path: Path) -> SweepGrid:
-    """GRID.toml as scans, settings and seeds; patterns start at the folder of ``path``. InputError for whatever a run would
-    stumble over: unknown keys, values out of range, patterns that match nothing, files that are no scans."""
+    """Returns the scans, settings and seeds of GRID.toml; its patterns start at the folder of ``path``.
+
+    Raises InputError for everything that would stop a run: unknown keys, values out of range, patterns that match
+    nothing, files that are no scans.
+    """
     refuse_unknown(f"{path}:", document, _KEYS)
     settings = _settings(document, path)
     seeds = _seeds(document.get("seeds", [0]), path)
     scans = _scans(document.get("scans"), path)
-    if (count := len(scans) * len(settings) * len(seeds)) > MOST_RUNS:
-        raise InputError(str(path), f"{count} runs", f"at most {MOST_RUNS}", "make several files of it")
+    _limit_runs(str(path), len(scans) * len(settings) * len(seeds))
     for scan in scans:
         with expecting(scan, "scan"), open_hdf5(scan) as source:
             read_header(source)
@@ -86,9 +87,7 @@ def read_grid(document: Table, path: Path) -> SweepGrid:
 
 
 def flat(table: Table, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted name, value) of everything in nested tables."""
-    if prefix.count(".") > _DEEPEST:
-        raise InputError(prefix[:60], "tables in tables in tables", f"at most {_DEEPEST} of them")
+    """Yields (dotted name, value) of every value in nested tables."""
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.")
@@ -96,33 +95,50 @@ def flat(table: Table, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + name, value
 
 
-def _nested(pairs: Iterator[tuple[str, Any]]) -> dict[str, Any]:
-    table: dict[str, Any] = {}
-    for name, value in pairs:
+def _nested(values: Table) -> dict[str, Any]:
+    """Returns nested tables from dotted names."""
+    tables: dict[str, Any] = {}
+    for name, value in values.items():
         *groups, last = name.split(".")
-        inside = table
+        table = tables
         for group in groups:
-            inside = inside.setdefault(group, {})
-            if not isinstance(inside, dict):
-                raise InputError(name, f"{group}={checks.shown(inside)} too", f"a value or a table {group}")
-        inside[last] = value
-    return table
-# --- scans and seeds --------------------------------------------------------------------------------------
+            table = table.setdefault(group, {})
+            if not isinstance(table, dict):
+                raise InputError(name, f"{group}={checks.shown(table)} too", f"a value or a table {group}")
+        table[last] = value
+    return tables
+
+
+# --- scans and seeds ------------------------------------------------------------------------------------------
 
 
 def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
+    subject = f"{path}: scans"
     if not _is_list_of(str, patterns):
         expected = 'a list of file names or patterns, as scans = ["scans/*.h5"]'
-        raise InputError(f"{path}: scans", checks.shown(patterns), expected)
-    found: dict[Path, None] = {}
-    search, start = Search(f"{path}: scans"), path.resolve().parent
+        raise InputError(subject, checks.shown(patterns), expected)
+    folder = path.resolve().parent
+    scans: dict[Path, None] = {}
     for pattern in patterns:
-        names = search.files(plain_text(pattern), start)
-        if not names:
-            remedy = f"patterns start at the folder of the file, {start}"
-            raise InputError(f"{path}: scans", f"no file for {pattern!r}", "at least one scan file", remedy)
-        found.update((Path(os.path.abspath(name)), None) for name in names)
-    return tuple(found)
+        files = _files(plain_text(pattern), folder, subject)
+        if not files:
+            remedy = f"patterns start at the folder of the file, {folder}"
+            raise InputError(subject, f"no file for {pattern!r}", "at least one scan file", remedy)
+        scans.update((Path(os.path.abspath(file)), None) for file in files)
+    return tuple(scans)
+
+
+def _files(pattern: str, folder: Path, subject: str) -> list[Path]:
+    """Returns the regular files that match, sorted; a name without wildcards stands for itself, whatever it is."""
+    parts = (folder / pattern).parts
+    wild = next((k for k, part in enumerate(parts) if set(part) & set("*?[")), None)
+    if wild is None:
+        return [folder / pattern] if os.path.lexists(folder / pattern) else []
+    matches = Path(*parts[:wild]).glob(str(Path(*parts[wild:])))
+    files = (match for match in matches if match.is_file() and not match.name.startswith("."))
+    limited = list(itertools.islice(files, MOST_RUNS + 1))
+    _limit_runs(subject, len(limited))
+    return sorted(set(limited))
 
 
 def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
@@ -134,23 +150,29 @@ def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
 
 def _is_list_of(kind: type, values: Any) -> bool:
     return isinstance(values, list) and bool(values) and all(isinstance(value, kind) for value in values)
-# --- settings ---------------------------------------------------------------------------------------------
+
+
+def _limit_runs(subject: str, count: int) -> None:
+    if count > MOST_RUNS:
+        raise InputError(subject, f"{count} runs", f"at most {MOST_RUNS}", "split the file into several")
+
+
+# --- settings -------------------------------------------------------------------------------------------------
 
 
 def _settings(document: Table, path: Path) -> tuple[Setting, ...]:
+    """Returns the settings of [[grid]] and [[runs]] without repetitions."""
     shared = dict(flat(_table(document.get("options", {}), f"{path}: [options]")))
-    chosen: dict[str, Setting] = {}
-    for where, table in _tables(document, "grid", path):
-        for combination in _product(table, where):
-            setting = _setting({**shared, **combination}, where)
-            chosen.setdefault(repr(setting), setting)
-    for where, table in _tables(document, "runs", path):
-        setting = _setting({**shared, **dict(flat(table))}, where)
-        chosen.setdefault(repr(setting), setting)
-    if not chosen:
+    settings: dict[str, Setting] = {}
+    for key, expand in (("grid", _product), ("runs", _single)):
+        for where, table in _tables(document, key, path):
+            for values in expand(table, where):
+                setting = _setting({**shared, **values}, where)
+                settings.setdefault(repr(setting), setting)
+    if not settings:
         remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"
         raise InputError(str(path), "neither [[grid]] nor [[runs]]", "at least one of them", remedy)
-    return tuple(chosen.values())
+    return tuple(settings.values())
 
 
 def _tables(document: Table, key: str, path: Path) -> Iterator[tuple[str, Table]]:
@@ -168,25 +190,28 @@ def _table(table: Any, where: str) -> Table:
     return table
 
 
+def _single(table: Table, where: str) -> Iterator[dict[str, Any]]:
+    yield dict(flat(table))
+
+
 def _product(table: Table, where: str) -> Iterator[dict[str, Any]]:
-    """Every combination of the lists; a value that is no list is a list of one."""
+    """Yields every combination of the lists; a value that is no list is a list of one."""
     axes = {name: values if isinstance(values, list) else [values] for name, values in flat(table)}
     for name, values in axes.items():
         if not values:
             raise InputError(f"{where}: {name}", "an empty list", "the values to try")
-    if (count := math.prod(map(len, axes.values()))) > MOST_RUNS:
-        raise InputError(where, f"{count} combinations", f"at most {MOST_RUNS}")
-    for chosen in itertools.product(*axes.values()):
-        yield dict(zip(axes, chosen, strict=True))
+    _limit_runs(where, math.prod(map(len, axes.values())))
+    for combination in itertools.product(*axes.values()):
+        yield dict(zip(axes, combination, strict=True))
 
 
 def _setting(values: dict[str, Any], where: str) -> Setting:
-    """A setting whose options exist and are in range; an error says which table, and which values of it."""
+    """Returns a checked setting; its errors name the table and the values."""
     try:
         return _checked(values)
     except PhyradgsError as error:
-        told = ", ".join(f"{name}={checks.shown(value)}" for name, value in values.items())
-        subject = f"{where} ({told}): {error.subject}"
+        words = ", ".join(f"{name}={checks.shown(value)}" for name, value in values.items())
+        subject = f"{where} ({words}): {error.subject}"
         raise type(error)(subject, error.found, error.expected, error.remedy) from error
 
 
@@ -198,6 +223,6 @@ def _checked(values: dict[str, Any]) -> Setting:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
     before = {name: changes.pop(name) for name in input_names(method, preset) if name in changes}
     tune = input_options(before).tune
-    nested = _nested(iter(changes.items()))
+    nested = _nested(changes)
     method_options(method, preset, nested, tune)
     return Setting(method, usual_preset(method) if preset is None else preset, nested, before)

@@ -1,18 +1,18 @@
-"""A sweep's results as tables: one line per setting in Markdown, one line per run in CSV."""
+"""The lines of a sweep's results file, and the tables made of them: a row per setting (Markdown), a record per run (CSV)."""
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl.io import written_beside
+from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.io.json_lines import Line
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.sweep.grid import flat
-from phyradgs_cl.workflow.sweep.plan import SweepRun, same_run
 
 _METRICS = {"psnr_db": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".4f")}
 _HELD_OUT = {"holdout_rms": ("held-out RMS", ".4g"), "holdout_noise_rms": ("of noise", ".4g")}  # where it was asked for
@@ -20,24 +20,44 @@ _FACTS = ("run", "scan", "method", "preset", "seed")
 _RESULTS = ("psnr_db", "ssim", *_HELD_OUT, "seconds", "gaussians", "device", "host", "version", "volume", "error")
 
 
-def write_tables(folder: Path, lines: Sequence[Line], plan: Sequence[SweepRun]) -> list[Path]:
-    """Writes results.md and results.csv about the planned runs, by their newest lines; the two paths."""
+def identity(line: Line) -> tuple[Any, ...]:
+    """Returns the values that equal lines of one run share: its name, and the size and time of the scan file."""
+    return tuple(line.get(name) for name in ("run", "scan", "scan_bytes", "scan_mtime_ns"))
+
+
+def is_sound(line: Any) -> bool:
+    """True for a line of a run that the tables can read: a person may have edited the file."""
+    if not isinstance(line, dict) or None in identity(line):
+        return False
+    texts, tables, numbers = [line.get("label"), line.get("error", "")], [line.get("changes"), line.get("input")], []
+    if "error" not in line:
+        metrics = line.get("metrics")
+        tables.append(metrics)
+        numbers = [line.get("seconds"), *(metrics.values() if isinstance(metrics, Mapping) else ())]
+    return (
+        all(isinstance(text, str) for text in (line["run"], line["scan"], *texts))
+        and all(isinstance(table, Mapping) for table in tables)
+        and all(number is None or NUMBER.fits(number) for number in numbers)
+    )
+
+
+def write_tables(folder: Path, lines: Sequence[Line], planned: Sequence[Line]) -> list[Path]:
+    """Writes results.md and results.csv of the newest lines of the planned runs; returns both paths."""
     newest = {line["run"]: line for line in lines}
-    found = [(newest[run.name], run.facts) for run in plan if run.name in newest]
-    chosen = [line for line, facts in found if same_run(line, facts)]
-    tables = {"results.md": markdown(chosen, len(plan)), "results.csv": comma_separated(chosen)}
-    written = {folder / name: text for name, text in tables.items()}
-    for path, text in written.items():
+    rows = [newest[facts["run"]] for facts in planned if identity(newest.get(facts["run"], {})) == identity(facts)]
+    tables = {"results.md": markdown(rows, len(planned)), "results.csv": comma_separated(rows)}
+    paths = [folder / name for name in tables]
+    for path, text in zip(paths, tables.values(), strict=True):
         with written_beside(path) as temporary:
             temporary.write_text(plain_text(text), encoding="utf-8", newline="")
-    return list(written)
+    return paths
 
 
 def markdown(lines: Sequence[Line], planned: int) -> str:
-    """Means and standard deviations over the scans and seeds of every setting, the failed runs below."""
+    """Returns means and standard deviations over the scans and seeds of every setting, and the failed runs below."""
     done = [line for line in lines if "error" not in line]
-    asked = {name for line in done for name in line["metrics"]}
-    metrics = {**_METRICS, **{name: column for name, column in _HELD_OUT.items() if name in asked}}
+    measured = {name for line in done for name in line["metrics"]}
+    metrics = {**_METRICS, **{name: column for name, column in _HELD_OUT.items() if name in measured}}
     rows = [
         f"{len(done)} of {planned} runs, {len(lines) - len(done)} failed; mean ± standard deviation over scans and seeds.",
         "",
@@ -46,10 +66,10 @@ def markdown(lines: Sequence[Line], planned: int) -> str:
     ]
     for label in dict.fromkeys(line["label"] for line in done):
         same = [line for line in done if line["label"] == label]
-        found = {name: [line["metrics"].get(name) for line in same] for name in metrics}
-        numbers = [_spread(found[name], form) for name, (_, form) in metrics.items()]
-        seconds = _spread([line["seconds"] for line in same], ".1f")
-        rows.append("| " + " | ".join([_cell(label), str(len(same)), *numbers, seconds]) + " |")
+        cells = [_cell(label), str(len(same))]
+        cells += [_mean([line["metrics"].get(name) for line in same], form) for name, (_, form) in metrics.items()]
+        cells.append(_mean([line["seconds"] for line in same], ".1f"))
+        rows.append("| " + " | ".join(cells) + " |")
     rows += _failures([line for line in lines if "error" in line])
     return "\n".join([*rows, ""])
 
@@ -62,20 +82,20 @@ def _failures(failed: Sequence[Line]) -> Iterator[str]:
 
 
 def comma_separated(lines: Sequence[Line]) -> str:
-    """A record per run; a column for every option that any run states."""
-    stated = [dict(flat({**line["input"], **line["changes"]})) for line in lines]
-    names = list(dict.fromkeys(name for options in stated for name in options))
+    """Returns a record per run, with a column for every option that any run states."""
+    options = [dict(flat({**line["input"], **line["changes"]})) for line in lines]
+    names = list(dict.fromkeys(name for stated in options for name in stated))
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([*_FACTS, *names, *_RESULTS])
-    for line, options in zip(lines, stated, strict=True):
-        found = {**line, **line.get("metrics", {})}
-        values = [found.get(name) for name in _FACTS] + [options.get(name) for name in names]
-        writer.writerow([*values, *(found.get(name) for name in _RESULTS)])
+    for line, stated in zip(lines, options, strict=True):
+        values = {**line, **line.get("metrics", {})}
+        facts, results = ([values.get(name) for name in columns] for columns in (_FACTS, _RESULTS))
+        writer.writerow([*facts, *(stated.get(name) for name in names), *results])
     return stream.getvalue()
 
 
-def _spread(values: Sequence[Any], form: str) -> str:
+def _mean(values: Sequence[Any], form: str) -> str:
     known = [float(value) for value in values if value is not None]
     if not known:
         return "–"
