@@ -22,7 +22,7 @@ from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device, list_de
 
 LOCAL = "local"
 RESOURCE = "device"
-_MOST_WORKERS = 1024
+_MOST_WORKERS, _MOST_RESTARTS = 1024, 3
 _HOST = "127.0.0.1"  # other machines must not send work to this one
 _CONNECT_S, _WAIT_S, _WITHOUT_WORKERS_S = 10.0, 0.2, 20.0
 # up to Python 3.10 asyncio.TimeoutError is a different class
@@ -100,6 +100,7 @@ class Pool:
         self.workers = workers
         self._cluster: Any = None
         self._client: Any = None
+        self._restarts = 0
 
     def __enter__(self) -> "Pool":
         dask = distributed()
@@ -144,7 +145,10 @@ class Pool:
                 if devices:
                     seen_s = time.monotonic()
                 elif time.monotonic() - seen_s > _WITHOUT_WORKERS_S:
-                    self._warn_of_no_worker()
+                    self._await_workers()
+                    if self.workers.is_local:  # with a new scheduler, which knows none of these runs
+                        waiting.extendleft(running.values())
+                        running.clear()
                     seen_s = time.monotonic()
                 while waiting and len(running) < devices:
                     name = waiting.popleft()
@@ -206,11 +210,18 @@ class Pool:
             raise self._scheduler_gone()
         return sum(int(worker.get("resources", {}).get(RESOURCE, 0)) for worker in workers)
 
-    def _warn_of_no_worker(self) -> None:
-        if self.workers.is_local:  # a worker that dies while it starts is not started again
-            raise DeviceError(self._subject, "no process left", "running processes", "repeat the command to go on")
-        start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
-        log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)
+    def _await_workers(self) -> None:
+        """Starts local workers again: Dask gives up a worker that dies while it starts. Warns of others that are missing."""
+        if not self.workers.is_local:
+            start = f"dask worker {self.workers.scheduler} --nthreads 1 --resources {RESOURCE}=1"
+            log.warning("no worker with the resource %s: waiting for one ('%s')", RESOURCE, start)
+            return
+        self._restarts += 1
+        if self._restarts > _MOST_RESTARTS:
+            raise DeviceError(self._subject, "no process left", "running processes", "try fewer --workers")
+        log.warning("no local worker is left: starting them again")
+        self._close()
+        self.__enter__()
 
     @property
     def _subject(self) -> str:

@@ -13,6 +13,7 @@ from cluster.processes import free_port, wait_until
 from tables import RESULTS, BenchJob, BenchSize, run_bench, run_bench_at_workers
 from tables.results import read_lines
 
+from phyradgs_cl import cluster as cluster_module
 from phyradgs_cl.cluster import Lost, Pool, Workers
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime
@@ -111,3 +112,16 @@ def test_workers_without_the_resource_are_waited_for(sweep_folder, start, tmp_pa
     wait_until(lambda: sweep.poll() is not None, 90, log.read_text)
     assert sweep.returncode == 0, log.read_text()
     shutil.rmtree(tmp_path / "out")
+
+
+def test_local_workers_that_are_all_gone_are_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when workers are killed while they start: their nannies give up."""
+    monkeypatch.setattr(cluster_module, "_WITHOUT_WORKERS_S", 1.0)
+    with Pool(Workers(count=1, device="cpu")) as pool:
+        found = pool.results(device_of, {f"run-{n}": n for n in range(3)})
+        first = next(found)[1]
+        for nanny in pool._cluster.workers.values():
+            pool._cluster.sync(nanny.close)
+        rest = [value for _, value in found]
+    assert sorted([first[0], *(number for number, _, _ in rest)]) == [0, 1, 2]
+    assert rest[-1][2] != first[2]

@@ -17,7 +17,8 @@ from phyradgs_cl.io import only_run, read_volume
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import ReconstructionJob
-from phyradgs_cl.workflow.watch import Arrivals, WatchEvent, WatchJob, run_watch, service
+from phyradgs_cl.workflow import watch as watch_module
+from phyradgs_cl.workflow.watch import Arrivals, WatchEvent, WatchJob, run_watch
 
 
 @pytest.fixture
@@ -107,7 +108,7 @@ def test_half_a_file_is_set_aside_and_the_whole_taken(job, drop, rt, tiny_scan) 
 
 def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeypatch) -> None:
     scan = drop("a.h5")
-    original, runs = service.go_on, []
+    original, runs = watch_module.go_on, []
 
     def touching(*arguments):
         found = original(*arguments)
@@ -116,7 +117,7 @@ def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeyp
             os.utime(scan, (1, 1))
         return found
 
-    monkeypatch.setattr(service, "go_on", touching)
+    monkeypatch.setattr(watch_module, "go_on", touching)
     assert len(watched(job, rt)) == 1 and len(runs) == 2
 
 
@@ -125,14 +126,14 @@ def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt,
     failures = dict(zip(("a.h5", "b.h5", "c.h5"), errors, strict=True))
     for name in (*failures, "d.h5"):
         drop(name)
-    original = service.go_on
+    original = watch_module.go_on
 
     def failing(given, *rest):
         if given.scan.name in failures:
             raise failures[given.scan.name]
         return original(given, *rest)
 
-    monkeypatch.setattr(service, "go_on", failing)
+    monkeypatch.setattr(watch_module, "go_on", failing)
     assert len(watched(job, rt)) == 4
     assert outputs(job) == ["a.error.txt", "b.error.txt", "c.error.txt", "d.h5"]
 
@@ -140,7 +141,7 @@ def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt,
 def test_devices_and_disks_that_fail_are_no_fault_of_a_scan(job, drop, rt, monkeypatch) -> None:
     """A lost device is opened anew; one that is gone, or a full disk, ends the watch."""
     drop("a.h5")
-    original, opened, told = service.go_on, [], []
+    original, opened, told = watch_module.go_on, [], []
 
     def failing(error: Exception, times: int):
         def go_on(*arguments):
@@ -156,14 +157,14 @@ def test_devices_and_disks_that_fail_are_no_fault_of_a_scan(job, drop, rt, monke
             raise DeviceError("OpenCL", "no device")
         return rt
 
-    monkeypatch.setattr(service, "go_on", failing(DeviceError("device", "lost"), 2))
+    monkeypatch.setattr(watch_module, "go_on", failing(DeviceError("device", "lost"), 2))
     run_watch(job, opening, told.append)
     assert len(told) == 1 and len(opened) == 2 and outputs(job) == ["a.h5"]
     drop("b.h5")
     full = OutputError("out", "no room")
     for error, end in ((DeviceError("device", "lost"), "no device"), (full, "no room")):
         opened[:] = [1]
-        monkeypatch.setattr(service, "go_on", failing(error, 9))
+        monkeypatch.setattr(watch_module, "go_on", failing(error, 9))
         with pytest.raises(type(error), match=end):
             run_watch(job, opening, told.append)
         assert outputs(job) == ["a.h5"]
@@ -182,7 +183,7 @@ def test_folders_and_locks_are_checked_first(job, rt, refused, tmp_path) -> None
 
 def test_a_folder_that_is_away_for_a_while_is_waited_for(job, drop, rt, monkeypatch, caplog) -> None:
     drop("a.h5")
-    original, looks = service.Arrivals.look, []
+    original, looks = watch_module.Arrivals.look, []
 
     def away(self):
         looks.append(1)
@@ -193,7 +194,7 @@ def test_a_folder_that_is_away_for_a_while_is_waited_for(job, drop, rt, monkeypa
     def stop(event: WatchEvent) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(service.Arrivals, "look", away)
+    monkeypatch.setattr(watch_module.Arrivals, "look", away)
     with pytest.raises(KeyboardInterrupt):
         run_watch(replace(job, once=False), lambda: rt, stop)
     assert caplog.text.count("cannot be read") == 1 and outputs(job) == ["a.h5"]
