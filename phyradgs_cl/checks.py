@@ -14,6 +14,11 @@ from phyradgs_cl.text import near_miss
 _LONGEST_SHOWN = 80
 
 
+def ceil_div(count: int, divisor: int) -> int:
+    """Returns count / divisor rounded up, for whole numbers of any size."""
+    return -(-count // divisor)
+
+
 def positive(subject: str, value: float) -> None:
     """Raise InputError unless the scalar `value` is finite and above zero."""
     if not (_is_finite(value) and value > 0):

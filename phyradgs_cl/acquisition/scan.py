@@ -50,7 +50,7 @@ class Scan:
 
     projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read line;
     pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``. lag: share λ of
-    the recorded intensity that comes from the frames before (detector/lag.py), still in the projections. Lines that a
+    the recorded intensity that comes from the frames before (detector/effects.py), still in the projections. Lines that a
     pulsed beam misses are added to the mask, so that no method has to look for them. ``saturation`` is None where nobody
     looked at raw counts. ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says. ``geometry`` and
     ``grid`` are in mm, ``shutter`` in s; ``trajectory``: anything with ``pose(frame, time_s)``, a class of your own too.

@@ -120,7 +120,7 @@ class Shutter:
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
         """[start, stop) of the strips, as they are read; may be empty. Line r (in reading order) is in floor(r·M/H)."""
-        edges = [-(-strip * lines // strips) for strip in range(strips + 1)]
+        edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:
             ranges = [(lines - stop, lines - start) for start, stop in ranges]

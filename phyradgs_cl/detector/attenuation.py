@@ -1,38 +1,43 @@
-"""From what a detector records to line integrals, with its flat and dark frames."""
+"""Counts to line integrals, and the average of line integrals over an exposure."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phyradgs_cl.checks import one_of, shape
+from phyradgs_cl.checks import finite, one_of, shape
 from phyradgs_cl.errors import InputError
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
-# Transmission is kept at or above this before the logarithm (a line integral of 13.8): beyond what
-# 16-bit detectors resolve, and finite.
+MODELS = ("log", "intensity")
+# Smallest transmission before the logarithm (a line integral of 13.8): below what 16-bit panels resolve, and finite.
 TRANSMISSION_FLOOR = 1e-6
 _LARGEST = float(np.finfo(np.float32).max)
-_BLOCK = 1 << 18  # pixels that are converted at a time
+_BLOCK_PIXELS = 1 << 18  # converted at a time: float64 copies of a whole scan, or of one huge frame, are large
+_WEIGHT_TOLERANCE = 1e-6  # of the sum of weights, for weights summed in float32
 
 
 def counts_to_attenuation(
     data: ArrayLike, image_key: ArrayLike, quantity: str
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Line integrals of the projections of a scan: data (F, v, u), integers or floats.
+    """Converts the projections of a scan, data (F, v, u), to line integrals (P, v, u) float32, always finite.
 
-    "counts" become (I - dark) / (flat - dark) with the mean flat and dark (0 where there are none), "transmission" T
-    becomes -ln T, "attenuation" stays. Frames whose key is not 0 are left out; image_key (F,): 0 projection, 1 flat, 2 dark,
-    3 invalid. Returns (P, v, u) float32, in order and always finite; and a bool mask of the same shape, True where a value
-    must not be used: not finite, a flat that is not brighter than the dark, a transmission at or below `TRANSMISSION_FLOOR`.
-    InputError: shapes, keys or quantity wrong, no projection, or counts without a flat frame.
+    Of ``quantity`` "counts", transmission is (I − dark) / (flat − dark) with the mean flat and the mean dark (0 without
+    darks); "transmission" is taken as it is, "attenuation" is returned unchanged. image_key (F,): 0 projection, 1 flat,
+    2 dark, 3 invalid. The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not
+    brighter than the dark, or the transmission is at most ``TRANSMISSION_FLOOR``.
+    Raises InputError for a wrong shape, key or quantity, for no projection, and for counts without a flat.
     """
     one_of("quantity", quantity, QUANTITIES)
     frames, key = np.asarray(data), np.asarray(image_key)
     shape("data", frames, (None, None, None))
     shape("image_key", key, (frames.shape[0],))
-    _check_keys(key)
+    unknown_keys = sorted({int(k) for k in key} - {PROJECTION, FLAT, DARK, INVALID})
+    if unknown_keys:
+        raise InputError("image_key", str(unknown_keys), "0 projection, 1 flat, 2 dark, 3 invalid")
+    if not (key == PROJECTION).any():
+        raise InputError("image_key", "no projection (key 0)", "at least one projection")
     return _converted(frames, np.flatnonzero(key == PROJECTION), quantity, frames[key == FLAT], frames[key == DARK])
 
 
@@ -43,64 +48,96 @@ def frames_to_attenuation(
     darks: NDArray[np.generic] | None = None,
     largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """``counts_to_attenuation`` of projections (P, v, u), with flats and darks (n, v, u) in arrays of their own;
-    attenuation above ``largest`` must not be used either."""
+    """Does the same for projections (P, v, u) with flats and darks (n, v, u) of their own.
+
+    Attenuation above ``largest`` is marked as unusable too.
+    """
     return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
 
 
 def _converted(
     frames: NDArray[np.generic],
-    chosen: Sequence[int] | NDArray[np.intp],
+    projections: Sequence[int] | NDArray[np.intp],
     quantity: str,
     flats: NDArray[np.generic] | None,
     darks: NDArray[np.generic] | None,
     largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     panel = frames.shape[1:]
-    result = np.empty((len(chosen), *panel), dtype=np.float32)
+    result = np.empty((len(projections), *panel), dtype=np.float32)
     unusable = np.empty(result.shape, dtype=bool)
-    rows = max(1, _BLOCK // max(1, panel[1]))
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is marked as unusable
-        plain = np.broadcast_to(0.0, panel), np.broadcast_to(1.0, panel)
-        dark, gain = _calibration(flats, darks) if quantity == "counts" else plain
-        for i, frame in enumerate(chosen):
-            for start in range(0, panel[0], rows):  # float64 copies of a scan, or of one huge frame, are large
+    rows = max(1, _BLOCK_PIXELS // max(1, panel[1]))
+    with np.errstate(over="ignore", invalid="ignore"):  # overflowing values are marked as unusable
+        dark, gain = np.broadcast_to(0.0, panel), np.broadcast_to(1.0, panel)
+        if quantity == "counts":
+            if flats is None or len(flats) == 0:
+                remedy = "add flat frames, or store transmission or attenuation"
+                raise InputError("image_key", "no flat (key 1) among counts", "at least one flat frame", remedy)
+            dark = mean_dark(darks, panel)
+            gain = flats.mean(axis=0, dtype=np.float64) - dark
+        for i, frame in enumerate(projections):
+            for start in range(0, panel[0], rows):
                 part = slice(start, start + rows)
                 values = frames[frame, part].astype(np.float64)
                 if quantity == "attenuation":
                     bad = ~(np.abs(values) <= largest)  # NaN compares false
                     result[i, part], unusable[i, part] = np.where(bad, 0.0, values), bad
                 else:
-                    result[i, part], unusable[i, part] = _minus_log(values - dark[part], gain[part])
+                    result[i, part], unusable[i, part] = minus_log(values - dark[part], gain[part])
     return result, unusable
 
 
-def _check_keys(key: NDArray[np.generic]) -> None:
-    unknown = sorted({int(k) for k in key} - {PROJECTION, FLAT, DARK, INVALID})
-    if unknown:
-        raise InputError("image_key", str(unknown), "0 projection, 1 flat, 2 dark, 3 invalid")
-    if not (key == PROJECTION).any():
-        raise InputError("image_key", "no projection (key 0)", "at least one projection")
+def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDArray[np.float64]:
+    """Returns the mean (v, u) of dark frames (n, v, u), 0 without any. A frame with NaN affects its pixel only."""
+    if darks is None or len(darks) == 0:
+        return np.zeros(panel)
+    return np.asarray(darks.mean(axis=0, dtype=np.float64))
 
 
-def _calibration(
-    flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean dark and mean flat minus dark, each (v, u); frames with NaN spoil their pixel only."""
-    if flats is None or len(flats) == 0:
-        remedy = "add flat frames, or store transmission or attenuation"
-        raise InputError("image_key", "no flat (key 1) among counts", "at least one flat frame", remedy)
-    flat = flats.mean(axis=0, dtype=np.float64)
-    dark = np.zeros(flat.shape) if darks is None or len(darks) == 0 else darks.mean(axis=0, dtype=np.float64)
-    return dark, flat - dark
-
-
-def _minus_log(
+def minus_log(
     signal: NDArray[np.float64], gain: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
+
+    A pixel without gain becomes 0, because it holds no information; a dark one becomes −ln ``TRANSMISSION_FLOOR``.
+    """
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
     p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
     unusable = ~live | (transmission <= TRANSMISSION_FLOOR) | ~np.isfinite(transmission)
-    # A pixel without gain knows nothing: 0, not a wall. One that is merely dark keeps the floor's value.
     return np.where(live & np.isfinite(p), p, 0.0), unusable
+
+
+def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
+    """Averages line integrals p (S, ...) of S moments of an exposure to (...) float64.
+
+    Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does,
+    −ln Σ w exp(−p), without overflow at any p. weight (S,): shares of the exposure, not negative, sum 1.
+    Raises InputError for an unknown model, shapes or weights that do not fit, and NaN.
+    """
+    one_of("detector model", model, MODELS)
+    values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
+    if values.ndim == 0 or values.shape[0] == 0:
+        raise InputError("line integrals", f"shape {values.shape}", "shape (S, ...) with at least one time")
+    shape("weight", weights, (values.shape[0],))
+    finite("weight", weights)
+    finite("line integrals", values)
+    if (weights < 0).any() or abs(weights.sum() - 1) > _WEIGHT_TOLERANCE:
+        raise InputError("weight", f"sum {weights.sum():g}, least {weights.min():g}", "not negative, sum 1")
+    return np.tensordot(weights, values, axes=1) if model == "log" else intensity_average(values, weights)[0]
+
+
+def intensity_average(
+    p: Iterable[np.ndarray], weights: Iterable[np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow.
+
+    p: S arrays of the result's precision. weights: S numbers or arrays that broadcast, sum 1; all 0 gives 0 for both.
+    """
+    pairs = list(zip(p, weights, strict=True))
+    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # of the brightest moment
+    least = np.where(np.isfinite(least), least, 0)
+    intensities = [w * np.exp(np.where(w > 0, least - q, 0)) for q, w in pairs]
+    total = np.sum(intensities, axis=0)
+    inverse = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+    return least - np.log(np.where(total > 0, total, 1)), [part * inverse for part in intensities]

@@ -1,45 +1,63 @@
-"""How noisy line integrals are, estimated from themselves, and how far each can be trusted."""
+"""Estimates from the frames themselves: their noise, the weights that follow from it, and saturation of raw counts."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phyradgs_cl.acquisition import Saturation
+from phyradgs_cl.checks import ceil_div
+
+NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 # Median of |x| over the standard deviation of a normal x, and the norm of the filter (-1/2, 1, -1/2).
 _MEDIAN_OF_NORMAL, _FILTER_NORM = 0.6745, 1.5**0.5
 _LARGEST_SAMPLE = 1_000_000
 _TENTHS = 10
-_BEHIND = 5.0  # times the noise: what is larger has met the object
-_FRAMES = 16  # that tell the noise
+_BEHIND = 5.0  # times the noise: larger line integrals have met the object
+_FRAMES = 16  # from which noise is estimated
+
+LEAST_SHARE = 1e-3
+"""Share of the pixels at one extreme from which saturation is suspected."""
+_TOUCHING = 0.5  # share of those with all four neighbours at the same extreme
+_SAME = 1e-3  # relative difference between a flat and the projections' ceiling that counts as none
+_MOST_FRAMES, _LONGEST_EDGE = 8, 1024  # of the frames that are searched for noise
+_ROUNDING, _RELATIVE = 0.5, 2e-5  # noise in counts, and relative to the ceiling, that counts as none
+_WHITE = 0.5  # least ratio of two estimates that agree for white noise and differ by far for smooth structure
+
+
+def robust_deviation(values: np.ndarray) -> float:
+    """Returns the standard deviation of values (any shape) from their median absolute deviation, which ignores outliers."""
+    return NORMAL_MAD * float(np.median(np.abs(values - np.median(values))))
 
 
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
-    """Standard deviation of the noise of a pixel behind the object, dimensionless.
+    """Returns the standard deviation of a pixel's noise behind the object, dimensionless; 0 without usable pixels.
 
-    From the median of |second differences| along rows where values are above 0: structure is smooth beside white noise, and
-    a median does not mind edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine as a pixel raises it,
-    noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all. 0 where nothing can be told.
+    It is the median of |second differences| along rows where values are above 0: structure is smooth compared with white
+    noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine as a pixel raises
+    it, noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all.
     """
     if line_integrals.shape[-1] < 3:
         return 0.0
-    left, middle, right = line_integrals[..., :-2], line_integrals[..., 1:-1], line_integrals[..., 2:]
+    left, middle, right = _along_rows(line_integrals)
     usable = middle > 0
     if valid is not None:
-        usable = usable & valid[..., :-2] & valid[..., 1:-1] & valid[..., 2:]
-    chosen = np.flatnonzero(usable)
-    chosen = chosen[:: max(1, chosen.size // _LARGEST_SAMPLE)]
-    if chosen.size == 0:
+        usable = np.logical_and.reduce([usable, *_along_rows(valid)])
+    pixels = np.flatnonzero(usable)
+    pixels = pixels[:: max(1, pixels.size // _LARGEST_SAMPLE)]
+    if pixels.size == 0:
         return 0.0
-    second = middle.ravel()[chosen] - 0.5 * (left.ravel()[chosen] + right.ravel()[chosen])
+    second = middle.ravel()[pixels] - 0.5 * (left.ravel()[pixels] + right.ravel()[pixels])
     return float(np.median(np.abs(second))) / (_MEDIAN_OF_NORMAL * _FILTER_NORM)
 
 
 def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], valid: NDArray[np.bool_]) -> float:
-    """Root mean square of the noise of the pixels ``chosen`` (F, v, u), dimensionless; ``valid`` likewise.
+    """Returns the root mean square of the noise of the pixels ``chosen`` (F, v, u), dimensionless; ``valid`` likewise.
 
-    Noise grows with what a ray loses: it is estimated by tenths of the line integrals, and taken where the pixels lie. From
-    the median of |second differences along rows of those along columns|, which no straight edge along either survives
-    (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300); of a panel of fewer than three rows along rows alone.
+    Noise grows with attenuation, so it is estimated by tenths of the line integrals and averaged as the chosen pixels lie.
+    Each estimate is the median of |second differences along rows of those along columns|, which vanish at straight edges
+    along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Panels of fewer than three rows use rows alone.
     """
     usable, differences, means = valid, line_integrals, line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -59,8 +77,10 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """``noise_rms`` behind the object, from some of the frames: beside it there is less, and half of that is clipped at 0
-    in some files. line_integrals and valid (F, v, u)."""
+    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid (F, v, u).
+
+    Air has less noise, and in some files half of it is clipped at 0.
+    """
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
     frames, usable = line_integrals[some], valid[some]
     behind = usable & (frames > _BEHIND * noise_level(frames, usable))
@@ -78,15 +98,70 @@ def _along_columns(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
 def transmission_weights(
     line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float32]:
-    """Weights exp(−p) of a scan's pixels p (F, v, u), scaled to the mean 1 over those that are ``valid`` (None: all).
+    """Returns weights exp(−p) of line integrals p (F, v, u), with mean 1 over the ``valid`` pixels (None: all).
 
-    Those of least squares for photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534). What lies below 0
-    counts as air: noise should not be trusted more for being bright.
+    They are the least-squares weights of photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534).
+    Negative line integrals count as air, because a pixel is not more precise for being bright by chance.
     """
     weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
     if valid is None:
         mean = float(weights.mean(dtype=np.float64))
     else:
-        chosen = np.broadcast_to(valid, weights.shape)
-        mean = float(weights.mean(dtype=np.float64, where=chosen)) if chosen.any() else 1.0
+        usable = np.broadcast_to(valid, weights.shape)
+        mean = float(weights.mean(dtype=np.float64, where=usable)) if usable.any() else 1.0
     return weights / np.float32(mean) if mean > 0 else np.ones_like(weights)
+
+
+def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
+    """Returns the largest count of projections (P, v, u), and the share of their pixels clipped there.
+
+    Only whole areas count as clipped. An area at the count of the mean ``flat`` (v, u) may be air without noise: it counts
+    only where the rest of the frames shows noise.
+    """
+    level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
+    share = clustered_share(frame == level for frame in frames)
+    if share <= LEAST_SHARE or not (_flat_differs(frames, flat, level) or _shows_noise(frames, level)):
+        share = 0.0
+    return Saturation(level, share)
+
+
+def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
+    """Returns the share of pixels at an extreme, given frame by frame (v, u), if most have four such neighbours; else 0.
+
+    Saturation puts whole areas at an extreme, clipped noise single pixels.
+    """
+    pixels = count = inner = touching = 0
+    for at in extreme:
+        pixels, count = pixels + at.size, count + int(np.count_nonzero(at))
+        if min(at.shape) < 3 or not at.any():
+            continue
+        middle = at[1:-1, 1:-1]
+        inner += int(np.count_nonzero(middle))
+        sides = at[:-2, 1:-1] & at[2:, 1:-1] & at[1:-1, :-2] & at[1:-1, 2:]
+        touching += int(np.count_nonzero(middle & sides))
+    return count / pixels if inner and touching / inner > _TOUCHING else 0.0
+
+
+def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level: float) -> bool:
+    """Returns whether the clipped pixels, taken as air, would differ in brightness from the flats."""
+    hit = np.zeros(frames.shape[1:], bool)
+    for frame in frames:
+        hit |= frame == level
+    return bool(np.median(np.abs(flat[hit] - level)) > _SAME * abs(level))
+
+
+def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
+    """Returns whether pixels below the ceiling are noisy, from second differences along both axes and along rows."""
+    along_rows, along_both = [], []
+    top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
+    middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]
+    for frame in frames[:: ceil_div(len(frames), _MOST_FRAMES)]:
+        values = np.where(frame[middle] < level, frame[middle], np.nan).astype(np.float64)
+        along_rows.append(np.diff(values, 2, axis=1)[1:-1].ravel())
+        along_both.append(np.diff(np.diff(values, 2, axis=1), 2, axis=0).ravel())
+    rows, both = np.concatenate(along_rows), np.concatenate(along_both)
+    unclipped = np.isfinite(both)
+    if not unclipped.any():
+        return True  # nothing but clipped pixels and their rims
+    in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
+    return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

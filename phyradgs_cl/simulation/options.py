@@ -27,8 +27,8 @@ class SimulationOptions:
 
     time_samples: midpoint samples per line in its own exposure; 0: the volume's edge moves at most half a voxel of ``grid``
     between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
-    lag: λ of detector/lag.py. rings, sparks, drift, scatter: of detector/effects.py, 0 without; kvp: of
-    detector/spectrum.py, 0 for a beam of one energy.
+    lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/spectrum.py, 0 for a beam of
+    one energy.
     """
 
     protocol: Protocol = Protocol()
