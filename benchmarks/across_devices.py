@@ -37,7 +37,7 @@ from phyradgs_cl.operators import (
 )
 from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.optim import DeviceAdam
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
@@ -163,7 +163,7 @@ def runs(rt: Runtime) -> Iterator[tuple[str, np.ndarray]]:
         options = method_options(method, None, changes)
         yield (
             f"run of {method}, {changes.get('iterations', 1)}",
-            reconstruct(scan, method, rt, options, seed=0).volume,
+            reconstruct(scan, RunPlan(method, options, seed=0), rt).volume,
         )
 
 

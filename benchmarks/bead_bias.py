@@ -18,7 +18,7 @@ from tables.sizes import bench_size
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
@@ -58,7 +58,7 @@ def ideal(case: PhantomCase, detector_model: str) -> Scan:
 def run(rt: Runtime, case: PhantomCase, scan: Scan, trial: Trial) -> dict[str, float]:
     motion = {"motion": "per-row"} if trial.method == "fista-tv" else {}
     options = method_options(trial.method, None, {**motion, **trial.changes})
-    volume = reconstruct(scan, trial.method, rt, options).volume
+    volume = reconstruct(scan, RunPlan(trial.method, options), rt).volume
     shape = case.shape(volume)
     return {
         "psnr_db": compare(volume, case.truth)["psnr_db"],

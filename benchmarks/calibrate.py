@@ -53,7 +53,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom, sphere_phantom
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate, volume_scene
 
@@ -301,7 +301,7 @@ def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
 def score(rt: Runtime, scan: Scan) -> float:
     """PSNR in dB of fista-tv's volume."""
     options = method_options("fista-tv", None, {"motion": PerRow(3), "iterations": ITERATIONS})
-    volume = reconstruct(scan, "fista-tv", rt, options).volume
+    volume = reconstruct(scan, RunPlan("fista-tv", options), rt).volume
     assert scan.reference is not None
     return round(psnr(volume, scan.reference), 3)
 

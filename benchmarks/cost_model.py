@@ -33,7 +33,7 @@ from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, 
 from phyradgs_cl.operators.splats.binning import _SCANNED
 from phyradgs_cl.operators.splats.projector import RECORD_FLOATS
 from phyradgs_cl.optim import DeviceAdam
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of
 
@@ -230,7 +230,7 @@ def fista_case(rt: Runtime, edge: int, iterations: int) -> Counts:
     frames = np.random.default_rng(0).uniform(0, 1, (FEW_VIEWS, pixels, pixels)).astype(np.float32)
     where = geometry, protocol.orbit(geometry), protocol.shutter(), protocol.frame_start_s()[:FEW_VIEWS]
     options = method_options("fista-tv", None, {"motion": "per-row", "iterations": iterations})
-    reconstruct(Scan(frames, *where, Grid.cube(edge, 2.0)), "fista-tv", rt, options)
+    reconstruct(Scan(frames, *where, Grid.cube(edge, 2.0)), RunPlan("fista-tv", options), rt)
     return {}
 
 

@@ -26,7 +26,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_attenuation
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import InputOptions, method_options, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
 
@@ -102,12 +102,12 @@ def scan_of(scene: Scene, effect: Effect, seed: int) -> Scan:
 def psnr_db(rt: Runtime, scan: Scan, method: str, told: dict[str, object], seed: int) -> float:
     name, _, motion = method.partition(" ")
     changes = {"iterations": ITERATIONS[method], **told}
-    before = InputOptions(ignore_lag=bool(changes.pop("ignore_lag", False)))
+    before = Preprocessing(ignore_lag=bool(changes.pop("ignore_lag", False)))
     if name == "phyradgs":
         changes["motion"] = motion or "exact"
     else:
         changes |= {"motion": "per-row", "sub_intervals": SUB_INTERVALS}
-    result = reconstruct(scan, name, rt, method_options(name, None, changes), seed=seed, before=before)
+    result = reconstruct(scan, RunPlan(name, method_options(name, None, changes), seed=seed, preprocessing=before), rt)
     return compare(result.volume, scan.reference)["psnr_db"]
 
 

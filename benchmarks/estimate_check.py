@@ -20,10 +20,10 @@ from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.api import save_scan
 from phyradgs_cl.estimate import estimate, peak_host_bytes, seconds_around, seconds_since_start
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors import method_options
+from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
-from phyradgs_cl.workflow import ReconstructionJob, load_scan, run_reconstruction
+from phyradgs_cl.workflow import load_scan, run_reconstruction
 
 RUNS: dict[str, tuple[str, Facts]] = {
     "fdk": ("fdk", {}),
@@ -53,13 +53,8 @@ def said(scan: Path, name: str, device: str | None, iterations: int | None) -> F
     method, changes = changed(name, iterations)
     loaded, rt = load_scan(scan), Runtime(device)
     before_s = seconds_since_start()
-    found = estimate(
-        loaded,
-        method,
-        method_options(method, None, changes),
-        rt,
-        around=lambda result: before_s + seconds_around(scan, loaded, result),
-    )
+    plan = plan_run(method, changes)
+    found = estimate(loaded, plan, rt, around=lambda result: before_s + seconds_around(scan, loaded, result))
     return {
         "seconds": found.seconds,
         "host_bytes": found.host_bytes,
@@ -72,8 +67,7 @@ def happened(scan: Path, name: str, device: str | None, iterations: int | None) 
     """What a run takes, in this process."""
     method, changes = changed(name, iterations)
     rt = Runtime(device)
-    job = ReconstructionJob(scan, scan.with_name("volume.h5"), method=method, changes=changes)
-    result, metrics = run_reconstruction(job, lambda: rt, lambda progress: None)
+    result, metrics = run_reconstruction(plan_run(method, changes), scan, scan.with_name("volume.h5"), lambda: rt)
     return {
         "method_seconds": result.facts["seconds"],
         "host_bytes": peak_host_bytes(),

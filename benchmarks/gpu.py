@@ -23,7 +23,7 @@ from phyradgs_cl.acquisition import ConeGeometry, Exact, Scan, make_protocol
 from phyradgs_cl.device_check import check_device
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
@@ -60,7 +60,7 @@ def same_bits(rt: Runtime, quick: bool) -> Facts:
     }  # fmt: skip
     for method, changes in runs.items():
         options = method_options(method, None, changes)
-        first, second = (reconstruct(scan, method, rt, options).volume for _ in range(2))
+        first, second = (reconstruct(scan, RunPlan(method, options), rt).volume for _ in range(2))
         if not np.array_equal(first, second):
             different.append(method)
     return {"same_bits": not different, "different": different}
@@ -109,7 +109,7 @@ def fista_tv(rt: Runtime, quick: bool) -> Facts:
         marks.clear()
         options = method_options("fista-tv", None, {"motion": "per-row", "iterations": iterations})
         started = time.perf_counter()
-        reconstruct(scan, "fista-tv", rt, options, report=lambda progress: marks.append(time.perf_counter()))
+        reconstruct(scan, RunPlan("fista-tv", options), rt, report=lambda progress: marks.append(time.perf_counter()))
         return time.perf_counter() - started
 
     run(2)  # builds kernels

@@ -24,7 +24,7 @@ from scans import append, files_of, make_scan, read_lines
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splats.method import SplatRun, first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
@@ -74,7 +74,7 @@ def run(arguments: Namespace) -> None:
 
 def run_one(rt: Runtime, scan: Scan, motion: str, iterations: int, seed: int) -> Line:
     options = method_options("phyradgs", None, {**motion_of(motion), "iterations": iterations})
-    result = reconstruct(scan, "phyradgs", rt, options, seed=seed)
+    result = reconstruct(scan, RunPlan("phyradgs", options, seed=seed), rt)
     facts = result.facts
     return {
         **compare(result.volume, scan.reference),

@@ -22,7 +22,7 @@ from scans import append, files_of, make_scan, read_lines
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import Progress, method_options, reconstruct
+from phyradgs_cl.reconstructors import Progress, RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 
 METHODS = {
@@ -74,7 +74,7 @@ def run_one(rt: Runtime, scan: Scan, label: str, factor: float, seed: int) -> di
     options = method_options(method, None, {**changes, "iterations": iterations})
     assert scan.reference is not None
     scores = Scores(scan.reference)
-    result = reconstruct(scan, method, rt, options, seed=seed, report=scores)
+    result = reconstruct(scan, RunPlan(method, options, seed=seed), rt, report=scores)
     scores.finish(iterations, result.volume)
     return {
         "points": scores.points,

@@ -23,7 +23,7 @@ ITERATIONS = {"fista-tv": 2, "asd-pocs": 1, "sirt": 2}  # after the first
 def run(method: str, scan_file: str, iterations: int, device: str | None) -> dict[str, float]:
     """Processor seconds and bytes over the bus per iteration of one run, by whichever package is imported."""
     from phyradgs_cl.api import load_scan
-    from phyradgs_cl.reconstructors import method_options, reconstruct
+    from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
     from phyradgs_cl.runtime import Runtime
 
     rt = Runtime(device)
@@ -35,7 +35,7 @@ def run(method: str, scan_file: str, iterations: int, device: str | None) -> dic
 
     options = method_options(method, None, {"motion": "per-row", "iterations": iterations + 1})
     started = time.process_time()
-    reconstruct(load_scan(scan_file), method, rt, options, report=report)
+    reconstruct(load_scan(scan_file), RunPlan(method, options), rt, report=report)
     (first_s, first_bytes), (last_s, last_bytes) = marks[0], marks[-1]
     return {
         "iteration_s": (last_s - first_s) / iterations,

@@ -19,7 +19,7 @@ from scans import append, files_of, make_scan, read_lines
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import Progress, method_options, reconstruct
+from phyradgs_cl.reconstructors import Progress, RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 
 KEYS = ("volume", "method", "motion", "size", "seed", "iterations")
@@ -49,7 +49,7 @@ class Snapshots:
 
 def run_r2(rt: Runtime, scan: Scan, iterations: int, seed: int) -> Facts:
     options = method_options("r2", None, {"iterations": iterations})
-    result = reconstruct(scan, "r2", rt, options, seed=seed)
+    result = reconstruct(scan, RunPlan("r2", options, seed=seed), rt)
     metrics = compare(result.volume, scan.reference)  # type: ignore[arg-type]
     return {"seconds": result.facts["seconds"], "psnr_db": metrics["psnr_db"], "ssim": metrics["ssim"]}
 
@@ -59,7 +59,7 @@ def run_phyradgs(rt: Runtime, scan: Scan, arguments: Namespace, seed: int, goal_
     changes = own if arguments.preset == "default" else {}
     options = method_options("phyradgs", arguments.preset, changes)
     watch = Snapshots(scan, arguments.every, goal_db)
-    result = reconstruct(scan, "phyradgs", rt, options, seed=seed, report=watch)
+    result = reconstruct(scan, RunPlan("phyradgs", options, seed=seed), rt, report=watch)
     curve = watch.curve
     passed = next(((i, s) for i, s, psnr_db in curve if psnr_db >= goal_db), None)
     return {

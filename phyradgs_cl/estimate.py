@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.io import sha256_of, write_volume
 from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import InputOptions, Reconstruction, method_of, reconstruct
+from phyradgs_cl.reconstructors import Reconstruction, RunPlan, method_of, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
@@ -65,25 +65,20 @@ class Estimate:
 
 
 def estimate(
-    scan: Scan,
-    method: str,
-    options: Any,
-    rt: Runtime,
-    before: InputOptions | None = None,
-    around: Callable[[Reconstruction], float] | None = None,
+    scan: Scan, plan: RunPlan, rt: Runtime, around: Callable[[Reconstruction], float] | None = None
 ) -> Estimate:
-    """Runs ``method`` for a few iterations (FDK as a whole) and says what ``options`` would take. ``around``: seconds
+    """Runs the plan for a few iterations (FDK as a whole) and says what it would take as a whole. ``around``: seconds
     of what a run does beside the method, from a result of it. The first trial builds kernels, as the run will."""
     started = time.perf_counter()
-    trials = _Trials(scan, method, options, rt, before)
+    trials, method, options = _Trials(scan, plan, rt), method_of(plan.method), plan.options
     total = getattr(options, "iterations", None)
-    if total is None or not method_of(method).is_resumable:
+    if total is None or not method.is_resumable:
         whole_s, each_s, total = trials.run(None), 0.0, 0
     elif isinstance(options, SplatOptions):
         whole_s, each_s = _of_schedule(trials, options, *_SPLAT_TRIALS)
     else:
         whole_s, each_s = _of_alike(trials, total, *_ITERATIVE_TRIALS)
-        if whole_s <= _AS_WELL_RUN_S and method_of(method).stops_itself(options):
+        if whole_s <= _AS_WELL_RUN_S and method.stops_itself(options):
             whole_s = trials.run(total)  # only a run tells when
     around_s = around(trials.last) if around else 0.0
     spent_s, held = time.perf_counter() - started, peak_host_bytes()
@@ -96,20 +91,19 @@ class _Trials:
     """Short runs of one reconstruction; ``last`` is the latest and longest, ``iterations`` how many they had in all;
     ``device_bytes`` of the last alone, since clouds grow most in the shortest."""
 
-    def __init__(
-        self, scan: Scan, method: str, options: Any, rt: Runtime, before: InputOptions | None
-    ) -> None:
-        self.scan, self.method, self.options, self.rt = scan, method, options, rt
-        self.before = before and replace(before, tune="")  # which would be runs in each trial
+    def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
+        self.scan, self.rt = scan, rt
+        self.plan = replace(plan, preprocessing=replace(plan.preprocessing, tune=""))  # which would be runs in each trial
         self.iterations = 0
 
     def run(self, iterations: int | None) -> float:
         """Seconds of so many iterations, or of the method as a whole."""
-        short = self.options if iterations is None else shortened(self.options, iterations)
+        options = self.plan.options
+        plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.iterations += iterations or 0
         self.rt.reset_peak()
         begun = time.perf_counter()
-        self.last = reconstruct(self.scan, self.method, self.rt, short, before=self.before)
+        self.last = reconstruct(self.scan, plan, self.rt)
         seconds, self.device_bytes = time.perf_counter() - begun, self.rt.peak_bytes
         return seconds
 

@@ -1,4 +1,4 @@
-"""What a run is asked to do: the configuration file, the command line that wins over it, and words into values."""
+"""Reads options by name from a configuration file and the command line, and turns them into a plan of a run."""
 
 import json
 import math
@@ -6,49 +6,70 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
+from phyradgs_cl.importers import load_volume
+from phyradgs_cl.io import sha256_of
 from phyradgs_cl.io.tables import read_toml
+from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
-    InputOptions,
-    input_names,
-    input_options,
-    method_name,
-    method_options,
+    InitialVolume,
+    Preprocessing,
+    RunPlan,
+    plan_run,
+    preprocessing_of,
 )
-from phyradgs_cl.runtime import bytes_of
+from phyradgs_cl.runtime import Runtime, bytes_of
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-LARGEST_SEED = 2**63
-
 
 @dataclass(frozen=True)
-class RunSettings:
-    """A reconstruction as it is asked for; ``changes`` are the method's own options by name, unchecked. ``before``:
-    what is done to the frames first. ``origins``: where values that are no named options come from, for errors.
-    ``memory``: the device's limit, bytes or text as 2GiB."""
+class Settings:
+    """Options by name, unchecked, and the place where each was given, for errors. device: as from ``device_wish``; memory:
+    the device's limit in bytes."""
 
-    method: str
-    preset: str | None
-    seed: int
-    device: str | None
-    changes: Mapping[str, Any]
-    before: InputOptions = InputOptions()
-    memory: str | int | None = None
-    origins: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[str, Any]
+    origins: Mapping[str, str]
+    config: Path | None = None
+    device: str | None = None
+    memory: int | None = None
+
+    def plan(self, initial: Path | None = None) -> RunPlan:
+        """Returns the checked plan of a run that starts from the volume file ``initial``, if any."""
+        values = dict(self.values)
+        method, preset = (self._word(values, name) for name in ("method", "preset"))
+        seed, volume = values.pop("seed", 0), None
+        if initial is not None:
+            volume = _initial_volume(initial)
+        # an option of the command line means what --help says, whatever the method calls its own
+        flags = [f.name for f in fields(Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
+        with self.naming_origins(method or DEFAULT_METHOD):
+            return plan_run(
+                method or DEFAULT_METHOD, values, preset=preset, seed=seed, initial=volume, of_preprocessing=flags
+            )
+
+    def preprocessing(self, defaults: Mapping[str, object]) -> Preprocessing:
+        """Returns the checked preprocessing, of no method, with ``defaults`` for what nobody gave."""
+        with self.naming_origins():
+            return preprocessing_of({**defaults, **self.values})
+
+    def runtime(self, *, profile: bool = False, ranks: Communicator | None = None) -> Runtime:
+        """Opens the device."""
+        with self.naming_origins():
+            return Runtime(self.device, profile=profile, memory=self.memory, ranks=ranks)
 
     @contextmanager
-    def naming_origins(self) -> Iterator[None]:
-        """Errors about an option, in the body, name the line of the file or the --set that it comes from."""
+    def naming_origins(self, method: str = "") -> Iterator[None]:
+        """Makes errors of the body name the line of the file, or the --set, that holds the wrong option."""
         try:
             yield
         except PhyradgsError as error:
@@ -56,78 +77,48 @@ class RunSettings:
             if subject is None:
                 raise
             found = error.found
-            if found == "no such option" and self.method:
-                found += f" of --method {self.method}"
+            if found == "no such option" and method:
+                found += f" of --method {method}"
             raise type(error)(subject, found, error.expected, error.remedy) from error
 
+    def _word(self, values: dict[str, Any], name: str) -> str | None:
+        value = values.pop(name, None)
+        if value is not None and not isinstance(value, str):
+            raise InputError(self.origins.get(name, _flag(name)), checks.shown(value), "a word in quotation marks")
+        return value
 
-def run_settings(
+
+def read_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
-) -> RunSettings:
-    """The settings of a configuration file; over them ``assignments`` NAME=VALUE; over both what is given, not None;
-    all over the preset. They are checked here, so that an error can say where a wrong value stands."""
-    settings, origins = _collected(config, given, assignments)
-    chosen = _run_settings(settings, origins)
-    with chosen.naming_origins():
-        method_options(chosen.method, chosen.preset, chosen.changes, chosen.before.tune)
-    return chosen
-
-
-def input_settings(
-    config: Path | None, given: Mapping[str, object], assignments: Sequence[str], usual: Mapping[str, object]
-) -> RunSettings:
-    """``run_settings`` of what comes before every method, and of no method: ``before``, device and memory. usual: values of
-    what nobody gave."""
-    settings, origins = _collected(config, given, assignments)
-    settings = {**usual, **settings}
-    wish, memory = _device_and_memory(settings, origins)
-    chosen = RunSettings("", None, 0, wish, {}, memory=memory, origins=origins)
-    with chosen.naming_origins():
-        return replace(chosen, before=input_options(settings))
-
-
-def _collected(
-    config: Path | None, given: Mapping[str, object], assignments: Sequence[str]
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Values by name, and where each comes from."""
-    settings = read_config(config)
-    origins = {key: f"config {config}: {key}" for key in settings}
+) -> Settings:
+    """Reads a configuration file. ``assignments`` NAME=VALUE win over it, and options ``given`` (not None) win over both.
+    """
+    values = read_config(config)
+    origins = {key: f"config {config}: {key}" for key in values}
     for text in assignments:
-        merge(settings, assignment(text))
+        merge(values, assignment(text))
         origins[text.split("=")[0].split(".")[0].strip()] = f"--set {text}"
     for key, value in given.items():
         if value is not None:
-            settings[key] = value
+            values[key] = value
             origins[key] = _flag(key)
-    return settings, origins
+    device, memory = values.pop("device", None), values.pop("memory", None)
+    if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
+        device = str(device)  # in TOML an index is a number
+    device = device_wish(device, origins.get("device", "--device"))
+    memory = None if memory is None else bytes_of(memory, origins.get("memory", "--memory"))
+    return Settings(values, origins, config, device, memory)
+
+
+def _initial_volume(path: Path) -> InitialVolume:
+    values, grid = load_volume(path)
+    if grid is None:
+        raise InputError("--initial", f"{path}, values without voxel sizes", "a volume with its grid in mm")
+    return InitialVolume(values, grid, {"initial": str(path), "initial_sha256": sha256_of(path)})
 
 
 def _flag(key: str) -> str:
     return f"--{key.replace('_', '-')}"
-
-
-def _run_settings(settings: dict[str, Any], origins: Mapping[str, str]) -> RunSettings:
-    method = _word(settings, "method", origins)
-    preset = _word(settings, "preset", origins)
-    seed = _seed(settings.pop("seed", 0), origins.get("seed", "--seed"))
-    wish, memory = _device_and_memory(settings, origins)
-    chosen = RunSettings(
-        DEFAULT_METHOD if method is None else method, preset, seed, wish, settings, memory=memory, origins=origins
-    )
-    with chosen.naming_origins():
-        theirs = input_names(chosen.method, preset)
-        flags = [f.name for f in fields(InputOptions) if origins.get(f.name) == _flag(f.name)]  # mean what --help says
-        before = {name: settings.pop(name) for name in {*theirs, *flags} if name in settings}
-        return replace(chosen, method=method_name(chosen.method), before=input_options(before))
-
-
-def _device_and_memory(settings: dict[str, Any], origins: Mapping[str, str]) -> tuple[str | None, int | None]:
-    device = settings.pop("device", None)
-    if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
-        device = str(device)  # in TOML an index is a number
-    wish = device_wish(device, origins.get("device", "--device"))
-    memory = settings.pop("memory", None)
-    return wish, None if memory is None else bytes_of(memory, origins.get("memory", "--memory"))
 
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
@@ -200,18 +191,3 @@ def numbers(text: str) -> float | list[float] | str:
     except ValueError:
         return text
     return found if len(found) > 1 else found[0]
-
-
-def _word(settings: dict[str, Any], key: str, origins: Mapping[str, str]) -> str | None:
-    value = settings.pop(key, None)
-    if value is not None and not isinstance(value, str):
-        raise InputError(origins.get(key, f"--{key}"), checks.shown(value), "a word in quotation marks")
-    return value
-
-
-def _seed(value: object, subject: str) -> int:
-    if isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_SEED:
-        raise InputError(subject, checks.shown(value), f"a whole number from 0 to {LARGEST_SEED}")
-    return value

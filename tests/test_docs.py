@@ -19,7 +19,7 @@ from phyradgs_cl import __version__, api
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -80,7 +80,7 @@ def test_the_worked_example_of_a_method_works(rt, monkeypatch) -> None:
     monkeypatch.setitem(METHODS, "landweber", module.METHOD)
     changes = {"iterations": 40, "step": 1.5}
     static, fly = (
-        reconstruct(scan, "landweber", rt, method_options("landweber", None, {"motion": motion, **changes}))
+        reconstruct(scan, plan_run("landweber", {"motion": motion, **changes}), rt)
         for motion in ("static", "per-row")
     )
     residuals = [line["residual"] for line in fly.record]

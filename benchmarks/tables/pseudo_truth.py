@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, reconstruct
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, RunPlan, reconstruct
 from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.runtime import Runtime
 from tables.job import BenchJob, plain
@@ -55,7 +55,7 @@ class PseudoTruth:
         case = PhantomCase(self._rt, size, protocol, self._job.axis, self._seed, self.volume_of)
         scan = case.scan(PSEUDO)
         with keep_finished_work():
-            result = reconstruct(scan, "r2", self._rt, self._options, seed=self._seed, report=self._report)
+            result = reconstruct(scan, RunPlan("r2", self._options, seed=self._seed), self._rt, report=self._report)
             refuse_interrupted(result)
             provenance = {"method": "r2", "views": PSEUDO_VIEWS, "identity": self._identity}
             metrics = compare(result.volume, case.truth)

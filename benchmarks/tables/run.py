@@ -16,7 +16,7 @@ from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind, load_attenuation, only_run
 from phyradgs_cl.neural.requirement import INSTALL
-from phyradgs_cl.reconstructors import Progress, ProgressReport, reconstruct
+from phyradgs_cl.reconstructors import Progress, ProgressReport, RunPlan, reconstruct
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.environment import environment
@@ -199,7 +199,7 @@ def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: P
     scan = case.scan(run.acquisition)
     started, used = time.perf_counter(), time.process_time()
     try:
-        result = reconstruct(scan, str(run.row.method), rt, run.options, seed=run.seed, report=progress)
+        result = reconstruct(scan, RunPlan(str(run.row.method), run.options, seed=run.seed), rt, report=progress)
     except NumericalError as error:  # one method that overflows must not cost a night's other runs
         log.warning("%s: %s", run.title, error)
         return {**run.facts, "error": str(error), **environment(rt)}

@@ -24,16 +24,16 @@ from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
+    InitialVolume,
     ProgressReport,
     Reconstruction,
+    RunPlan,
     State,
     ignore_progress,
-    input_names,
-    input_options,
     interrupted,
-    method_name,
     method_of,
-    method_options,
+    plan_run,
+    preprocessing_of,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.checkpoint import parsed
@@ -174,7 +174,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     not show what a step looks for.
     """
     check_scan(scan)
-    before = input_options({"steps": steps, **options})
+    before = preprocessing_of({"steps": steps, **options})
     before.check_written()
     return prepared(scan, before, runtime_of(device))
 
@@ -220,32 +220,26 @@ def reconstruct(
         NumericalError: numbers overflow.
         KeyboardInterrupt: see ``on_interrupt``.
     """
-    _check_reconstruct(scan, grid, report, on_interrupt, seed)
+    _check_reconstruct(scan, grid, report, on_interrupt)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
-    given = {name: options.pop(name) for name in input_names(method, preset) if name in options}
-    before = input_options(given)
-    chosen = method_options(method, preset, options, before.tune)
-    on_its_grid = scan.with_grid(before)
-    more: dict[str, Any] = {}
+    plan = plan_run(method, options, preset=preset, seed=seed)
+    on_its_grid = scan.with_grid(plan.preprocessing)
     if initial is not None:
-        more["initial"] = _first_volume(initial, on_its_grid.grid)
+        plan = replace(plan, initial=_first_volume(initial, on_its_grid.grid))
 
     def identity() -> dict[str, object]:  # made where it is needed: it reads all frames
-        return _identity(on_its_grid, asdict(before), seed, *more.get("initial", ())[:1])
+        return _identity(on_its_grid, plan)
 
-    if resume is not None:
-        more["resume"] = _state_of(resume, method, chosen, on_its_grid.grid, identity)
+    state = None if resume is None else _state_of(resume, plan, on_its_grid.grid, identity)
     result: Reconstruction | None = None
     try:
         with _reporting(report) as (tell, end), keep_finished_work():
-            result = run_method(
-                scan, method, runtime_of(device), chosen, seed=seed, report=tell, before=before, **more
-            )
+            result = run_method(scan, plan, runtime_of(device), report=tell, resume=state)
             if result.state is not None:
                 result = replace(result, state={**result.state, _IDENTITY: np.array(json.dumps(identity(), default=repr))})
             if result.early_stop:
-                end(f"{method_name(method)}{result.early_stop}")
+                end(f"{plan.method_name}{result.early_stop}")
     except KeyboardInterrupt as error:
         if result is None or on_interrupt == "raise":
             raise interrupted(result) from (error if result is None else None)
@@ -254,13 +248,13 @@ def reconstruct(
     return result
 
 
-def _first_volume(initial: object, grid: Grid) -> tuple[np.ndarray, Grid]:
+def _first_volume(initial: object, grid: Grid) -> InitialVolume:
     """What ``initial`` says, with its grid; InputError for what is no volume, or has other voxels."""
     if isinstance(initial, Reconstruction):
-        return initial.volume, initial.grid
+        return InitialVolume(initial.volume, initial.grid)
     if not isinstance(initial, np.ndarray):
         raise InputError("initial", checks.shown(initial), "a Reconstruction, or an array (nz, ny, nx) in 1/mm")
-    return checks.numbers("initial", initial, grid.shape), grid
+    return InitialVolume(checks.numbers("initial", initial, grid.shape), grid)
 
 
 def _checked_path(path: object) -> Path:
@@ -276,14 +270,13 @@ def check_scan(scan: object, subject: str = "scan") -> None:
         raise InputError(subject, checks.shown(scan), "a Scan", remedy)
 
 
-def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object, seed: int) -> None:
+def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object) -> None:
     check_scan(scan)
     if not (grid is None or isinstance(grid, Grid)):
         raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
     if not (isinstance(report, bool) or callable(report)):
         raise InputError("report", checks.shown(report), "a function, True or False")
     checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
-    checks.whole("seed", seed, 0, 2**63)
 
 
 @contextmanager
@@ -299,11 +292,12 @@ def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, 
             yield ticker.progress, ticker.end
 
 
-def _identity(scan: Scan, before: object, seed: int, initial: np.ndarray | None = None) -> dict[str, object]:
+def _identity(scan: Scan, plan: RunPlan) -> dict[str, object]:
     """What a run that goes on has in common with the one that was interrupted, besides its method: of arrays SHA-256."""
     frames = _sha256(scan.projections, np.packbits(scan.valid))
-    start = None if initial is None else _sha256(initial.astype(np.float32))  # as files have it
-    return {"scan": frames, "seed": seed, "input (steps, holdout, tune)": before, "initial": start}
+    start = None if plan.initial is None else _sha256(plan.initial.values.astype(np.float32))  # as files have it
+    preprocessing = asdict(plan.preprocessing)
+    return {"scan": frames, "seed": plan.seed, "input (steps, holdout, tune)": preprocessing, "initial": start}
 
 
 def _sha256(*arrays: np.ndarray) -> str:
@@ -313,24 +307,21 @@ def _sha256(*arrays: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _state_of(
-    partial: object, method: object, options: Any, grid: Grid, identity: Callable[[], dict[str, object]]
-) -> State:
+def _state_of(partial: object, plan: RunPlan, grid: Grid, identity: Callable[[], dict[str, object]]) -> State:
     """How to go on from a result that was interrupted, of the same scan, method and options."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
         found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.shown(partial)
         raise InputError("resume", found, "the partial result of an interrupted run")
-    if not method_of(method).is_resumable:
-        raise InputError(
-            "resume", f"method {method_name(method)}", "a method that can go on", "leave resume out"
-        )
+    if not method_of(plan.method).is_resumable:
+        raise InputError("resume", f"method {plan.method_name}", "a method that can go on", "leave resume out")
+    options = plan.options
     tuned: Any = partial.facts.get(TUNED)
     if is_told(tuned) and hasattr(options, tuned["option"]):
         options = with_chosen(options, tuned)
     then, now = (
         json.dumps(facts, sort_keys=True, default=repr) for facts in (partial.facts.get("options"), option_facts(options))
     )
-    if partial.facts.get("method") != method_name(method) or then != now:  # as JSON: in files tuples are lists
+    if partial.facts.get("method") != plan.method_name or then != now:  # as JSON: in files tuples are lists
         raise InputError(
             "resume", "another method, or other options", "those of the run that was interrupted"
         )

@@ -35,7 +35,7 @@ from phyradgs_cl.check.statistics import residual_ratio, t_statistic
 from phyradgs_cl.check.variants import reversed_readout
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.phantoms import EllipsoidPhantom
-from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
@@ -114,7 +114,7 @@ def calibrate(
     what frames show."""
     parameters, per_view, asks_direction = chosen(what, scan, phantom is not None)
     asks_lag = any(one.name == "lag" for one in parameters)
-    ready = [prepared(one, InputOptions(ignore_lag=asks_lag)) for one in (scan, *others)]
+    ready = [prepared(one, Preprocessing(ignore_lag=asks_lag)) for one in (scan, *others)]
     if splines and per_view != WOBBLE:
         raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")
     _check(ready, [one.name for one in parameters], per_view, phantom)

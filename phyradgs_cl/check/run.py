@@ -33,7 +33,7 @@ from phyradgs_cl.check.questions.saturation import OVERFLOW, CountReader, check_
 from phyradgs_cl.check.questions.timing import check_timing
 from phyradgs_cl.check.variants import reversed_rotation, shifted
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
 
 
@@ -60,7 +60,7 @@ def check(
 ) -> CheckResult:
     """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was. ``report`` gets how
     many questions are answered, of how many, and the next. InputError: every pixel masked; NaN or infinity elsewhere."""
-    scan = prepared(_usable(scan), InputOptions())
+    scan = prepared(_usable(scan), Preprocessing())
     asks_readout = scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0
     asks_exposure = scan.shutter.exposure_s > 0
     names = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, DISTANCES, GAIN]

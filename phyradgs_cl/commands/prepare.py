@@ -9,8 +9,7 @@ from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import STEPS_OF_PREPARE, Device, Memory, Output, Scan
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import input_settings
+from phyradgs_cl.settings import read_settings
 from phyradgs_cl.workflow import run_preparation
 
 EXAMPLE = "Example: phyradgs prepare scan.h5 -o clean.h5 --steps sparks,dead,rings --set rings.window=11"
@@ -36,12 +35,11 @@ def prepare_command(
     for themselves whether there is anything to do.
     """
     given = {"steps": steps, "ignore_lag": ignore_lag or None, "device": device, "memory": memory}
-    settings = input_settings(config, given, assignments or [], {"steps": DEFAULT_STEPS})
+    settings = read_settings(config, given, assignments or [])
+    preprocessing = settings.preprocessing({"steps": DEFAULT_STEPS})
     with Ticker("step") as ticker, settings.naming_origins():
         ticker.stage(f"preparing {scan.name}")
-        told = run_preparation(
-            scan, output, settings.before, lambda: Runtime(settings.device, memory=settings.memory), config
-        )
+        told = run_preparation(scan, output, preprocessing, settings.runtime, config)
     if as_json:
         say(json.dumps({"scan": str(scan), "output": str(output), "steps": told}))
     else:

@@ -12,7 +12,7 @@ from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Output, Scan
 from phyradgs_cl.commands.ranks import last_words
 from phyradgs_cl.commands.run_options import GROUPS as GROUPS
-from phyradgs_cl.commands.run_options import RunRequest, with_run_options
+from phyradgs_cl.commands.run_options import with_run_options
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
@@ -22,6 +22,7 @@ from phyradgs_cl.reconstructors.result import COMPARED
 from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import profile_report, run_reconstruction
 
 EXAMPLE = (
@@ -37,7 +38,7 @@ _PROFILE = "Print the device's time by kernel."
 def reconstruct_command(
     scan: Scan,
     output: Output,
-    request: RunRequest,
+    settings: Settings,
     initial: Annotated[
         Path | None, file_option("Volume to start from.", "--initial")
     ] = None,
@@ -47,15 +48,13 @@ def reconstruct_command(
     profile: Annotated[bool, option(_PROFILE, True, "--profile")] = False,
 ) -> None:
     """Reconstruct a scan into a volume; print PSNR and SSIM if the scan carries the truth. Defaults are those of fista."""
-    settings = request.settings()
-    job = request.job(settings, scan, output, initial=initial, resume=resume, checkpoint_every_s=checkpoint_every)
+    plan = settings.plan(initial)
     ranks = launched_ranks()
     runtimes: list[Runtime] = []
     ticker = Ticker("iteration")
 
     def runtime() -> Runtime:
-        with settings.naming_origins():
-            runtimes.append(Runtime(settings.device, profile=profile, memory=settings.memory, ranks=ranks))
+        runtimes.append(settings.runtime(profile=profile, ranks=ranks))
         ticker.stage("building kernels")
         return runtimes[-1]
 
@@ -65,13 +64,24 @@ def reconstruct_command(
         if preview is not None:
             check_preview(preview, scan, output, partial_path(output))
             report = Preview(preview, ticker.progress)
-        result, metrics = run_reconstruction(job, runtime, report, ranks)
+        inputs = [path for path in (settings.config, initial) if path is not None]
+        result, metrics = run_reconstruction(
+            plan,
+            scan,
+            output,
+            runtime,
+            report,
+            resume=resume,
+            checkpoint_every_s=checkpoint_every,
+            inputs=inputs,
+            ranks=ranks,
+        )
         if isinstance(report, Preview) and result.state is None and ranks.rank == 0:
             with finish_despite_interrupt():
                 report.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
     used_s = time.process_time()  # of the command so far, its start included: other programs do not change it
-    how = f"{job.method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
+    how = f"{plan.method_name}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
     if TUNED in result.facts:

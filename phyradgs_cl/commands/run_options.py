@@ -3,7 +3,6 @@
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -11,8 +10,7 @@ from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.commands import options
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
-from phyradgs_cl.settings import RunSettings, run_settings
-from phyradgs_cl.workflow import ReconstructionJob
+from phyradgs_cl.settings import read_settings
 
 # heading of the help: names of parameters; a command shows those that it has
 GROUPS = {
@@ -89,36 +87,20 @@ RUN_OPTIONS: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class RunRequest:
-    """What the options of a reconstruction were given; ``given`` has None for those that were not."""
-
-    config: Path | None
-    assignments: list[str]
-    given: dict[str, Any]
-
-    def settings(self) -> RunSettings:
-        """Everything together, checked; InputError for an option or line that is not what it should be."""
-        return run_settings(self.config, self.given, self.assignments)
-
-    def job(self, settings: RunSettings, scan: Path, output: Path, **more: Any) -> ReconstructionJob:
-        """What is to be done with ``scan``, by the ``settings`` of this request."""
-        known = {name: getattr(settings, name) for name in ("method", "seed", "preset", "changes", "before")}
-        return ReconstructionJob(scan, output, config=self.config, **known, **more)
-
-
 def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command all options of a reconstruction but some, in place of its parameter ``request``: Typer, which
-    reads a command's signature, sees the options, and the command is called with a RunRequest."""
+    """Gives a command the options of a reconstruction, except ``without``, in place of its parameter ``settings``.
+
+    Typer reads a command's signature, so the signature lists the options; the command gets the ``Settings`` that they make.
+    """
     names = [name for name in RUN_OPTIONS if name not in without]
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def called(**values: Any) -> None:
-            found = {name: values.pop(name) for name in names}
-            given = {name: None if value is False else value for name, value in found.items()}  # a flag not raised
+            options = {name: values.pop(name) for name in names}
+            given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
             config, assignments = given.pop("config"), given.pop("assignments") or []
-            command(request=RunRequest(config, assignments, given), **values)
+            command(settings=read_settings(config, given, assignments), **values)
 
         called.__signature__ = _signature(command, names)  # type: ignore[attr-defined]
         return called
@@ -127,10 +109,10 @@ def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[
 
 
 def _signature(command: Callable[..., None], names: list[str]) -> inspect.Signature:
-    """The command's own, with the options of a reconstruction for ``request``."""
+    """Returns the command's signature with the options of a reconstruction in place of ``settings``."""
     parameters: list[inspect.Parameter] = []
     for own in inspect.signature(command, eval_str=True).parameters.values():
-        if own.name == "request":
+        if own.name == "settings":
             for name in names:
                 default = False if get_args(kind := RUN_OPTIONS[name])[0] is bool else None
                 parameters.append(inspect.Parameter(name, own.KEYWORD_ONLY, default=default, annotation=kind))

@@ -9,10 +9,10 @@ from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, say, scores
 from phyradgs_cl.commands.files import file_argument, option
 from phyradgs_cl.commands.run_options import GROUPS as GROUPS
-from phyradgs_cl.commands.run_options import RunRequest, with_run_options
+from phyradgs_cl.commands.run_options import with_run_options
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow.watch import WatchEvent, WatchJob, run_watch
 
 EXAMPLE = (
@@ -28,7 +28,7 @@ def watch_command(
     output: Annotated[
         Path, option("Folder for a volume, or an error, of each scan.", True, "--output", "-o", metavar="DIR")
     ],
-    request: RunRequest,
+    settings: Settings,
     once: Annotated[
         bool, option("End when every complete scan has its volume or its error.", True, "--once")
     ] = False,
@@ -41,19 +41,12 @@ def watch_command(
     ] = 600.0,
 ) -> None:
     """Reconstruct the scans of a folder as they arrive, each once; failures are set aside with their message."""
-    settings = request.settings()
-    template = request.job(settings, folder, output, checkpoint_every_s=checkpoint_every)
-    job = WatchJob(folder, output, template, poll_s, settle_s, once)
-
-    def runtime() -> Runtime:
-        with settings.naming_origins():
-            return Runtime(settings.device, memory=settings.memory)
-
+    job = WatchJob(folder, output, settings.plan(), poll_s, settle_s, once, checkpoint_every)
     interrupted = f"interrupted: finished volumes are in {output}; the next start goes on from there"
     signals.say_at_the_end(interrupted)
     telling = _Telling(output)
     try:
-        run_watch(job, runtime, telling.tell, telling.report)
+        run_watch(job, settings.runtime, telling.tell, telling.report)
     except KeyboardInterrupt:
         telling.end_line()
         complain(interrupted)

@@ -1,8 +1,11 @@
-from .frames.preprocess import InputOptions as InputOptions
+from .frames.preprocess import Preprocessing as Preprocessing
 from .method import Method as Method
-from .options import input_names as input_names
-from .options import input_options as input_options
 from .options import method_options as method_options
+from .options import preprocessing_names as preprocessing_names
+from .options import preprocessing_of as preprocessing_of
+from .plan import InitialVolume as InitialVolume
+from .plan import RunPlan as RunPlan
+from .plan import plan_run as plan_run
 from .registry import DEFAULT_METHOD as DEFAULT_METHOD
 from .registry import METHODS as METHODS
 from .registry import method_name as method_name

@@ -11,7 +11,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion
 from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.frames.preprocess import InputOptions
+from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.tune.wish import check_wish
 from phyradgs_cl.text import near_miss
@@ -48,15 +48,15 @@ def method_options(
     return options
 
 
-def input_options(changes: Mapping[str, Any]) -> InputOptions:
+def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
     """Input options by name, checked as the methods' own are."""
-    return _changed(InputOptions(), changes, "reconstruct")
+    return _changed(Preprocessing(), changes, "reconstruct")
 
 
-def input_names(method: object, preset: str | None = None) -> list[str]:
+def preprocessing_names(method: object, preset: str | None = None) -> list[str]:
     """The names of the input options, but those that the method's own options have too, which go before them."""
     own = {f.name for f in fields(method_options(method, preset))}
-    return [f.name for f in fields(InputOptions) if f.name not in own]
+    return [f.name for f in fields(Preprocessing) if f.name not in own]
 
 
 def motions_of(method: object) -> tuple[str, ...]:

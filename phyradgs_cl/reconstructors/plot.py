@@ -9,7 +9,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics import reference_on
 from phyradgs_cl.metrics.slices import draw_slices
 from phyradgs_cl.reconstructors.frames.pairs import FramePair, frame_pairs
-from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
+from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.reconstructors.result import MARGIN_MM
 from phyradgs_cl.runtime import Runtime
 
@@ -33,7 +33,7 @@ def plot_result(
             raise InputError("scan", checks.shown(scan), "the Scan of the result, or None")
         checks.whole("frame", frame, 0, scan.frames - 1)
         rt = device if isinstance(device, Runtime) else Runtime(device)
-        (pair,) = frame_pairs(rt, prepared(scan, InputOptions()), result.volume, result.grid, [frame])
+        (pair,) = frame_pairs(rt, prepared(scan, Preprocessing()), result.volume, result.grid, [frame])
         truth = None if scan.reference is None else reference_on(result.grid, scan.reference, scan.grid)
     columns = 1 if truth is None else 3
     side = _SIDE_INCH if len(result.record) > 1 or pair is not None else 0.0

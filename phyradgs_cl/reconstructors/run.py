@@ -16,15 +16,16 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.prepare.masked import with_masked
 from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
-from phyradgs_cl.reconstructors.frames.preprocess import InputOptions, prepared
-from phyradgs_cl.reconstructors.options import method_options
-from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
+from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
+from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
+from phyradgs_cl.reconstructors.registry import METHODS, method_of
 from phyradgs_cl.reconstructors.result import (
     HELD_OUT,
     MARGIN_MM,
     Progress,
     ProgressReport,
     Reconstruction,
+    State,
     ignore_progress,
 )
 from phyradgs_cl.reconstructors.room import naming_size_that_fits
@@ -34,71 +35,66 @@ from phyradgs_cl.runtime import Runtime
 
 def reconstruct(
     scan: Scan,
-    method: object,
+    plan: RunPlan,
     rt: Runtime,
-    options: Any = None,
     *,
-    seed: int = 0,
     report: ProgressReport = ignore_progress,
-    before: InputOptions | None = None,
-    initial: tuple[np.ndarray, Grid] | None = None,
-    **extra: Any,
+    resume: State | None = None,
 ) -> Reconstruction:
-    """Runs a method, by its name or a function of one's own; ``options`` as from ``method_options``, its default when None.
+    """Runs a plan on a scan. resume: the state of an interrupted run of the same plan, to go on from.
 
-    ``before`` says what is done to the frames first; None undoes the scan's lag and filters nothing. ``initial``: a volume
-    in 1/mm and its grid, from which a method starts that can; it is resampled onto the scan's.
+    The plan's first volume is resampled onto the scan's grid.
     """
-    asked = InputOptions() if before is None else before
-    chosen = method_options(method, tune=asked.tune) if options is None else options
+    preprocessing, method, options = plan.preprocessing, method_of(plan.method), plan.options
     if rt.ranks.size > 1:
-        _check_ranks(method_name(method), rt)
-    if asked.margin_mm is not None:
-        _check_margin(method, chosen)
-    ready = prepared(scan, asked, rt)
+        _check_ranks(plan.method_name, rt)
+    if preprocessing.margin_mm is not None:
+        _check_margin(plan)
+    ready = prepared(scan, preprocessing, rt)
     ready.check_sight()
-    check_own_motion(getattr(chosen, "motion", None), ready)
-    if initial is not None:
-        extra["initial"] = _initial(method, *initial, ready.grid)
-    held = held_out(ready, asked.holdout) if asked.holdout else None
-    seen = ready if held is None else with_masked(ready, held)
-    run = partial(method_of(method).run, rt=rt, seed=seed)
-    if asked.margin_mm is not None:
-        report = _showing(asked.of(scan.grid), report)
-    fitting = naming_size_that_fits(rt, ready, method_name(method), chosen)
-    with _naming_margin(asked, ready.grid), fitting, naming_host_memory():
-        if asked.tune:
-            result = tuned(asked.tune, run, seen, chosen, rt, report, **extra)
+    check_own_motion(getattr(options, "motion", None), ready)
+    more: dict[str, Any] = {} if resume is None else {"resume": resume}
+    if plan.initial is not None:
+        more["initial"] = _initial(plan, plan.initial, ready.grid)
+    hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
+    visible = ready if hidden is None else with_masked(ready, hidden)
+    run = partial(method.run, rt=rt, seed=plan.seed)
+    if preprocessing.margin_mm is not None:
+        report = _showing(preprocessing.of(scan.grid), report)
+    fitting = naming_size_that_fits(rt, ready, plan.method_name, options)
+    with _naming_margin(preprocessing, ready.grid), fitting, naming_host_memory():
+        if preprocessing.tune:
+            result = tuned(preprocessing.tune, run, visible, options, rt, report, **more)
         else:
-            result = run(seen, chosen, report=report, **extra)
-    if held is not None and rt.ranks.rank == 0:
-        result.facts[HELD_OUT] = holdout_errors(rt, ready, held, result)
+            result = run(visible, options, report=report, **more)
+    if hidden is not None and rt.ranks.rank == 0:
+        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result)
     if TOLD in ready.provenance:
         result.facts[TOLD] = ready.provenance[TOLD]
-    if asked.margin_mm is None:
+    if preprocessing.margin_mm is None:
         return result
-    result.facts[MARGIN_MM] = asked.margin_mm
-    return result.within(asked.of(scan.grid))
+    result.facts[MARGIN_MM] = preprocessing.margin_mm
+    return result.within(preprocessing.of(scan.grid))
 
 
-def _initial(method: object, volume: np.ndarray, grid: Grid, onto: Grid) -> np.ndarray:
-    """A first volume on the grid of the scan; InputError for a method that starts from none."""
-    if not method_of(method).takes_initial:
-        taking = ", ".join(name for name, one in METHODS.items() if one.takes_initial)
-        raise InputError("--initial", f"--method {method_name(method)}", f"one of {taking}", "leave --initial out")
-    if grid == onto:
-        return volume
-    first, share = resampled(volume, grid, onto)
+def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
+    """Returns the first volume on the scan's ``grid``. Raises InputError for a method that cannot start from one."""
+    if not method_of(plan.method).takes_initial:
+        names = ", ".join(name for name, method in METHODS.items() if method.takes_initial)
+        raise InputError("--initial", f"--method {plan.method_name}", f"one of {names}", "leave --initial out")
+    if initial.grid == grid:
+        return initial.values
+    volume, share = resampled(initial.values, initial.grid, grid)
     if share == 0:
-        box_mm = np.round(grid.box_mm, 3).tolist()
+        box_mm = np.round(initial.grid.box_mm, 3).tolist()
         raise InputError("--initial", f"a volume in {box_mm} mm (z, y, x)", "one that meets the scan's grid")
-    return first
+    return volume
 
 
-def _check_margin(method: object, options: Any) -> None:
-    """InputError where a method would do nothing with voxels beyond the box."""
-    if (way := getattr(options, "extrapolate", None)) not in (None, "reprojected"):
-        found = f"--method {method_name(method)} with extrapolate={way}, whose voxels do not depend on each other"
+def _check_margin(plan: RunPlan) -> None:
+    """Raises InputError for a method that ignores voxels outside the box."""
+    if (way := getattr(plan.options, "extrapolate", None)) not in (None, "reprojected"):
+        found = f"--method {plan.method_name} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
         raise InputError("--margin-mm", found, "a method that explains frames by what is in the box", remedy)
 
@@ -122,12 +118,12 @@ def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid
 
 
 @contextmanager
-def _naming_margin(asked: InputOptions, grid: Grid) -> Iterator[None]:
+def _naming_margin(preprocessing: Preprocessing, grid: Grid) -> Iterator[None]:
     """Where memory does not do, the body's error says what the margin has made of the grid."""
     try:
         yield
     except OutOfMemoryError as error:
-        if asked.margin_mm is not None:
+        if preprocessing.margin_mm is not None:
             voxels = " × ".join(map(str, grid.shape[::-1]))
             error.remedy += f", as by a narrower --margin-mm (with it the grid has {voxels} voxels)"
         raise

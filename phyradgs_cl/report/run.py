@@ -16,7 +16,7 @@ from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan
 from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import aligned, compare
 from phyradgs_cl.prepare import flat_correction
-from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.tune.trials import TUNED
 from phyradgs_cl.reconstructors.tune.wish import is_told
 from phyradgs_cl.text import plain_text
@@ -55,7 +55,7 @@ class Run:
             return None
 
     @property
-    def before(self) -> InputOptions:
+    def before(self) -> Preprocessing:
         """What was done to the frames first; nothing but what is usual where the provenance does not say."""
         return input_of(self.stored)
 
@@ -73,13 +73,13 @@ class Run:
         return found if is_told(found) else None
 
 
-def input_of(stored: StoredVolume) -> InputOptions:
+def input_of(stored: StoredVolume) -> Preprocessing:
     """What was done to the frames before a volume was made of them, as far as its provenance says."""
     table = stored.provenance.get("input")
     try:
-        return input_options(dict(table)) if isinstance(table, Mapping) else InputOptions()
+        return preprocessing_of(dict(table)) if isinstance(table, Mapping) else Preprocessing()
     except InputError:
-        return InputOptions()
+        return Preprocessing()
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:

@@ -3,7 +3,6 @@ from .files import load_reference as load_reference
 from .files import load_scan as load_scan
 from .files import summary as summary
 from .prepare import run_preparation as run_preparation
-from .reconstruct import ReconstructionJob as ReconstructionJob
 from .reconstruct import profile_report as profile_report
 from .reconstruct import run_reconstruction as run_reconstruction
 from .simulate import SimulationJob as SimulationJob

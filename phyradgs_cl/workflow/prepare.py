@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, hashing, only_run, write_scan
 from phyradgs_cl.prepare import STEPS, TOLD
-from phyradgs_cl.reconstructors import InputOptions
+from phyradgs_cl.reconstructors import Preprocessing
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
@@ -21,7 +21,7 @@ from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_
 
 @np.errstate(all="ignore")
 def run_preparation(
-    source: Path, output: Path, options: InputOptions, make_runtime: Callable[[], Runtime], config: Path | None = None
+    source: Path, output: Path, options: Preprocessing, make_runtime: Callable[[], Runtime], config: Path | None = None
 ) -> list[dict[str, Any]]:
     """Writes the scan ``source`` after the steps of ``options`` as line integrals; says what each did, in order. The file
     says the same, and of which scan. Bad pixels are masked and filled in. Raises InputError and OutputError as any run."""

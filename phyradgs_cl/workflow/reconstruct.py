@@ -5,15 +5,16 @@ import logging
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import __version__, checks, importers, signals
+from phyradgs_cl import __version__, checks, signals
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.field_of_view import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
@@ -25,22 +26,20 @@ from phyradgs_cl.io import (
     only_run,
     partial_path,
     read_checkpoint,
-    sha256_of,
     write_checkpoint,
     write_volume,
 )
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import (
-    DEFAULT_METHOD,
     METHODS,
-    InputOptions,
     Progress,
     ProgressReport,
     Reconstruction,
+    RunPlan,
     State,
+    ignore_progress,
     method_of,
-    method_options,
     reconstruct,
 )
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
@@ -52,24 +51,17 @@ from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_
 log = logging.getLogger(__name__)
 
 
+def check_interval(seconds: float) -> None:
+    """Raises InputError for an impossible time between checkpoints."""
+    checks.within("--checkpoint-every (seconds)", seconds, 0, 1e9)
+
+
 @dataclass(frozen=True)
-class ReconstructionJob:
-    """Which scan to reconstruct by which method, as from ``method_name``, into which file."""
+class _Files:
+    """The scan to read and the volume to write."""
 
     scan: Path
     output: Path
-    method: str = DEFAULT_METHOD
-    preset: str | None = None
-    changes: Mapping[str, Any] | None = None
-    seed: int = 0
-    resume: bool = False
-    config: Path | None = None
-    before: InputOptions = InputOptions()
-    checkpoint_every_s: float = 600.0
-    initial: Path | None = None
-
-    def __post_init__(self) -> None:
-        checks.within("--checkpoint-every (seconds)", self.checkpoint_every_s, 0, 1e9)
 
 
 class _Keeper:
@@ -114,61 +106,70 @@ class _Keeper:
 
 @np.errstate(all="ignore")
 def run_reconstruction(
-    job: ReconstructionJob,
+    plan: RunPlan,
+    scan: Path,
+    output: Path,
     make_runtime: Callable[[], Runtime],
-    report: ProgressReport,
+    report: ProgressReport = ignore_progress,
+    *,
+    resume: bool = False,
+    checkpoint_every_s: float = 600.0,
+    inputs: Sequence[Path] = (),
     ranks: Communicator | None = None,
 ) -> tuple[Reconstruction, dict[str, float]]:
-    """Reconstructs and writes a volume file; returns the result and its metrics where the scan has a reference.
+    """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
 
-    An interrupted run leaves ``output`` alone: what it has goes to ``io.partial_path``, and a checkpoint that ``resume``
-    continues; both go when a run ends. One that is killed leaves its last checkpoint. Of ``ranks``, which the runtime must
-    have too, rank 0 alone writes and has metrics. Raises OutputError while another run is at work on the output.
+    An interrupted run leaves ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes
+    on. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output must not
+    overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run
+    writes the output.
     """
+    check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
-    options = method_options(job.method, job.preset, job.changes, job.before.tune)
     if leads:
-        export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(job.output.name)}'"
-        refuse_foreign_suffix(job.output, export)
-        check_writable(job.output)
-    for path in (job.output, partial_path(job.output)):
-        refuse_overwriting("-o", path, job.scan, *(other for other in (job.config, job.initial) if other))
-    with only_run(job.output) if leads else nullcontext():
-        return _reconstructed(job, options, make_runtime, report)
+        export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
+        refuse_foreign_suffix(output, export)
+        check_writable(output)
+    for path in (output, partial_path(output)):
+        refuse_overwriting("-o", path, scan, *inputs)
+    with only_run(output) if leads else nullcontext():
+        return _reconstructed(plan, _Files(scan, output), make_runtime, report, resume, checkpoint_every_s)
 
 
 def _reconstructed(
-    job: ReconstructionJob, options: Any, make_runtime: Callable[[], Runtime], report: ProgressReport
+    plan: RunPlan,
+    files: _Files,
+    make_runtime: Callable[[], Runtime],
+    report: ProgressReport,
+    resume: bool,
+    checkpoint_every_s: float,
 ) -> tuple[Reconstruction, dict[str, float]]:
-    with hashing(job.scan) as scan_hash_of:
-        scan = load_scan(job.scan, job.before.flats)
+    with hashing(files.scan) as scan_hash_of:
+        scan = load_scan(files.scan, plan.preprocessing.flats)
         scan_hash = scan_hash_of()
-    _warn_of_doubts(job, scan, options)
+    _warn_of_doubts(plan, files.scan, scan)
     rt = make_runtime()
-    fingerprint = _fingerprint(scan_hash, job, options)
-    extra: dict[str, Any] = {"before": job.before}
-    leads = rt.ranks.rank == 0
-    if job.initial is not None:
-        extra["initial"] = importers.load_volume(job.initial)
-    if job.resume:
-        extra["resume"] = rt.ranks.bcast(_resumed(job, fingerprint) if leads else None)
+    fingerprint = _fingerprint(scan_hash, plan)
+    leads, state = rt.ranks.rank == 0, None
+    if resume:
+        state = rt.ranks.bcast(_resumed(plan, files.output, fingerprint) if leads else None)
     elif leads:
-        _set_aside(job.output)
-    keeper = _Keeper(checkpoint_path(job.output), fingerprint, job.checkpoint_every_s, report)
+        _set_aside(files.output)
+    keeper = _Keeper(checkpoint_path(files.output), fingerprint, checkpoint_every_s, report)
     result: Reconstruction | None = None
     metrics: dict[str, float] = {}
     try:
         with keeper.telling(), keep_finished_work():
-            result = reconstruct(scan, job.method, rt, options, seed=job.seed, report=keeper, **extra)
+            result = reconstruct(scan, plan, rt, report=keeper, resume=state)
             if not leads:
                 return result, metrics
             with finish_despite_interrupt():
                 metrics = _metrics(scan, result)
-                path = job.output if result.state is None else partial_path(job.output)
-                told = _provenance(result, scan_hash, job, rt)
-                parts = result.volume, result.grid, told, result.gaussians, metrics or None
+                path = files.output if result.state is None else partial_path(files.output)
+                provenance = _provenance(result, scan_hash, plan, files.scan, rt)
+                parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
                 write_volume(path, *parts, disagreement=result.disagreement)
-                _keep_checkpoint(job, result, fingerprint)
+                _keep_checkpoint(files.output, result, fingerprint)
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
@@ -190,29 +191,31 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
     return {**compare(pair.volume, pair.reference), **held_out}
 
 
-def _warn_of_doubts(job: ReconstructionJob, scan: Scan, options: Any) -> None:
-    """Says what can be reconstructed, but is hardly what was meant."""
-    motion = getattr(options, "motion", None)
-    is_ignored = scan.detector_model == "intensity" and not hasattr(options, "detector_model")
-    if is_ignored and _averages(scan, options):
-        found = "%s averages intensity over an exposure; --method %s averages line integrals"
-        log.warning(found, job.scan, job.method)
+def _warn_of_doubts(plan: RunPlan, path: Path, scan: Scan) -> None:
+    """Warns of a run that is possible, but hardly meant."""
+    motion, grid_choice = getattr(plan.options, "motion", None), plan.preprocessing
+    ignores_model = scan.detector_model == "intensity" and not hasattr(plan.options, "detector_model")
+    if ignores_model and _averages(scan, plan.options):
+        text = "%s averages intensity over an exposure; --method %s averages line integrals"
+        log.warning(text, path, plan.method_name)
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
-        found = "%d strips are more than the %d lines of %s: one strip per line is the most there is"
-        log.warning(found, motion.strips, scan.lines, job.scan)
-    grid = job.before.with_margin(scan.with_grid(job.before).grid)
-    if grid != scan.grid and hasattr(options, "iterations") and cuts(grid, scan.grid, scan.geometry):
-        found = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; "
-        given = job.before.margin_mm is not None
-        found += "if the object goes on, widen --margin-mm" if given else "--margin-mm has that filled, and discards it"
-        log.warning(found, job.scan, job.method)
+        text = "%d strips are more than the %d lines of %s: one strip per line is the most there is"
+        log.warning(text, motion.strips, scan.lines, path)
+    grid = grid_choice.with_margin(scan.with_grid(grid_choice).grid)
+    if grid != scan.grid and hasattr(plan.options, "iterations") and cuts(grid, scan.grid, scan.geometry):
+        text = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; "
+        if grid_choice.margin_mm is None:
+            text += "--margin-mm has that filled, and discards it"
+        else:
+            text += "if the object goes on, widen --margin-mm"
+        log.warning(text, path, plan.method_name)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:
-        found = "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
-        log.warning(found, job.scan, late[0] + 1, late[0])
+        text = "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
+        log.warning(text, path, late[0] + 1, late[0])
     if (largest := float(scan.projections.max())) <= 0:
         found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
-        log.warning("%s: %s: there is no object in it, or the sign is wrong", job.scan, found)
+        log.warning("%s: %s: there is no object in it, or the sign is wrong", path, found)
 
 
 def _averages(scan: Scan, options: Any) -> bool:
@@ -230,7 +233,7 @@ def profile_report(rt: Runtime, result: Reconstruction) -> str:
 
 
 def _provenance(
-    result: Reconstruction, scan_hash: str, job: ReconstructionJob, rt: Runtime
+    result: Reconstruction, scan_hash: str, plan: RunPlan, scan: Path, rt: Runtime
 ) -> dict[str, object]:
     return {
         **result.facts,
@@ -238,32 +241,28 @@ def _provenance(
         "python": platform.python_version(),
         "device": rt.device.name,
         "device_version": rt.device.version,
-        "seed": job.seed,
-        "input": job.before.facts(),
-        "scan": str(job.scan),
+        "seed": plan.seed,
+        "input": plan.preprocessing.facts(),
+        "scan": str(scan),
         "scan_sha256": scan_hash,
-        **_start_facts(job),
+        **(plan.initial.facts if plan.initial else {}),
         "record": result.record,
     }
 
 
-def _fingerprint(scan_hash: str, job: ReconstructionJob, options: Any) -> str:
+def _fingerprint(scan_hash: str, plan: RunPlan) -> str:
     """What a run that goes on must have in common with the one that it continues, as JSON."""
-    run = {"method": job.method, "seed": job.seed, "input": job.before.facts(), **option_facts(options), **_start_facts(job)}
-    return json.dumps({"scan": scan_hash[:16], **run}, sort_keys=True, default=repr)
+    run = {"method": plan.method_name, "seed": plan.seed, "input": plan.preprocessing.facts(), **option_facts(plan.options)}
+    initial = plan.initial.facts if plan.initial else {}
+    return json.dumps({"scan": scan_hash[:16], **run, **initial}, sort_keys=True, default=repr)
 
 
-def _start_facts(job: ReconstructionJob) -> dict[str, str]:
-    """Which volume the run starts from, if any."""
-    return {} if job.initial is None else {"initial": str(job.initial), "initial_sha256": sha256_of(job.initial)}
-
-
-def _resumed(job: ReconstructionJob, fingerprint: str) -> State:
-    if not method_of(job.method).is_resumable:
+def _resumed(plan: RunPlan, output: Path, fingerprint: str) -> State:
+    if not method_of(plan.method).is_resumable:
         resumable = [name for name, method in METHODS.items() if method.is_resumable]
         expected = f"a method with checkpoints: {', '.join(resumable)}"
-        raise InputError("--resume", f"--method {job.method}", expected)
-    return read_checkpoint(checkpoint_path(job.output), fingerprint)
+        raise InputError("--resume", f"--method {plan.method_name}", expected)
+    return read_checkpoint(checkpoint_path(output), fingerprint)
 
 
 def _set_aside(output: Path) -> None:
@@ -276,31 +275,37 @@ def _set_aside(output: Path) -> None:
         log.warning("%s is of an earlier run and is kept as %s: %s", checkpoint, kept.name, remedy)
 
 
-def _keep_checkpoint(job: ReconstructionJob, result: Reconstruction, fingerprint: str) -> None:
-    path = checkpoint_path(job.output)
+def _keep_checkpoint(output: Path, result: Reconstruction, fingerprint: str) -> None:
+    path = checkpoint_path(output)
     if result.state is None:
-        for outdated in (path, partial_path(job.output)):
+        for outdated in (path, partial_path(output)):
             with suppress(OSError):  # the volume is there, whatever lies in their place
                 outdated.unlink()
     else:
         write_checkpoint(path, dict(result.state), fingerprint)
 
 
-def go_on(
-    job: ReconstructionJob, make_runtime: Callable[[], Runtime], report: ProgressReport
+def resume_or_restart(
+    plan: RunPlan,
+    scan: Path,
+    output: Path,
+    make_runtime: Callable[[], Runtime],
+    report: ProgressReport = ignore_progress,
+    checkpoint_every_s: float = 600.0,
 ) -> tuple[Reconstruction, dict[str, float]]:
-    """As ``run_reconstruction``; a checkpoint of another scan or other options, or a damaged one, is set aside."""
-    checkpoint = checkpoint_path(job.output)
-    if checkpoint.is_file() and method_of(job.method).is_resumable:
+    """Goes on from the output's checkpoint, as ``run_reconstruction``; sets aside one that is damaged, or of another run."""
+    run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
+    checkpoint = checkpoint_path(output)
+    if checkpoint.is_file() and method_of(plan.method).is_resumable:
         try:
-            return run_reconstruction(replace(job, resume=True), make_runtime, report)
+            return run(resume=True)
         except InputError as error:
             named = ("--resume", str(checkpoint))
             if error.subject not in named and not error.subject.startswith("checkpoint"):
                 raise
-    return run_reconstruction(replace(job, resume=False), make_runtime, report)
+    return run(resume=False)
 
 
-def is_whole(result: Reconstruction) -> bool:
+def is_complete(result: Reconstruction) -> bool:
     """Whether the run came to its end; a stopped one has left a checkpoint."""
     return result.facts.get("interrupted_at") is None

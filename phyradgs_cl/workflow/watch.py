@@ -9,18 +9,18 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from phyradgs_cl import checks, signals
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError, PhyradgsError
 from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, only_run, partial_path, written_beside
 from phyradgs_cl.io.output import beside, make_folder
-from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, ignore_progress
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, RunPlan, ignore_progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.reconstruct import ReconstructionJob, go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import check_interval, is_complete, resume_or_restart
 
 _LOCK = "watch"
 _WORK = ".work"
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WatchJob:
-    """The watched folder, and the reconstruction of its scans into ``output``: ``template`` with other files.
+    """The watched folder, and the plan by which its scans are reconstructed into ``output``.
 
     poll_s: seconds between two looks at the folder. settle_s: how long a file must not have changed. once: return when
     every complete scan has its volume or its error.
@@ -37,14 +37,16 @@ class WatchJob:
 
     folder: Path
     output: Path
-    template: ReconstructionJob
+    plan: RunPlan
     poll_s: float = 2.0
     settle_s: float = 5.0
     once: bool = False
+    checkpoint_every_s: float = 600.0
 
     def __post_init__(self) -> None:
         checks.within("--poll-s", self.poll_s, 0.01, 86_400)
         checks.within("--settle-s", self.settle_s, 0, 86_400)
+        check_interval(self.checkpoint_every_s)
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,8 @@ class _Watch:
         scan, work = arrival.path, self._work(arrival)
         work.unlink(missing_ok=True)  # of an earlier run, whose checkpoint stays
         try:
-            result, metrics = go_on(replace(self.job.template, scan=scan, output=work), lambda: self.rt, self.report(scan))
+            every_s = self.job.checkpoint_every_s
+            result, metrics = resume_or_restart(self.job.plan, scan, work, lambda: self.rt, self.report(scan), every_s)
         except signals.InterruptedAfterwards:  # the run had finished
             if work.exists() and not checkpoint_path(work).exists():
                 self._publish(arrival)
@@ -211,7 +214,7 @@ class _Watch:
         except Exception as error:  # a defect that one scan meets must not stop the others
             log.exception("%s", scan)
             return self._fail(arrival, error)
-        if not is_whole(result):
+        if not is_complete(result):
             raise KeyboardInterrupt
         if self._publish(arrival):
             self.tell(WatchEvent(scan, result, metrics))

@@ -9,7 +9,7 @@ import pytest
 
 from phyradgs_cl import estimate as room
 from phyradgs_cl.estimate import duration, estimate, shortened
-from phyradgs_cl.reconstructors import method_options
+from phyradgs_cl.reconstructors import RunPlan, method_options, plan_run
 from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.workflow import load_scan
@@ -34,7 +34,8 @@ class Clock:
     def perf_counter(self) -> float:
         return self.now
 
-    def reconstruct(self, scan, method, rt, options, *, before=None) -> Reconstruction:
+    def reconstruct(self, scan, plan, rt) -> Reconstruction:
+        options = plan.options
         iterations = getattr(options, "iterations", 1)
         self.now += 50.0 * (len(self.iterations) == self.slow)
         self.iterations.append(iterations)
@@ -60,7 +61,7 @@ def estimated(rt, scan):
     """(method, iterations) → the estimate of such a run."""
 
     def estimate_of(method: str, **changes: int) -> room.Estimate:
-        return estimate(load_scan(scan), method, method_options(method, None, changes), rt)
+        return estimate(load_scan(scan), plan_run(method, changes), rt)
 
     return estimate_of
 
@@ -115,7 +116,7 @@ def test_fast_iterations_are_told_from_noise(estimated, clock) -> None:
 
 def test_what_is_around_the_method_counts_and_fdk_is_run(rt, scan, clock, estimated) -> None:
     options = method_options("phyradgs", None, {"iterations": 300})
-    found = estimate(load_scan(scan), "phyradgs", options, rt, around=lambda result: 1.5)
+    found = estimate(load_scan(scan), RunPlan("phyradgs", options), rt, around=lambda result: 1.5)
     assert (found.seconds, found.around_s) == (pytest.approx(2.0 + 75 + 1.5), 1.5)
     assert "1.5 s to read, compare and write" in found.text()
     found = estimated("fdk")
@@ -139,20 +140,20 @@ def test_the_command_says_time_and_memory(cli, scan, capsys, method) -> None:
 
 def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
     """All that changes how long a run takes can be said to both."""
-    asked = []
+    plans = []
 
-    def fake(scan, method, options, rt, before, around):
-        asked.append((options, before))
+    def fake(scan, plan, rt, around):
+        plans.append(plan)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("phyradgs_cl.commands.estimate.estimate", fake)
     before = ["--detector-model", "intensity", "--median-filter", "3", "--ignore-lag"]
     for words in (["--strips", "2", "--sub-intervals", "1"], ["--segments", "2", "--time-error", "0.01"]):
         cli.run(["estimate", str(scan), "--method", "phyradgs", *words, *before])
-    for options, before in asked:
-        assert options.detector_model == "intensity"
-        assert (before.median_filter, before.ignore_lag) == (3, True)
-    micro, exact = (options.motion for options, _ in asked)
+    for plan in plans:
+        assert plan.options.detector_model == "intensity"
+        assert (plan.preprocessing.median_filter, plan.preprocessing.ignore_lag) == (3, True)
+    micro, exact = (plan.options.motion for plan in plans)
     assert (micro.name, micro.strips, micro.sub_intervals) == ("micro-views", 2, 1)
     assert (exact.name, exact.segments, exact.time_error) == ("exact", 2, 0.01)
     refused(["estimate", scan, "--method", "phyradgs", "--motion", "per-row"], "--motion")

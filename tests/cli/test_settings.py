@@ -1,6 +1,7 @@
 """What wins over what, and how a wrong value is named by the place where it stands."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -8,15 +9,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from phyradgs_cl.commands.run_options import RUN_OPTIONS, RunRequest, with_run_options
+from phyradgs_cl.commands.run_options import with_run_options
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import method_options
-from phyradgs_cl.settings import RunSettings, run_settings
+from phyradgs_cl.reconstructors import RunPlan, method_options
+from phyradgs_cl.settings import Settings, read_settings
 
 
-def options_of(settings: RunSettings) -> Any:
-    """The method's options that the settings lead to."""
-    return method_options(settings.method, settings.preset, settings.changes)
+def plan_of(config: Path | None, given: dict[str, Any], assignments: Sequence[str] = ()) -> RunPlan:
+    """The plan that a file and a command line lead to."""
+    return read_settings(config, given, assignments).plan()
 
 
 @pytest.fixture
@@ -30,21 +31,21 @@ def test_whatever_is_said_lies_over_the_preset(config: Path, where: str) -> None
     config.write_text("method = 'fdk'\n" + ("preset = 'hann'\n" if where == "file" else ""))
     named = {"preset": "hann" if where == "option" else None}
     preset = ["preset=hann"] if where == "set" else []
-    assert options_of(run_settings(config, named, preset)).window == "hann"
-    assert options_of(run_settings(config, named, [*preset, "window=cosine"])).window == "cosine"
+    assert plan_of(config, named, preset).options.window == "hann"
+    assert plan_of(config, named, [*preset, "window=cosine"]).options.window == "cosine"
     config.write_text(config.read_text() + "window = 'hamming'\n")
-    assert options_of(run_settings(config, named, preset)).window == "hamming"
-    assert options_of(run_settings(config, named, [*preset, "window=cosine"])).window == "cosine"
+    assert plan_of(config, named, preset).options.window == "hamming"
+    assert plan_of(config, named, [*preset, "window=cosine"]).options.window == "cosine"
 
 
 def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> None:
     config.write_text("iterations = 1\nseed = 1\npreset = 'paper'\nmethod = 'phyradgs'\n")
-    found = run_settings(config, {"iterations": None}, [])
-    assert (options_of(found).iterations, options_of(found).gaussians, found.seed) == (1, 50_000, 1)
-    assert options_of(run_settings(config, {}, ["iterations=2"])).iterations == 2
-    found = run_settings(config, {"iterations": 3, "seed": 3}, ["iterations=2", "seed=2"])
-    assert (options_of(found).iterations, found.seed) == (3, 3)
-    assert options_of(run_settings(config, {"preset": "default"}, ["preset=released"])).ssim_weight == 0.2
+    found = plan_of(config, {"iterations": None}, [])
+    assert (found.options.iterations, found.options.gaussians, found.seed) == (1, 50_000, 1)
+    assert plan_of(config, {}, ["iterations=2"]).options.iterations == 2
+    found = plan_of(config, {"iterations": 3, "seed": 3}, ["iterations=2", "seed=2"])
+    assert (found.options.iterations, found.seed) == (3, 3)
+    assert plan_of(config, {"preset": "default"}, ["preset=released"]).options.ssim_weight == 0.2
 
 
 @pytest.mark.parametrize(
@@ -66,29 +67,29 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
 def test_a_wrong_value_of_a_file_is_named_by_its_line(config: Path, text: str, error: str) -> None:
     config.write_text(text)
     with pytest.raises(InputError, match=re.escape(f"config {config}: {error}")):
-        run_settings(config, {})
+        plan_of(config, {})
 
 
 def test_a_wrong_option_of_the_command_line_is_not_the_files(config: Path) -> None:
     config.write_text("method = 'fdk'\niterations = 3\n")
     with pytest.raises(InputError, match="^--iterations: found no such option of --method fdk"):
-        run_settings(config, {"iterations": 5})
+        plan_of(config, {"iterations": 5})
     with pytest.raises(InputError, match="^--set iterations=5: found no such option of --method fdk"):
-        run_settings(None, {"method": "fdk"}, ["iterations=5"])
+        plan_of(None, {"method": "fdk"}, ["iterations=5"])
 
 
 def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
     config.write_text("method = 'FISTA-TV'\nsize = [8, 9, 10]\n")
-    found = run_settings(config, {"size": None, "voxel_mm": (0.5, 0.5, 0.5)})
-    assert (found.method, found.before.size, found.before.voxel_mm) == ("fista-tv", (8, 9, 10), (0.5,) * 3)
-    found = run_settings(config, {"size": 7.0, "method": "Sirt"})
-    assert (found.method, found.before.size) == ("sirt", 7)
+    found = plan_of(config, {"size": None, "voxel_mm": (0.5, 0.5, 0.5)})
+    assert (found.method, found.preprocessing.size, found.preprocessing.voxel_mm) == ("fista-tv", (8, 9, 10), (0.5,) * 3)
+    found = plan_of(config, {"size": 7.0, "method": "Sirt"})
+    assert (found.method, found.preprocessing.size) == ("sirt", 7)
 
 
 def test_a_prior_is_for_methods_that_have_one() -> None:
-    assert run_settings(None, {"prior": "tv"}, ["prior=dct"]).changes["prior"] == "tv"
+    assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
     with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*--method fista has it$"):
-        run_settings(None, {"prior": "tv", "method": "sirt"})
+        plan_of(None, {"prior": "tv", "method": "sirt"})
 
 
 def test_a_method_offers_only_what_it_has() -> None:
@@ -108,9 +109,9 @@ def asked() -> tuple[typer.Typer, list[object]]:
 
     @app.command()
     @with_run_options("seed", "batch")
-    def command(scan: str, request: RunRequest, often: Annotated[float, typer.Option()] = 2.0) -> None:
+    def command(scan: str, settings: Settings, often: Annotated[float, typer.Option()] = 2.0) -> None:
         """What it does."""
-        seen.extend([scan, request, often])
+        seen.extend([scan, settings, often])
 
     return app, seen
 
@@ -119,19 +120,16 @@ def test_a_command_gets_what_was_given_and_none_for_the_rest(asked, tmp_path: Pa
     app, seen = asked
     config = tmp_path / "options.toml"
     words = ["s.h5", "--method", "sirt", "--motion", "per-row", "--often", "3", "--ignore-lag"]
+    config.write_text("iterations = 7\nseed = 5\n", encoding="utf-8")
     words += ["--set", "relaxation=0.5", "--set", "iterations=3", "--config", str(config), "--memory", "1GiB"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
-    scan, request, often = seen
-    assert (scan, often, request.config) == ("s.h5", 3.0, config)
-    assert request.assignments == ["relaxation=0.5", "iterations=3"]
-    given = {name: value for name, value in request.given.items() if value is not None}
-    assert given == {"method": "sirt", "motion": "per-row", "ignore_lag": True, "memory": "1GiB"}
-    assert set(request.given) == set(RUN_OPTIONS) - {"seed", "batch", "config", "assignments"}
-    config.write_text("iterations = 7\nseed = 5\n", encoding="utf-8")
-    settings = request.settings()
-    assert (settings.method, settings.seed, settings.memory) == ("sirt", 5, 2**30)
-    assert (settings.changes["iterations"], settings.changes["relaxation"]) == (3, 0.5)
+    scan, settings, often = seen
+    assert (scan, often, settings.config, settings.memory) == ("s.h5", 3.0, config, 2**30)
+    words = {"method": "sirt", "motion": "per-row", "ignore_lag": True}
+    assert settings.values == {**words, "relaxation": 0.5, "iterations": 3, "seed": 5}
+    plan = settings.plan()
+    assert (plan.method, plan.seed, plan.options.iterations, plan.options.relaxation) == ("sirt", 5, 3, 0.5)
 
 
 def test_nothing_given_is_nothing_given_and_what_is_left_out_is_no_option(asked) -> None:
@@ -139,4 +137,4 @@ def test_nothing_given_is_nothing_given_and_what_is_left_out_is_no_option(asked)
     for option in ("--seed", "--batch"):
         assert CliRunner().invoke(app, ["s.h5", option, "1"]).exit_code == 2 and seen == []
     assert CliRunner().invoke(app, ["s.h5"]).exit_code == 0
-    assert seen[1] == RunRequest(None, [], dict.fromkeys(seen[1].given))
+    assert seen[1] == Settings({}, {})

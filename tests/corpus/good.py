@@ -12,8 +12,7 @@ from phyradgs_cl.io import checkpoint_path, write_checkpoint
 from phyradgs_cl.io.sha256 import sha256_of
 from phyradgs_cl.reconstructors import Progress, reconstruct
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import run_settings
-from phyradgs_cl.workflow import ReconstructionJob
+from phyradgs_cl.settings import read_settings
 from phyradgs_cl.workflow import reconstruct as workflow
 from phyradgs_cl.workflow.files import load_scan
 
@@ -129,12 +128,8 @@ def _write_checkpoint(folder: Path, method: str) -> None:
     options = dict(zip(RESUMED[method][::2], RESUMED[method][1::2], strict=True))
     assignments = [options.pop("--set")] if "--set" in options else []
     given = {name.strip("-"): int(text) if text.isdigit() else text for name, text in options.items()}
-    settings = run_settings(None, {"method": method, **given}, assignments)
-    job = ReconstructionJob(
-        scan, folder / method, method=method, changes=settings.changes, before=settings.before
-    )
-    chosen = workflow.method_options(job.method, job.preset, job.changes)
-    result = reconstruct(load_scan(scan), method, Runtime(), chosen, seed=0, report=_stop)
+    plan = read_settings(None, {"method": method, **given}, assignments).plan()
+    result = reconstruct(load_scan(scan), plan, Runtime(), report=_stop)
     assert result.state is not None
-    fingerprint = workflow._fingerprint(sha256_of(scan), job, chosen)
+    fingerprint = workflow._fingerprint(sha256_of(scan), plan)
     write_checkpoint(checkpoint_path(folder / method), dict(result.state), fingerprint)

@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, SCALE
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, RayOperator, SplatProjector, voxelise
 from phyradgs_cl.optim import DeviceAdam
-from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime.layout import pad_rows
 from phyradgs_cl.workflow.files import load_scan
@@ -135,6 +135,6 @@ def test_any_finite_scan(rt, scan, method) -> None:
         measured = replace(loaded, projections=frames.astype(np.float32))
         with np.errstate(all="ignore"):
             try:
-                assert np.isfinite(reconstruct(measured, method, rt, options, seed=0).volume).all(), values
+                assert np.isfinite(reconstruct(measured, RunPlan(method, options, seed=0), rt).volume).all(), values
             except NumericalError as error:
                 assert values in ("huge", "alternating") and error.found

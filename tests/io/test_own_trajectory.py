@@ -11,7 +11,7 @@ from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 
 GEOMETRY = ConeGeometry(500.0, 800.0, (9, 12), (6.0, 5.0))
 TURN = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 0.5))
@@ -64,7 +64,7 @@ def test_every_kind_of_method_follows_it(rt, tmp_path) -> None:
     for name, changes in {"fdk": {}, "sirt": {"iterations": 2}, "phyradgs": {"iterations": 2, "gaussians": 20}}.items():
         options = method_options(name, None, changes)
         own, table, circle = (
-            reconstruct(s, name, rt, options).volume for s in (scan, stored, replace(scan, trajectory=TURN))
+            reconstruct(s, RunPlan(name, options), rt).volume for s in (scan, stored, replace(scan, trajectory=TURN))
         )
         np.testing.assert_allclose(own, table, rtol=0, atol=2e-3 * np.abs(own).max(), err_msg=name)
         assert np.abs(own - circle).max() > 1e-2 * np.abs(own).max(), name

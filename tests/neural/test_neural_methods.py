@@ -13,7 +13,7 @@ from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.neural.field.start import first_field
 from phyradgs_cl.neural.trainer import Trainer
 from phyradgs_cl.parallel import Alone
-from phyradgs_cl.reconstructors import METHODS, method_options
+from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.neural.run import _Passes
@@ -78,15 +78,15 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(rt, scan, met
 @pytest.mark.parametrize("stop", [1, 2])
 def test_a_run_goes_on_from_any_report_to_the_same_bits(rt, scan, method, stop) -> None:
     options = method_options(method, None, {**SHORT[method], "motion": "per-row"})
-    whole = run_method(scan, method, rt, options)
+    whole = run_method(scan, RunPlan(method, options), rt)
 
     def interrupt(progress: Progress) -> None:
         if progress.iteration == stop:
             raise KeyboardInterrupt
 
-    part = run_method(scan, method, rt, options, report=interrupt)
+    part = run_method(scan, RunPlan(method, options), rt, report=interrupt)
     assert part.facts["interrupted_at"] == stop and part.state is not None
-    rest = run_method(scan, method, rt, options, resume=part.state)
+    rest = run_method(scan, RunPlan(method, options), rt, resume=part.state)
     assert np.array_equal(rest.volume, whole.volume)
     assert [x["loss"] for x in rest.record] == [x["loss"] for x in whole.record]
 
@@ -112,7 +112,7 @@ def test_a_run_goes_on_from_the_middle_of_a_pass(scan) -> None:
 def test_a_damaged_state_is_refused(rt, scan) -> None:
     options = method_options("naf", None, SHORT["naf"])
     states = []
-    run_method(scan, "naf", rt, options, report=lambda p: states.append(dict(p.state())))
+    run_method(scan, RunPlan("naf", options), rt, report=lambda p: states.append(dict(p.state())))
     wrong = {
         "parameters": np.zeros(3, np.float32), "moments": np.full_like(states[0]["moments"], np.nan),
         "steps": np.array(10**6), "updates": np.array(-1), "queue": states[0]["queue"] + 100,
@@ -120,9 +120,9 @@ def test_a_damaged_state_is_refused(rt, scan) -> None:
     }  # fmt: skip
     for name, value in wrong.items():
         with pytest.raises(InputError, match=f"checkpoint, array {name}"):
-            run_method(scan, "naf", rt, options, resume={**states[0], name: value})
+            run_method(scan, RunPlan("naf", options), rt, resume={**states[0], name: value})
     with pytest.raises(InputError, match="checkpoint"):
-        run_method(scan, "naf", rt, options, resume={})
+        run_method(scan, RunPlan("naf", options), rt, resume={})
 
 
 @pytest.mark.parametrize("method", NEURAL)
@@ -163,7 +163,7 @@ def test_the_published_constants_run(rt, scan, method) -> None:
     """One pass of the published configuration, its tables cut down to what a test can hold."""
     options = method_options(method, "published", {"iterations": 1, "table_log2": 12, "rays": 16})
     assert (options.rate, options.levels, options.jitter, options.positive_only) == (1e-3, 16, "sample", True)
-    volume = run_method(scan, method, rt, options).volume
+    volume = run_method(scan, RunPlan(method, options), rt).volume
     assert np.isfinite(volume).all() and volume.min() >= 0
 
 

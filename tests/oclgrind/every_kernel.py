@@ -32,7 +32,7 @@ from phyradgs_cl.operators import (
     VoxelOperator,
     voxelise,
 )
-from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors import METHODS, plan_run, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
@@ -137,7 +137,7 @@ def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
     elif name != "fdk":
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
         changes |= {"voxel_iterations": 1} if name == "fused" else {}
-    reconstruct(scan, name, rt, method_options(name, None, {**changes, **more}))
+    reconstruct(scan, plan_run(name, {**changes, **more}), rt)
 
 
 def cases() -> dict[str, Callable[[Runtime], None]]:

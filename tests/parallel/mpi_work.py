@@ -13,7 +13,8 @@ from parallel.shared_runs import OPTIONS, started  # noqa: E402
 from phyradgs_cl.acquisition import Exact  # noqa: E402
 from phyradgs_cl.api import load_scan, reconstruct  # noqa: E402
 from phyradgs_cl.parallel import launched_ranks  # noqa: E402
-from phyradgs_cl.reconstructors import reconstruct as run_method  # noqa: E402
+from phyradgs_cl.reconstructors import RunPlan
+from phyradgs_cl.reconstructors import reconstruct as run_method  # noqa: E402, RunPlan
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 SPLATS = {"micro-views": OPTIONS, "exact": replace(OPTIONS, motion=Exact())}
@@ -30,7 +31,7 @@ def main() -> None:
     rt, scan = Runtime(ranks=ranks), load_scan(sys.argv[1])
     kept: dict[str, np.ndarray] = {"size": np.array(ranks.size)}
     for name, options in SPLATS.items():
-        kept[name] = run_method(scan, "phyradgs", rt, options, seed=1).volume
+        kept[name] = run_method(scan, RunPlan("phyradgs", options, seed=1), rt).volume
     for name, options in VOXELS.items():
         volume = reconstruct(scan, name, device=rt, **options)
         again = reconstruct(scan, name, device=rt, **options)

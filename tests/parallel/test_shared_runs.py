@@ -9,7 +9,7 @@ from tolerances import RANK_GRADIENT, RANK_VOLUME
 
 from phyradgs_cl.acquisition import Exact, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import InputOptions, Progress, loop, method_options, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, loop, method_options, reconstruct
 from phyradgs_cl.reconstructors.tune.trials import TUNED
 from phyradgs_cl.runtime import Runtime
 
@@ -30,7 +30,7 @@ def on_ranks(ranks_of, scan):
     """(size, method, options, more of a reconstruction) → the result of every rank."""
 
     def run(size: int, method: str, options=None, **more):
-        return ranks_of(size, lambda ranks: reconstruct(scan, method, Runtime(ranks=ranks), options, **more))
+        return ranks_of(size, lambda ranks: reconstruct(scan, RunPlan(method, options), Runtime(ranks=ranks), **more))
 
     return run
 
@@ -38,7 +38,7 @@ def on_ranks(ranks_of, scan):
 @pytest.mark.parametrize("name", DIVIDED)
 def test_same_bits_on_1_to_4_ranks(on_ranks, scan, name) -> None:
     options = DIVIDED[name]
-    one = reconstruct(scan, "phyradgs", Runtime(), options, seed=1)
+    one = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
     assert one.gaussians.count != one.facts["gaussians_first"]  # density control has acted
     for size in (2, 3, 4):
         found = on_ranks(size, "phyradgs", options, seed=1)
@@ -68,7 +68,7 @@ def test_a_batch_s_gradient_is_the_sum_of_its_frames(scan) -> None:
 def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model) -> None:
     changes = {"iterations": 6, "motion": "per-row", "detector_model": model}
     options = method_options(method, None, changes)
-    one = reconstruct(scan, method, Runtime(), options).volume
+    one = reconstruct(scan, RunPlan(method, options), Runtime()).volume
     for size in (2, 3, 4):
         volumes, again = ([found.volume for found in on_ranks(size, method, options)] for _ in range(2))
         assert np.linalg.norm(volumes[0] - one) <= RANK_VOLUME * np.linalg.norm(one)
@@ -78,8 +78,8 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model
 
 @pytest.mark.parametrize("method, wish", [("sirt", "relaxation=0.5,1,1.5"), ("cgls", "iterations")])
 def test_ranks_let_the_scan_choose_as_one_does(on_ranks, scan, method, wish) -> None:
-    options, before = method_options(method, None, {"iterations": 6}), InputOptions(tune=wish)
-    alone = reconstruct(scan, method, Runtime(), options, before=before).facts[TUNED]
+    options, before = method_options(method, None, {"iterations": 6}), Preprocessing(tune=wish)
+    alone = reconstruct(scan, RunPlan(method, options, preprocessing=before), Runtime()).facts[TUNED]
     for found in (result.facts[TUNED] for result in on_ranks(2, method, options, before=before)):
         assert found["values"] == alone["values"]
         assert found["chosen"] == pytest.approx(alone["chosen"], rel=1e-3)
@@ -87,7 +87,7 @@ def test_ranks_let_the_scan_choose_as_one_does(on_ranks, scan, method, wish) -> 
 
 def test_a_stopped_run_goes_on_with_another_number_of_ranks(on_ranks, scan) -> None:
     options = replace(OPTIONS, iterations=120, control=replace(CONTROL, max_gaussians=400))
-    whole = reconstruct(scan, "phyradgs", Runtime(), options, seed=1)
+    whole = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
 
     def stop(progress: Progress) -> None:
         raise KeyboardInterrupt

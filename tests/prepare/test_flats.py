@@ -8,7 +8,7 @@ from phyradgs_cl.api import load_scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.prepare import flat_correction
-from phyradgs_cl.reconstructors import InputOptions
+from phyradgs_cl.reconstructors import Preprocessing
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 
 DARK = 100.0
@@ -47,10 +47,10 @@ def test_files_are_read_with_them_and_scans_of_line_integrals_refused(planted, t
     write_scan(tmp_path / "counts.h5", clean, data=data, image_key=key, quantity="counts")
     found, mean = load_scan(tmp_path / "counts.h5", flats="time"), load_scan(tmp_path / "counts.h5")
     assert np.abs(found.projections - mean.projections).max() > 0.01
-    assert prepared(found, InputOptions(flats="time")) is found
+    assert prepared(found, Preprocessing(flats="time")) is found
     for call in (
-        lambda: prepared(clean, InputOptions(flats="time")),
-        lambda: InputOptions(flats="median"),
+        lambda: prepared(clean, Preprocessing(flats="time")),
+        lambda: Preprocessing(flats="median"),
         lambda: flat_correction("pca")(data, np.where(key == 1, 3, key), "counts"),
     ):
         with pytest.raises(InputError, match="flats"):

@@ -25,7 +25,7 @@ from phyradgs_cl.prepare import (
 )
 from phyradgs_cl.prepare.hardening import find_bone
 from phyradgs_cl.prepare.scatter import raised
-from phyradgs_cl.reconstructors import InputOptions, input_options
+from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.frames.reprojection import reprojection
 
@@ -61,7 +61,7 @@ def test_what_is_bone_may_be_stated(rt, planted) -> None:
     before, lost = psnr_db(rt, spoilt), psnr_db(rt, clean) - psnr_db(rt, spoilt)
     stated = psnr_db(rt, spoilt, "hardening", hardening={"kvp": 120.0, "bone_per_mm": half})
     assert stated - before > 0.6 * lost
-    none = prepared(spoilt, input_options({"steps": "hardening", "hardening": {"kvp": 120.0, "bone_per_mm": 99.0}}), rt)
+    none = prepared(spoilt, preprocessing_of({"steps": "hardening", "hardening": {"kvp": 120.0, "bone_per_mm": 99.0}}), rt)
     np.testing.assert_array_equal(none.projections, straighten(spoilt.projections, water_polynomial(120.0)))
 
 
@@ -81,7 +81,7 @@ def test_sparks_are_found_one_by_one(planted) -> None:
     found = find_sparks(spoilt)
     assert not (found & ~hit).any() and not find_sparks(clean).any()
     assert (found & hit).sum() > 0.9 * hit.sum()
-    masked = prepared(planted(sparks=1e-3), InputOptions(steps="sparks"))
+    masked = prepared(planted(sparks=1e-3), Preprocessing(steps="sparks"))
     assert (masked.valid == ~found).all()
     assert np.abs(masked.projections - clean)[found].mean() < 0.2 * np.abs(spoilt - clean)[found].mean()
 
@@ -93,7 +93,7 @@ def test_dead_pixels_and_lines_are_masked_and_filled_in(rt, planted) -> None:
     wanted = np.zeros(p.shape[1:], bool)
     wanted[20, 11] = wanted[12, 9] = wanted[5] = wanted[:, 33] = True
     spoilt = replace(clean, projections=p)
-    found = prepared(spoilt, InputOptions(steps="dead"))
+    found = prepared(spoilt, Preprocessing(steps="dead"))
     assert (find_dead(p) == wanted).all() and (~found.valid.any(0) == wanted).all()
     told = found.provenance[TOLD][0]
     assert (told["step"], told["rows"], told["columns"]) == ("dead", 1, 1)
@@ -113,7 +113,7 @@ def test_the_pattern_of_gains_is_what_was_planted(planted) -> None:
 
 def test_air_takes_the_drift_of_the_light_out(rt, planted) -> None:
     scan = planted(drift=0.1)
-    found = prepared(scan, InputOptions(steps="air"))
+    found = prepared(scan, Preprocessing(steps="air"))
     corner = np.s_[:, :4, :4]
     assert np.abs(scan.projections[corner].mean((1, 2))).max() > 0.08
     assert np.abs(found.projections[corner].mean((1, 2))).max() < 0.005
@@ -190,7 +190,7 @@ def test_bone_is_what_the_beam_says_and_not_the_densest_of_three_classes() -> No
 
 
 def test_frames_that_no_correction_explains_better_stay_as_they_are(rt, planted, caplog) -> None:
-    found = prepared(planted(), input_options({"steps": "hardening", "hardening": {"kvp": 120.0}}), rt)
+    found = prepared(planted(), preprocessing_of({"steps": "hardening", "hardening": {"kvp": 120.0}}), rt)
     assert found.projections is planted().projections and found.provenance[TOLD][0]["left_alone"]
     assert "stay as they are" in caplog.text
 
@@ -204,11 +204,11 @@ def test_one_material_says_its_own_polynomial(rt, planted) -> None:
     true *= 5 / true.max()
     straight = replace(scan, projections=true, reference=None)
     bent = replace(straight, projections=tube_spectrum(120.0).hardened(true).astype(np.float32))
-    found = prepared(bent, InputOptions(steps="hardening"), rt).projections
+    found = prepared(bent, Preprocessing(steps="hardening"), rt).projections
     error, before = (np.sqrt(np.mean((f - true) ** 2)) for f in (found, bent.projections))
     assert error < 0.7 * before, (error, before)
     with pytest.raises(InputError, match="hardening.kvp"):
-        prepared(planted(kvp=120.0), InputOptions(steps="hardening"), rt)
+        prepared(planted(kvp=120.0), Preprocessing(steps="hardening"), rt)
 
 
 def test_all_effects_together(rt, planted) -> None:
@@ -223,32 +223,32 @@ def test_steps_keep_their_order_and_are_told(rt, planted) -> None:
     result = reconstruct(planted(), "fdk", steps="rings, sparks", rings={"window": 5}, device=rt)
     told = result.facts[TOLD]
     assert [line["step"] for line in told] == ["sparks", "rings"] and told[1]["options"]["window"] == 5
-    again = prepared(prepared(planted(), InputOptions(steps="sparks")), InputOptions(steps="rings"))
+    again = prepared(prepared(planted(), Preprocessing(steps="sparks")), Preprocessing(steps="rings"))
     assert [line["step"] for line in again.provenance[TOLD]] == ["sparks", "rings"]
-    facts = input_options({"steps": "rings", "rings": {"window": 5}}).facts()
-    assert input_options(facts) == InputOptions(steps="rings", rings=replace(InputOptions().rings, window=5))
+    facts = preprocessing_of({"steps": "rings", "rings": {"window": 5}}).facts()
+    assert preprocessing_of(facts) == Preprocessing(steps="rings", rings=replace(Preprocessing().rings, window=5))
 
 
 def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
     empty, falling = replace(planted(), projections=0 * planted().projections), {"polynomial": [-5, 0, 0]}
     full = replace(planted(), projections=planted().projections + 1)
     cases = (
-        (lambda: InputOptions(steps="spark"), "did you mean 'sparks'"),
-        (lambda: input_options({"rings": {"window": 5}}), "rings among the steps"),
-        (lambda: input_options({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
-        (lambda: input_options({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
-        (lambda: prepared(planted(), input_options({"steps": "rings", "rings": {"window": 99}}), rt), "rings.window"),
-        (lambda: prepared(empty, input_options({"steps": "hardening", "hardening": {"kvp": 80}}), rt), "nothing"),
-        (lambda: prepared(planted(), input_options({"steps": "hardening", "hardening": falling}), rt), "falls"),
-        (lambda: input_options({"steps": "hardening", "hardening": {"bone_per_mm": 0.1}}), "without hardening.kvp"),
-        (lambda: input_options({"steps": "hardening", "hardening": {"anode_deg": 12}}), "without hardening.kvp"),
-        (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
-        (lambda: input_options({"steps": "hardening", "hardening": {"kvp": 80, "polynomial": [1, 0, 0]}}), "one of the two"),
-        (lambda: prepared(full, InputOptions(steps="air")), "pixels of air"),
-        (lambda: prepared(full, InputOptions(steps="scatter")), "scatter.to_primary"),
-        (lambda: prepared(full, InputOptions(steps="hardening")), "without a device"),
+        (lambda: Preprocessing(steps="spark"), "did you mean 'sparks'"),
+        (lambda: preprocessing_of({"rings": {"window": 5}}), "rings among the steps"),
+        (lambda: preprocessing_of({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
+        (lambda: preprocessing_of({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
+        (lambda: prepared(planted(), preprocessing_of({"steps": "rings", "rings": {"window": 99}}), rt), "rings.window"),
+        (lambda: prepared(empty, preprocessing_of({"steps": "hardening", "hardening": {"kvp": 80}}), rt), "nothing"),
+        (lambda: prepared(planted(), preprocessing_of({"steps": "hardening", "hardening": falling}), rt), "falls"),
+        (lambda: preprocessing_of({"steps": "hardening", "hardening": {"bone_per_mm": 0.1}}), "without hardening.kvp"),
+        (lambda: preprocessing_of({"steps": "hardening", "hardening": {"anode_deg": 12}}), "without hardening.kvp"),
+        (lambda: preprocessing_of({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
+        (lambda: preprocessing_of({"steps": "hardening", "hardening": {"kvp": 80, "polynomial": [1, 0, 0]}}), "one of the"),
+        (lambda: prepared(full, Preprocessing(steps="air")), "pixels of air"),
+        (lambda: prepared(full, Preprocessing(steps="scatter")), "scatter.to_primary"),
+        (lambda: prepared(full, Preprocessing(steps="hardening")), "without a device"),
     )
     for call, told in cases:
         with pytest.raises(InputError, match=told):
             call()
-    assert set(STEPS) <= set(vars(InputOptions()))
+    assert set(STEPS) <= set(vars(Preprocessing()))

@@ -11,7 +11,15 @@ from phyradgs_cl.api import simulate as simulated
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
-from phyradgs_cl.reconstructors import METHODS, Progress, method_options, reconstruct
+from phyradgs_cl.reconstructors import (
+    METHODS,
+    InitialVolume,
+    Progress,
+    RunPlan,
+    method_options,
+    plan_run,
+    reconstruct,
+)
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
 from phyradgs_cl.reconstructors.voxels.misfit import Misfit, Reach, misfit_of
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
@@ -29,7 +37,7 @@ def scan(rt) -> Scan:
 
 
 def run(rt, scan: Scan, method: str, **changes: object):
-    return reconstruct(scan, method, rt, method_options(method, None, {"iterations": 12, **changes}))
+    return reconstruct(scan, plan_run(method, {"iterations": 12, **changes}), rt)
 
 
 def quality(scan: Scan, volume: np.ndarray) -> float:
@@ -73,7 +81,7 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
 
     def with_prior(image: np.ndarray, share: float = 0.5) -> float:
         options = method_options("fista", None, {**usual, "prior": "piccs", "prior_share": share})
-        return quality(few, reconstruct(few, "fista", rt, options, initial=(image, few.grid)).volume)
+        return quality(few, reconstruct(few, RunPlan("fista", options, initial=InitialVolume(image, few.grid)), rt).volume)
 
     assert with_prior(changed) > plain + 1 and with_prior(changed) > quality(few, changed) + 1
     assert with_prior(scan.reference[:, ::-1].copy(), 0.3) > plain - 1
@@ -84,7 +92,8 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
 
     def by_asd_pocs(share: float) -> float:
         options = method_options("asd-pocs", None, {**usual, "prior_share": share, "tv_share": 0.05})
-        return quality(few, reconstruct(few, "asd-pocs", rt, options, initial=(changed, few.grid)).volume)
+        plan = RunPlan("asd-pocs", options, initial=InitialVolume(changed, few.grid))
+        return quality(few, reconstruct(few, plan, rt).volume)
 
     assert by_asd_pocs(0.5) > by_asd_pocs(0.0) + 1
 
@@ -93,7 +102,7 @@ def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
     """Their residual grows by less than a fifth from pass to pass, for ever."""
     scan = simulated("jaw", device=rt, size=32, detector=48, views=120, exposure_deg=3.0, peak=3.0, noise="tigre")
     options = method_options("fista", None, {"motion": "per-row", "iterations": 30})
-    result = reconstruct(scan, "fista", rt, options)
+    result = reconstruct(scan, RunPlan("fista", options), rt)
     residuals = [line["residual"] for line in result.record]
     assert residuals[-1] < 1.1 * min(residuals) and quality(scan, result.volume) > 30
 
@@ -157,11 +166,11 @@ def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
     if method == "fused":
         few["voxel_iterations"] = 1
     options = method_options(method, None, few)
-    begun = quality(scan, reconstruct(scan, method, rt, options).volume)
-    from_truth = reconstruct(scan, method, rt, options, initial=(scan.reference, scan.grid)).volume
+    begun = quality(scan, reconstruct(scan, RunPlan(method, options), rt).volume)
+    from_truth = reconstruct(scan, RunPlan(method, options, initial=InitialVolume(scan.reference, scan.grid)), rt).volume
     assert quality(scan, from_truth) > begun + (0.1 if method in ("phyradgs", "r2") else 1)
     with pytest.raises(InputError, match="--initial"):
-        reconstruct(scan, "fdk", rt, initial=(scan.reference, scan.grid))
+        reconstruct(scan, plan_run("fdk", initial=InitialVolume(scan.reference, scan.grid)), rt)
 
 
 @pytest.mark.parametrize("at", [2, 30])
@@ -173,10 +182,10 @@ def test_fused_goes_on_with_the_same_bits_from_either_half(rt, scan, at) -> None
         if progress.iteration >= at:
             raise KeyboardInterrupt
 
-    whole = reconstruct(scan, "fused", rt, options)
-    part = reconstruct(scan, "fused", rt, options, report=stop)
+    whole = reconstruct(scan, RunPlan("fused", options), rt)
+    part = reconstruct(scan, RunPlan("fused", options), rt, report=stop)
     assert part.facts["interrupted_at"] >= at
-    rest = reconstruct(scan, "fused", rt, options, resume=part.state)
+    rest = reconstruct(scan, RunPlan("fused", options), rt, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert rest.gaussians is not None and whole.facts["disagreement_per_mm"] > 0
     assert (part.disagreement is None) == (at < 4)  # before there are splats
@@ -204,10 +213,10 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
         if progress.iteration >= at:
             raise KeyboardInterrupt
 
-    whole = reconstruct(scan, "fista", rt, options)
-    part = reconstruct(scan, "fista", rt, options, report=stop)
+    whole = reconstruct(scan, RunPlan("fista", options), rt)
+    part = reconstruct(scan, RunPlan("fista", options), rt, report=stop)
     assert part.facts["interrupted_at"] == at and part.volume.shape == scan.grid.shape
-    rest = reconstruct(scan, "fista", rt, options, resume=part.state)
+    rest = reconstruct(scan, RunPlan("fista", options), rt, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
 

@@ -10,7 +10,7 @@ from tolerances import LAUNCH_SHAPE
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import plan_run, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
@@ -40,7 +40,7 @@ def gpu_shaped(scan) -> tuple[list[np.ndarray], set[str]]:
         launched = note_launches(patch)
         assert rt.best_rates().flops_per_s > 0  # launches multiply_add by itself
         volumes = [
-            reconstruct(scan, name, rt, method_options(name, None, changes)).volume for name, changes in RUNS
+            reconstruct(scan, plan_run(name, changes), rt).volume for name, changes in RUNS
         ]
     return volumes, set(launched)
 
@@ -56,7 +56,7 @@ def scan(rt) -> Scan:
 
 def test_methods(rt, gpu_shaped, scan) -> None:
     for (name, changes), found in zip(RUNS, gpu_shaped[0], strict=True):
-        expected = reconstruct(scan, name, rt, method_options(name, None, changes)).volume
+        expected = reconstruct(scan, plan_run(name, changes), rt).volume
         error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
         assert error <= LAUNCH_SHAPE, (name, changes["motion"])
 

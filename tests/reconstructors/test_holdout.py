@@ -8,7 +8,7 @@ import pytest
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import prepare, simulate
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import InputOptions, method_options, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, reconstruct
 from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import HELD_OUT, Reconstruction
 
@@ -21,15 +21,16 @@ def scan(rt) -> Scan:
 
 @pytest.mark.parametrize("method, some", [("fdk", {}), ("sirt", {"iterations": 3}), ("phyradgs", {"iterations": 10})])
 def test_no_method_sees_what_is_held_out(rt, scan, method, some) -> None:
-    options, before = method_options(method, None, some), InputOptions(holdout=2.0)
+    options, before = method_options(method, None, some), Preprocessing(holdout=2.0)
     held = held_out(scan, 2.0)
     assert 0.015 < held.mean() < 0.025
     frames = scan.projections.copy()
     frames[held] = 7.0
-    one, two = (reconstruct(s, method, rt, options, before=before) for s in (scan, replace(scan, projections=frames)))
+    plan = RunPlan(method, options, preprocessing=before)
+    one, two = (reconstruct(s, plan, rt) for s in (scan, replace(scan, projections=frames)))
     np.testing.assert_array_equal(one.volume, two.volume)
     assert one.facts[HELD_OUT]["holdout_rms"] < 1 < two.facts[HELD_OUT]["holdout_rms"]
-    assert HELD_OUT not in reconstruct(scan, method, rt, options).facts
+    assert HELD_OUT not in reconstruct(scan, RunPlan(method, options), rt).facts
 
 
 def test_the_error_is_least_where_noise_is_not_fitted_and_no_less_than_noise(rt, scan) -> None:
@@ -37,7 +38,7 @@ def test_the_error_is_least_where_noise_is_not_fitted_and_no_less_than_noise(rt,
     found = {}
     for iterations in (2, 10, 80):
         options = method_options("cgls", None, {"iterations": iterations, "noise_stop": 0.0, "motion": "per-row"})
-        result = reconstruct(scan, "cgls", rt, options, before=InputOptions(holdout=3.0))
+        result = reconstruct(scan, RunPlan("cgls", options, preprocessing=Preprocessing(holdout=3.0)), rt)
         errors = result.facts[HELD_OUT]
         mse = float(np.mean((result.volume - scan.reference) ** 2))
         found[iterations] = errors["holdout_rms"], mse, result.record[-1]["residual"]
@@ -60,12 +61,12 @@ def test_noise_is_told_where_the_held_out_pixels_lie(rt, scan) -> None:
 def test_what_cannot_be_held_out_is_refused(rt, scan) -> None:
     for wrong in (-1.0, 51.0):
         with pytest.raises(InputError, match="holdout"):
-            InputOptions(holdout=wrong)
+            Preprocessing(holdout=wrong)
     with pytest.raises(InputError, match="median filter"):
-        InputOptions(holdout=2.0, median_filter=3)
+        Preprocessing(holdout=2.0, median_filter=3)
     with pytest.raises(InputError, match="without a method"):
         prepare(scan, "sparks", device=rt, holdout=2.0)
     blind = replace(scan, pixel_mask=np.ones(scan.projections.shape[1:], bool))
     with pytest.raises(InputError, match="0 pixels.*at least one"):
-        reconstruct(blind, "fdk", rt, before=InputOptions(holdout=2.0))
-    assert "holdout" not in InputOptions().facts() and InputOptions(holdout=2).facts()["holdout"] == 2
+        reconstruct(blind, RunPlan("fdk", method_options("fdk"), preprocessing=Preprocessing(holdout=2.0)), rt)
+    assert "holdout" not in Preprocessing().facts() and Preprocessing(holdout=2).facts()["holdout"] == 2

@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition import ConeGeometry, MicroViews, OwnTimes, PerRow, 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import plan_run, reconstruct
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime.algebra import norm
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
@@ -39,7 +39,7 @@ def run(rt, scan: Scan, method: str, model: str | None = None, **more):
     changes |= {
         "iterations": ITERATIONS[method], **({} if model is None else {"detector_model": model}), **more,
     }
-    return reconstruct(scan, name, rt, method_options(name, None, changes))
+    return reconstruct(scan, plan_run(name, changes), rt)
 
 
 @pytest.mark.parametrize("method", ITERATIONS)

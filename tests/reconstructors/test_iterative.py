@@ -17,7 +17,7 @@ from phyradgs_cl.metrics import psnr
 from phyradgs_cl.objective import TvDescent, TvProx
 from phyradgs_cl.objective.tv_descent import tv_gradient
 from phyradgs_cl.objective.tv_prox import isotropic_tv, tv_prox
-from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
@@ -284,7 +284,7 @@ def fly_scan(rt) -> Scan:
 
 
 def run(rt, scan: Scan, method: str, **changes: object):
-    return reconstruct(scan, method, rt, method_options(method, None, {"iterations": 8, **changes}))
+    return reconstruct(scan, plan_run(method, {"iterations": 8, **changes}), rt)
 
 
 @pytest.mark.parametrize("method", ITERATIVE)
@@ -311,21 +311,21 @@ def test_record_and_facts_and_an_interrupted_run_goes_on_with_the_same_bits(rt, 
             raise KeyboardInterrupt
 
     seen: list[Progress] = []
-    whole = reconstruct(fly_scan, method, rt, options, seed=3, report=seen.append)
+    whole = reconstruct(fly_scan, RunPlan(method, options, seed=3), rt, report=seen.append)
     assert whole.volume.shape == fly_scan.grid.shape and whole.state is None
     assert [line["iteration"] for line in whole.record] == [1, 2, 3, 4, 5, 6]
     assert [p.loss for p in seen] == [line["residual"] for line in whole.record]
     assert all(line["residual"] > 0 and line["change"] > 0 for line in whole.record)
     assert (whole.facts["method"], whole.facts["stopped_by"]) == (method, "iterations")
-    part = reconstruct(fly_scan, method, rt, options, seed=3, report=stop)
+    part = reconstruct(fly_scan, RunPlan(method, options, seed=3), rt, report=stop)
     assert (part.facts["interrupted_at"], part.facts["stopped_by"]) == (3, "interrupt")
-    rest = reconstruct(fly_scan, method, rt, options, seed=3, resume=part.state)
+    rest = reconstruct(fly_scan, RunPlan(method, options, seed=3), rt, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert [line["iteration"] for line in rest.record] == [1, 2, 3, 4, 5, 6]
     assert rest.record[:3] == part.record
     assert rest.facts["seconds"] > part.facts["seconds"]
     with pytest.raises(InputError, match="checkpoint"):
-        reconstruct(fly_scan, method, rt, options, resume={"iteration": np.array(3)})
+        reconstruct(fly_scan, RunPlan(method, options), rt, resume={"iteration": np.array(3)})
 
 
 @pytest.mark.parametrize(("method", "gain_db"), [("cgls", 1), ("sart", 1)])

@@ -11,7 +11,7 @@ from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import InputOptions, input_options, method_options, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, preprocessing_of, reconstruct
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
@@ -30,20 +30,20 @@ def test_a_grid_that_is_chosen_is_the_scans_for_every_method(rt, scan, method) -
     """Bit for bit, and the volume has it; methods are named in any case."""
     few = {} if method == "FDK" else {"iterations": 2}
     options = method_options(method, None, few)
-    chosen = InputOptions(size=(8, 9, 10), roi_mm=(-0.8, 0.7, -0.9, 0.9, -1.0, 0.9))
-    found = reconstruct(scan, method, rt, options, before=chosen)
-    other = reconstruct(replace(scan, grid=chosen.of(scan.grid)), method, rt, options)
+    chosen = Preprocessing(size=(8, 9, 10), roi_mm=(-0.8, 0.7, -0.9, 0.9, -1.0, 0.9))
+    found = reconstruct(scan, RunPlan(method, options, preprocessing=chosen), rt)
+    other = reconstruct(replace(scan, grid=chosen.of(scan.grid)), RunPlan(method, options), rt)
     assert found.grid == other.grid and found.grid.shape == found.volume.shape == (8, 9, 10)
     np.testing.assert_array_equal(found.volume, other.volume)
 
 
 def test_lag_is_undone_unless_it_is_to_be_ignored(rt, scan) -> None:
     slow = replace(scan, projections=lagged(scan.projections, 0.2).astype(np.float32), lag=0.2)
-    assert prepared(slow, InputOptions(ignore_lag=True)) is slow and prepared(scan, InputOptions()) is scan
-    undone = prepared(slow, InputOptions()).projections
+    assert prepared(slow, Preprocessing(ignore_lag=True)) is slow and prepared(scan, Preprocessing()) is scan
+    undone = prepared(slow, Preprocessing()).projections
     np.testing.assert_allclose(undone, scan.projections, atol=FLOAT32 * np.exp(3.0))
-    cases = (scan, None), (slow, None), (slow, InputOptions(ignore_lag=True))
-    volumes = [reconstruct(s, "fdk", rt, before=before).volume for s, before in cases]
+    cases = (scan, None), (slow, None), (slow, Preprocessing(ignore_lag=True))
+    volumes = [reconstruct(s, RunPlan("fdk", method_options("fdk"), preprocessing=before), rt).volume for s, before in cases]
     undone, ignored = (np.abs(volume - volumes[0]).max() for volume in volumes[1:])
     assert undone < 1e-3 * np.abs(volumes[0]).max() < ignored
 
@@ -52,23 +52,23 @@ def test_the_median_takes_out_sparks_but_not_what_masked_pixels_hold(scan, maske
     sparked = scan.projections.copy()
     sparked[2, 7, 8] = 50.0
     for edge in (3, 5):
-        frames = prepared(replace(scan, projections=sparked), InputOptions(median_filter=edge)).projections
+        frames = prepared(replace(scan, projections=sparked), Preprocessing(median_filter=edge)).projections
         window = sparked[2, 7 - edge // 2 : 8 + edge // 2, 8 - edge // 2 : 9 + edge // 2]
         assert frames[2, 7, 8] == np.median(window) < 5
         assert frames.dtype == np.float32
     mask = np.zeros(GEOMETRY.detector_shape, bool)
     mask[4:7, 9] = True
-    one, two = (prepared(spoilt, InputOptions(median_filter=3)) for spoilt in masked(scan, mask))
+    one, two = (prepared(spoilt, Preprocessing(median_filter=3)) for spoilt in masked(scan, mask))
     np.testing.assert_array_equal(one.projections, two.projections)
 
 
 def test_options_by_name() -> None:
-    assert input_options({"median_filter": 3.0, "ignore_lag": True}) == InputOptions(ignore_lag=True, median_filter=3)
+    assert preprocessing_of({"median_filter": 3.0, "ignore_lag": True}) == Preprocessing(ignore_lag=True, median_filter=3)
     with pytest.raises(InputError, match="median_filter"):
-        input_options({"median_filter": 4})
+        preprocessing_of({"median_filter": 4})
     with pytest.raises(InputError, match="ignore_lag"):
-        input_options({"ignore_lag": "no"})
-    assert input_options({"size": [4, 5, 6], "voxel_mm": 2}).facts() == {
+        preprocessing_of({"ignore_lag": "no"})
+    assert preprocessing_of({"size": [4, 5, 6], "voxel_mm": 2}).facts() == {
         "size": (4, 5, 6), "voxel_mm": (2.0, 2.0, 2.0), "ignore_lag": False, "median_filter": 0
     }  # fmt: skip
     with pytest.raises(InputError, match="median_filter"):

@@ -11,7 +11,7 @@ import pytest
 from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static, TimeCells
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.options import motions_of
 from phyradgs_cl.reconstructors.voxels.sirt import SirtOptions
 
@@ -131,7 +131,7 @@ def test_a_motion_of_ones_own_works_and_is_named(method, rt) -> None:
     scan = simulate("foot", size=16, detector=20, views=6, device=rt)
     few = {} if method == "fdk" else {"iterations": 2}
     own, static = (
-        reconstruct(scan, method, rt, method_options(method, None, {**few, "motion": motion}))
+        reconstruct(scan, plan_run(method, {**few, "motion": motion}), rt)
         for motion in (Halves(), Static())
     )
     assert np.isfinite(own.volume).all() and np.any(own.volume != static.volume)

@@ -9,7 +9,7 @@ from tolerances import RESIDENT
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import METHODS, method_options, reconstruct
+from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.reconstructors.voxels.system import System
@@ -52,13 +52,14 @@ def options_of(method: str, model: str, iterations: int = 4):
 def test_an_iteration_moves_numbers_alone(scan, method, model) -> None:
     rt = Runtime()
     seen: list[Traffic] = []
-    result = reconstruct(scan, method, rt, options_of(method, model), report=lambda p: seen.append(replace(rt.traffic)))
+    plan = RunPlan(method, options_of(method, model))
+    result = reconstruct(scan, plan, rt, report=lambda p: seen.append(replace(rt.traffic)))
     moved = np.diff([(t.bytes_up, t.bytes_down, t.blocking) for t in seen], axis=0)
     assert len(moved) == 3
     assert moved[:, 1].min() > 0, "the record has numbers, which somebody has to have asked for"
     assert moved[:, :2].sum(axis=1).max() <= MOST_BYTES and moved[:, 2].max() <= MOST_WAITS[method]
     assert rt.traffic.bytes_down - seen[-1].bytes_down == result.volume.nbytes
-    again = reconstruct(scan, method, Runtime(), options_of(method, model))
+    again = reconstruct(scan, RunPlan(method, options_of(method, model)), Runtime())
     np.testing.assert_array_equal(again.volume, result.volume)
 
 
@@ -76,9 +77,9 @@ def test_the_host_comes_to_the_same_volume(scan, monkeypatch, method, model) -> 
 
     monkeypatch.setattr(System, "resident", noted)
     rt = Runtime()
-    on_device = reconstruct(scan, method, rt, options_of(method, model))
+    on_device = reconstruct(scan, RunPlan(method, options_of(method, model)), rt)
     tight = Runtime(memory=int(0.9 * rt.peak_bytes))
-    on_host = reconstruct(scan, method, tight, options_of(method, model))
+    on_host = reconstruct(scan, RunPlan(method, options_of(method, model)), tight)
     assert [isinstance(space, DeviceSpace) for space in spaces] == [True, False]
     error = np.linalg.norm(on_host.volume - on_device.volume) / np.linalg.norm(on_host.volume)
     assert error <= RESIDENT[method]
@@ -100,7 +101,7 @@ def test_a_method_holds_what_it_says(scan, monkeypatch, method, model) -> None:
         return found
 
     monkeypatch.setattr(System, "resident", noted)
-    reconstruct(scan, method, rt, options_of(method, model, 3))
+    reconstruct(scan, RunPlan(method, options_of(method, model, 3)), rt)
     assert 0.5 * asked[0] <= rt.peak_bytes <= asked[0]
 
 
@@ -115,13 +116,13 @@ def test_reports_alone_download(scan) -> None:
             call()
             moved[name] = rt.traffic.bytes_down - before
 
-    reconstruct(scan, "sirt", rt, options_of("sirt", "log", 2), report=report)
+    reconstruct(scan, RunPlan("sirt", options_of("sirt", "log", 2)), rt, report=report)
     assert moved == {"volume": 4 * int(np.prod(GRID.shape)), "state": 4 * int(np.prod(GRID.shape))}
 
 
 def test_frames_of_fdk_go_up_once_and_its_volume_comes_down_once(scan) -> None:
     rt = Runtime()
-    reconstruct(scan, "fdk", rt, method_options("fdk"))
+    reconstruct(scan, plan_run("fdk"), rt)
     (frames, lines, width), (nz, ny, nx) = scan.projections.shape, GRID.shape
     padded = max(lines * pitch_of(width), width * pitch_of(lines)) + 2 * GUARD  # columns may be made rows
     assert rt.traffic.bytes_up <= 4 * frames * (padded + 13)
@@ -146,5 +147,5 @@ def test_a_step_of_splats_waits_for_nothing(scan, method, monkeypatch) -> None:
 
     monkeypatch.setattr(SplatRun, "step", counted)
     changes = {"gaussians": 200, "iterations": 8, "tv_edge": 8, "shape_weight": 0.1, "control": {"every": 0}}
-    reconstruct(scan, method, Runtime(), method_options(method, None, changes))
+    reconstruct(scan, plan_run(method, changes), Runtime())
     assert len(waits) == 8 and waits[0] == 3 and max(waits[1:]) == 0, "lists of frames and of the sub-volume, its axes"

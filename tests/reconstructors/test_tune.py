@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, load_volume, prepare, reconstruct, save_scan, save_volume, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path
-from phyradgs_cl.reconstructors import InputOptions, Progress, method_options
+from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, method_options, plan_run
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.frames.holdout import held_out
 from phyradgs_cl.reconstructors.result import HELD_OUT
@@ -47,8 +47,8 @@ def test_a_bad_weight_is_mended_by_the_scan(rt, scan) -> None:
     for factor in (1 / 100, 100):
         bad = replace(method_options("fista-tv", None, {"motion": "per-row", "sub_intervals": 2}), iterations=24)
         bad = replace(bad, tv_weight=factor * bad.tv_weight)
-        lost = psnr_db(run_method(scan, "fista-tv", rt, bad), scan)
-        mended = run_method(scan, "fista-tv", rt, bad, before=InputOptions(tune="tv_weight"))
+        lost = psnr_db(run_method(scan, RunPlan("fista-tv", bad), rt), scan)
+        mended = run_method(scan, RunPlan("fista-tv", bad, preprocessing=Preprocessing(tune="tv_weight")), rt)
         found = mended.facts[TUNED]
         assert mended.facts["options"]["tv_weight"] == found["chosen"] and mended.facts["options"]["iterations"] == 24
         assert psnr_db(mended, scan) > max(lost + 1, usual - 0.5), (factor, found)
@@ -122,23 +122,22 @@ def test_a_run_that_goes_on_does_not_choose_again(rt, scan, file, cli, tmp_path,
 
 
 def test_a_command_that_was_stopped_goes_on_with_its_choice(rt, file, tmp_path) -> None:
-    from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
+    from phyradgs_cl.workflow import run_reconstruction
 
-    job = ReconstructionJob(
-        file, tmp_path / "volume.h5", "cgls", changes={"iterations": 30}, before=InputOptions(tune="iterations")
-    )
+    plan, output = plan_run("cgls", {"iterations": 30, "tune": "iterations"}), tmp_path / "volume.h5"
 
     def stop(progress: Progress) -> None:
         if "on trial" not in progress.quantity:
             raise KeyboardInterrupt
 
-    stopped, _ = run_reconstruction(job, lambda: rt, stop)
-    assert checkpoint_path(job.output).is_file() and stopped.state is not None
+    stopped, _ = run_reconstruction(plan, file, output, lambda: rt, stop)
+    assert checkpoint_path(output).is_file() and stopped.state is not None
     seen = []
-    result, _ = run_reconstruction(replace(job, resume=True), lambda: rt, lambda p: seen.append(p.quantity))
+    note = lambda p: seen.append(p.quantity)  # noqa: E731
+    result, _ = run_reconstruction(plan, file, output, lambda: rt, note, resume=True)
     assert result.facts[TUNED] == stopped.facts[TUNED] and not any("on trial" in quantity for quantity in seen)
     assert result.facts["iterations"] == result.facts[TUNED]["chosen"]
-    with h5py.File(job.output) as volume:
+    with h5py.File(output) as volume:
         assert json.loads(volume["entry/provenance/json"][()])[TUNED] == result.facts[TUNED]
 
 
@@ -196,4 +195,4 @@ def test_python_refuses_the_same(rt, scan) -> None:
         reconstruct(scan, "fista-tv", tv_weight=0.002, tune="tv_weight", device=rt)
     with pytest.raises(InputError, match="^tune: found tv_weight, without a method"):
         prepare(scan, "sparks", device=rt, tune="tv_weight")
-    assert "tune" not in InputOptions().facts() and InputOptions(tune="a").facts()["tune"] == "a"
+    assert "tune" not in Preprocessing().facts() and Preprocessing(tune="a").facts()["tune"] == "a"

@@ -8,7 +8,7 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural import has_accelerator, requirement
-from phyradgs_cl.reconstructors import method_options, reconstruct
+from phyradgs_cl.reconstructors import method_options, plan_run, reconstruct
 
 NEURAL = ("naf", "sax-nerf")
 
@@ -23,7 +23,7 @@ def without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys) -> None:
     scan = simulate("jaw", size=8, detector=12, views=3, device=rt)
     with pytest.raises(InputError, match=f"--method {method}: found no PyTorch"):
-        reconstruct(scan, method, rt)
+        reconstruct(scan, plan_run(method), rt)
     save_scan(tmp_path / "scan.h5", scan)
     command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out.h5"), "--method", method]
     assert load_cli().run(command) == 2

@@ -10,8 +10,9 @@ import pytest
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan
+from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
-from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
+from phyradgs_cl.workflow import run_reconstruction
 
 VOID = {"br", "img", "input", "link", "meta"}
 
@@ -81,8 +82,7 @@ def files(rt, small_scan, tmp_path_factory) -> tuple[Path, Path]:
     scan, volume = folder / "scan.h5", folder / "volume.h5"
     write_scan(scan, small_scan)
     changes = {"motion": "micro-views", "strips": 3, "iterations": 3}
-    job = ReconstructionJob(scan, volume, method="sart", changes=changes)
-    run_reconstruction(job, lambda: rt, lambda progress: None)
+    run_reconstruction(plan_run("sart", changes), scan, volume, lambda: rt)
     return scan, volume
 
 

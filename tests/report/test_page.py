@@ -15,12 +15,12 @@ from skimage import io
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
-from phyradgs_cl.reconstructors import input_options
+from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report.facts import number
 from phyradgs_cl.report.pictures.projections import chosen_frames, computed_views
 from phyradgs_cl.report.pictures.slices import Window
-from phyradgs_cl.workflow import ReconstructionJob, run_reconstruction
+from phyradgs_cl.workflow import run_reconstruction
 
 ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
 HOSTILE = "</title></script><script>alert(1)</script><img src=x onerror='alert(2)'>\"'&amp;"
@@ -87,8 +87,7 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
 def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
     target = tmp_path / "short.h5"
     changes = {"iterations": 12, "gaussians": 50, "tv_weight": 0.0}
-    job = ReconstructionJob(files[0], target, method="phyradgs", changes=changes)
-    run_reconstruction(job, lambda: rt, lambda progress: None)
+    run_reconstruction(plan_run("phyradgs", changes), files[0], target, lambda: rt)
     record = load_run(target).record
     assert [line["iteration"] for line in record] == list(range(1, 13))
     page = parse(report_page(load_run(target)))
@@ -268,9 +267,8 @@ def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> N
     sparked[1, 5, 6] -= 3
     told = {"prepared": [{"step": "air", "light": [0.98, 1.01]}]}
     write_scan(tmp_path / "scan.h5", replace(small_scan, projections=sparked, provenance=told))
-    before = input_options({"steps": "sparks,rings"})
-    job = ReconstructionJob(tmp_path / "scan.h5", tmp_path / "volume.h5", method="fdk", before=before)
-    run_reconstruction(job, lambda: rt, lambda progress: None)
+    plan = plan_run("fdk", {"steps": "sparks,rings"})
+    run_reconstruction(plan, tmp_path / "scan.h5", tmp_path / "volume.h5", lambda: rt)
     write_report(tmp_path / "volume.h5", tmp_path / "page.html", lambda: rt)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     section = text.split('id="preparation"')[1].split("</section>")[0]
@@ -291,8 +289,7 @@ def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_p
         ({"calibration": 7}, 0, 0), ({"calibration": [good]}, 0, 0), ({"calibration": {"parameters": {}}}, 0, 0),
     ):  # fmt: skip
         write_scan(tmp_path / "scan.h5", replace(small_scan, provenance=told))
-        job = ReconstructionJob(tmp_path / "scan.h5", tmp_path / "volume.h5", method="fdk")
-        run_reconstruction(job, lambda: rt, lambda progress: None)
+        run_reconstruction(plan_run("fdk"), tmp_path / "scan.h5", tmp_path / "volume.h5", lambda: rt)
         write_report(tmp_path / "volume.h5", tmp_path / "page.html", lambda: rt, views=0)
         text = (tmp_path / "page.html").read_text(encoding="utf-8")
         section = text.split('id="calibration"')[1].split("</section>")[0] if rows else ""

@@ -1,6 +1,6 @@
 """Runs of a sweep or a watched folder: they go on from their own checkpoint, and from no other."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +8,9 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path, partial_path, read_volume
-from phyradgs_cl.reconstructors import Progress
+from phyradgs_cl.reconstructors import Progress, Reconstruction, RunPlan, plan_run
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow import ReconstructionJob
-from phyradgs_cl.workflow.reconstruct import go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 
 
 class Report:
@@ -27,36 +26,45 @@ class Report:
             raise KeyboardInterrupt
 
 
+@dataclass(frozen=True)
+class Job:
+    plan: RunPlan
+    scan: Path
+    output: Path
+
+    def run(self, rt: Runtime, report: Report) -> Reconstruction:
+        return resume_or_restart(self.plan, self.scan, self.output, lambda: rt, report)[0]
+
+
 @pytest.fixture
-def job(tiny_scan: Path, tmp_path: Path) -> ReconstructionJob:
-    return ReconstructionJob(tiny_scan, tmp_path / "volume.h5", method="sirt", changes={"iterations": 6})
+def job(tiny_scan: Path, tmp_path: Path) -> Job:
+    return Job(plan_run("sirt", {"iterations": 6}), tiny_scan, tmp_path / "volume.h5")
 
 
-def stopped(job: ReconstructionJob, rt: Runtime) -> bytes:
+def stopped(job: Job, rt: Runtime) -> bytes:
     """The checkpoint of a run that was stopped in the middle."""
-    result, _ = go_on(job, lambda: rt, Report(stop_at=3))
-    assert not is_whole(result)
+    assert not is_complete(job.run(rt, Report(stop_at=3)))
     return checkpoint_path(job.output).read_bytes()
 
 
 def test_a_stopped_run_goes_on_to_the_same_bits(job, rt, tmp_path) -> None:
     stopped(job, rt)
     rest = Report()
-    result, _ = go_on(job, lambda: rt, rest)
-    assert is_whole(result) and min(rest.seen) > 3
-    alone, _ = go_on(replace(job, output=tmp_path / "alone.h5"), lambda: rt, Report())
+    result = job.run(rt, rest)
+    assert is_complete(result) and min(rest.seen) > 3
+    alone = replace(job, output=tmp_path / "alone.h5").run(rt, Report())
     np.testing.assert_array_equal(result.volume, alone.volume)
     assert not checkpoint_path(job.output).exists()
 
 
 def test_a_partial_volume_of_two_halves_has_their_disagreement(job, rt) -> None:
     """Once the second has begun; the whole one has it whatever came in between."""
-    job = replace(job, method="fused", changes={"voxel_iterations": 2, "iterations": 60})
-    alone, _ = go_on(job, lambda: rt, Report())
+    job = replace(job, plan=plan_run("fused", {"voxel_iterations": 2, "iterations": 60}))
+    alone = job.run(rt, Report())
     for stop_at, is_there in ((1, False), (52, True)):
-        assert not is_whole(go_on(job, lambda: rt, Report(stop_at))[0])
+        assert not is_complete(job.run(rt, Report(stop_at)))
         assert (read_volume(partial_path(job.output)).disagreement is not None) == is_there, stop_at
-        assert is_whole(go_on(job, lambda: rt, Report())[0])
+        assert is_complete(job.run(rt, Report()))
         np.testing.assert_array_equal(read_volume(job.output).disagreement, alone.disagreement)
 
 
@@ -64,13 +72,13 @@ def test_a_partial_volume_of_two_halves_has_their_disagreement(job, rt) -> None:
 def test_a_checkpoint_that_does_not_fit_is_set_aside(job, rt, what) -> None:
     content = stopped(job, rt)
     if what == "of another seed":
-        job = replace(job, seed=1)
+        job = replace(job, plan=replace(job.plan, seed=1))
     else:
         content = content[: len(content) // 2]
         checkpoint_path(job.output).write_bytes(content)
     whole = Report()
-    result, _ = go_on(job, lambda: rt, whole)
-    assert is_whole(result) and min(whole.seen) <= 3
+    result = job.run(rt, whole)
+    assert is_complete(result) and min(whole.seen) <= 3
     aside = Path(f"{checkpoint_path(job.output)}.bak")
     assert aside.read_bytes() == content
 
@@ -78,6 +86,6 @@ def test_a_checkpoint_that_does_not_fit_is_set_aside(job, rt, what) -> None:
 def test_a_checkpoint_outlives_a_missing_scan_and_no_other_method_takes_it(job, rt) -> None:
     stopped(job, rt)
     with pytest.raises(InputError, match="none.h5"):
-        go_on(replace(job, scan=job.scan.with_name("none.h5")), lambda: rt, Report())
+        replace(job, scan=job.scan.with_name("none.h5")).run(rt, Report())
     assert checkpoint_path(job.output).exists()
-    assert is_whole(go_on(replace(job, method="fdk", changes={}), lambda: rt, Report())[0])
+    assert is_complete(replace(job, plan=plan_run("fdk")).run(rt, Report()))

@@ -32,7 +32,7 @@ def test_grids_are_tried_like_other_options_and_methods_in_any_case(read) -> Non
     grid = read(GRID + '[[grid]]\nmethod = ["FDK", "fdk"]\nsize = [8, [4, 5, 6]]\n')
     assert [setting.label for setting in grid.settings] == ["fdk size=8", "fdk size=4,5,6"]
     run = plan_sweep(grid, Path("results"))[-1]
-    assert run.job.before.size == (4, 5, 6) and run.facts["input"] == {"size": [4, 5, 6]}
+    assert run.setting.plan().preprocessing.size == (4, 5, 6) and run.facts["input"] == {"size": [4, 5, 6]}
 
 
 def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
@@ -59,9 +59,9 @@ def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
     assert len(grid.settings) == 8 + 2 + 1
     first, splats, fdk = grid.settings[0], grid.settings[8], grid.settings[10]
     assert first.label == "sirt median_filter=3 motion=static iterations=5"
-    assert (first.options().iterations, first.options().motion.name) == (5, "static")
+    assert (first.plan().options.iterations, first.plan().options.motion.name) == (5, "static")
     assert first.before == {"median_filter": 3}
-    assert splats.options().control.every == 50 and splats.options().rates.position == (2e-4, 2e-5)
+    assert splats.plan().options.control.every == 50 and splats.plan().options.rates.position == (2e-4, 2e-5)
     assert (fdk.method, fdk.preset) == ("fdk", "hann")
 
 
@@ -70,7 +70,7 @@ def test_what_is_asked_for_twice_is_run_once_and_names_differ(read, tmp_path) ->
     grid = read(GRID + f"[[grid]]\n{sirt} [5, 6, 5]\n[[runs]]\n{sirt} 6\n")
     plan = plan_sweep(grid, tmp_path / "out")
     assert len(grid.settings) == 2 and len(plan) == 4 == len({run.name for run in plan})
-    assert len({run.job.output for run in plan}) == 4
+    assert len({run.output for run in plan}) == 4
     again = plan_sweep(grid, tmp_path / "elsewhere")
     assert [run.name for run in again] == [run.name for run in plan]
 

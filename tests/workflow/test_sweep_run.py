@@ -124,16 +124,16 @@ def test_a_sweep_goes_on_where_it_was_stopped(job) -> None:
 
 def test_a_result_that_was_lost_on_its_way_is_not_made_again(job) -> None:
     run = plan_sweep(job.grid, job.folder)[0]
-    run.job.output.parent.mkdir(parents=True)
+    run.output.parent.mkdir(parents=True)
     first = sweep_run.make_run(run)
-    made_ns = run.job.output.stat().st_mtime_ns
-    assert sweep_run.make_run(run) == first and run.job.output.stat().st_mtime_ns == made_ns
-    run.job.output.unlink()  # whoever removes a volume wants it anew
-    assert sweep_run.make_run(run)["finished"] >= first["finished"] and run.job.output.exists()
+    made_ns = run.output.stat().st_mtime_ns
+    assert sweep_run.make_run(run) == first and run.output.stat().st_mtime_ns == made_ns
+    run.output.unlink()  # whoever removes a volume wants it anew
+    assert sweep_run.make_run(run)["finished"] >= first["finished"] and run.output.exists()
 
 
 def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
-    original = sweep_run.go_on
+    original = sweep_run.resume_or_restart
 
     def failing(given, *rest):
         if given.method == "fdk" and given.seed == 1:
@@ -142,7 +142,7 @@ def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
             raise ZeroDivisionError("a defect")
         return original(given, *rest)
 
-    monkeypatch.setattr(sweep_run, "go_on", failing)
+    monkeypatch.setattr(sweep_run, "resume_or_restart", failing)
     _, failed = run_sweep(job)
     errors = [line["error"] for line in lines_of(job) if "error" in line]
     assert failed == 4 and set(errors) == {"ZeroDivisionError: a defect", "scan: found no good | at all"}
@@ -156,7 +156,7 @@ def test_failures_are_noted_and_tried_again(job, monkeypatch) -> None:
 
 def test_a_run_waits_for_one_that_its_scheduler_lost_sight_of(job, monkeypatch) -> None:
     run = plan_sweep(job.grid, job.folder)[0]
-    run.job.output.parent.mkdir(parents=True)
+    run.output.parent.mkdir(parents=True)
     monkeypatch.setattr(sweep_run, "_BUSY_S", 0.03)
     with only_run(run.record):
         assert "another run" in sweep_run.make_run(run)["error"]
@@ -190,7 +190,7 @@ def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, job, no_dask
 
 
 def test_failed_runs_show_in_the_status(cli, job, no_dask, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sweep_run, "go_on", lambda *_: 1 / 0)
+    monkeypatch.setattr(sweep_run, "resume_or_restart", lambda *_: 1 / 0)
     assert cli.run(["sweep", str(job.folder.parent / "grid.toml"), "-o", str(job.folder)]) == 2
     assert f"{RUNS} runs failed" in capsys.readouterr().err
 
@@ -210,13 +210,13 @@ def test_devices_are_given_out_in_turn_and_contradictions_refused() -> None:
 
 
 def test_lines_are_json_without_nan(job, monkeypatch) -> None:
-    original = sweep_run.go_on
+    original = sweep_run.resume_or_restart
 
     def perfect(*arguments):
         result, metrics = original(*arguments)
         return result, {**metrics, "psnr_db": float("inf")}
 
-    monkeypatch.setattr(sweep_run, "go_on", perfect)
+    monkeypatch.setattr(sweep_run, "resume_or_restart", perfect)
     run_sweep(job)
     rows = (job.folder / RESULTS).read_text().splitlines()
     lines = [json.loads(row, parse_constant=pytest.fail) for row in rows]

@@ -15,8 +15,8 @@ import pytest
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError
 from phyradgs_cl.io import only_run, read_volume
 from phyradgs_cl.io.lock import BusyError
+from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow import ReconstructionJob
 from phyradgs_cl.workflow import watch as watch_module
 from phyradgs_cl.workflow.watch import Arrivals, WatchEvent, WatchJob, run_watch
 
@@ -24,8 +24,7 @@ from phyradgs_cl.workflow.watch import Arrivals, WatchEvent, WatchJob, run_watch
 @pytest.fixture
 def job(tmp_path: Path) -> WatchJob:
     (tmp_path / "in").mkdir()
-    template = ReconstructionJob(Path(), Path(), method="fdk")
-    return WatchJob(tmp_path / "in", tmp_path / "out", template, poll_s=0.01, settle_s=0.0, once=True)
+    return WatchJob(tmp_path / "in", tmp_path / "out", plan_run("fdk"), poll_s=0.01, settle_s=0.0, once=True)
 
 
 @pytest.fixture
@@ -108,7 +107,7 @@ def test_half_a_file_is_set_aside_and_the_whole_taken(job, drop, rt, tiny_scan) 
 
 def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeypatch) -> None:
     scan = drop("a.h5")
-    original, runs = watch_module.go_on, []
+    original, runs = watch_module.resume_or_restart, []
 
     def touching(*arguments):
         found = original(*arguments)
@@ -117,7 +116,7 @@ def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeyp
             os.utime(scan, (1, 1))
         return found
 
-    monkeypatch.setattr(watch_module, "go_on", touching)
+    monkeypatch.setattr(watch_module, "resume_or_restart", touching)
     assert len(watched(job, rt)) == 1 and len(runs) == 2
 
 
@@ -126,14 +125,14 @@ def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt,
     failures = dict(zip(("a.h5", "b.h5", "c.h5"), errors, strict=True))
     for name in (*failures, "d.h5"):
         drop(name)
-    original = watch_module.go_on
+    original = watch_module.resume_or_restart
 
-    def failing(given, *rest):
-        if given.scan.name in failures:
-            raise failures[given.scan.name]
-        return original(given, *rest)
+    def failing(plan, scan, *rest):
+        if scan.name in failures:
+            raise failures[scan.name]
+        return original(plan, scan, *rest)
 
-    monkeypatch.setattr(watch_module, "go_on", failing)
+    monkeypatch.setattr(watch_module, "resume_or_restart", failing)
     assert len(watched(job, rt)) == 4
     assert outputs(job) == ["a.error.txt", "b.error.txt", "c.error.txt", "d.h5"]
 
@@ -141,7 +140,7 @@ def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt,
 def test_devices_and_disks_that_fail_are_no_fault_of_a_scan(job, drop, rt, monkeypatch) -> None:
     """A lost device is opened anew; one that is gone, or a full disk, ends the watch."""
     drop("a.h5")
-    original, opened, told = watch_module.go_on, [], []
+    original, opened, told = watch_module.resume_or_restart, [], []
 
     def failing(error: Exception, times: int):
         def go_on(*arguments):
@@ -157,14 +156,14 @@ def test_devices_and_disks_that_fail_are_no_fault_of_a_scan(job, drop, rt, monke
             raise DeviceError("OpenCL", "no device")
         return rt
 
-    monkeypatch.setattr(watch_module, "go_on", failing(DeviceError("device", "lost"), 2))
+    monkeypatch.setattr(watch_module, "resume_or_restart", failing(DeviceError("device", "lost"), 2))
     run_watch(job, opening, told.append)
     assert len(told) == 1 and len(opened) == 2 and outputs(job) == ["a.h5"]
     drop("b.h5")
     full = OutputError("out", "no room")
     for error, end in ((DeviceError("device", "lost"), "no device"), (full, "no room")):
         opened[:] = [1]
-        monkeypatch.setattr(watch_module, "go_on", failing(error, 9))
+        monkeypatch.setattr(watch_module, "resume_or_restart", failing(error, 9))
         with pytest.raises(type(error), match=end):
             run_watch(job, opening, told.append)
         assert outputs(job) == ["a.h5"]

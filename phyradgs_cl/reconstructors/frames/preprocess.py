@@ -25,7 +25,7 @@ _HIDING = ("holdout", "tune")
 
 
 @dataclass(frozen=True)
-class InputOptions(PrepareOptions, GridChoice):
+class Preprocessing(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm, margin_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
     median_filter: edge of its window in pixels, 0 for none. holdout: percent of the pixels that no method sees
     (``holdout.py``). tune: the option of the method that such pixels choose (``tune/``). steps and a table each: as of
@@ -66,7 +66,7 @@ class InputOptions(PrepareOptions, GridChoice):
             raise InputError(f"--{name.replace('_', '-')}", found, "none where a scan is prepared", remedy)
 
 
-def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Scan:
+def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
     """The scan as a method gets it, on a grid with its margin; the scan itself where nothing is to be done. ``rt``: where
     steps that ask the object reconstruct and project it."""
     scan = prepare(_begun(scan, options), options, partial(_model, rt))
@@ -75,14 +75,14 @@ def prepared(scan: Scan, options: InputOptions, rt: Runtime | None = None) -> Sc
     return scan
 
 
-def stages(scan: Scan, options: InputOptions, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
+def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
     """(name, scan, numbers) before the steps of ``options`` and after each of them."""
     scan = _begun(scan, options)
     yield "", scan, {}
     yield from one_by_one(scan, options, partial(_model, rt))
 
 
-def _begun(scan: Scan, options: InputOptions) -> Scan:
+def _begun(scan: Scan, options: Preprocessing) -> Scan:
     """The scan as the first step gets it."""
     scan = scan.with_grid(options)
     scan = scan.on_grid(options.with_margin(scan.grid))

@@ -15,10 +15,10 @@ from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
 from phyradgs_cl.reconstructors import (
     DEFAULT_METHOD,
-    input_names,
-    input_options,
+    RunPlan,
     method_name,
-    method_options,
+    plan_run,
+    preprocessing_names,
     usual_preset,
 )
 from phyradgs_cl.runtime import MEMORY_VARIABLE
@@ -45,9 +45,9 @@ class Setting:
     changes: Table
     before: Table
 
-    def options(self) -> Any:
-        """Returns the checked options of the method."""
-        return method_options(self.method, self.preset, self.changes, str(self.before.get("tune", "")))
+    def plan(self, seed: int = 0) -> RunPlan:
+        """Returns the checked plan of a run."""
+        return plan_run(self.method, {**self.changes, **self.before}, preset=self.preset, seed=seed)
 
     @property
     def label(self) -> str:
@@ -221,8 +221,7 @@ def _checked(values: dict[str, Any]) -> Setting:
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
             raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
-    before = {name: changes.pop(name) for name in input_names(method, preset) if name in changes}
-    tune = input_options(before).tune
+    before = {name: changes.pop(name) for name in preprocessing_names(method, preset) if name in changes}
     nested = _nested(changes)
-    method_options(method, preset, nested, tune)
+    plan_run(method, {**nested, **before}, preset=preset)
     return Setting(method, usual_preset(method) if preset is None else preset, nested, before)

@@ -21,11 +21,11 @@ from phyradgs_cl.io import only_run, written_beside
 from phyradgs_cl.io.json_lines import Line, append_line, json_text, read_lines, refuse_irregular
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.io.output import make_folder, shortened
-from phyradgs_cl.reconstructors import Progress, ProgressReport, ignore_progress, input_options
+from phyradgs_cl.reconstructors import Progress, ProgressReport, ignore_progress
 from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.runtime.environment import environment
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.reconstruct import ReconstructionJob, go_on, is_whole
+from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid
 from phyradgs_cl.workflow.sweep.tables import identity, is_sound, write_tables
 
@@ -41,13 +41,17 @@ class SweepRun:
     """One reconstruction, in the form in which a worker gets it; ``facts`` identify it in the results file."""
 
     name: str
-    job: ReconstructionJob
+    setting: Setting
+    seed: int
+    scan: Path
+    output: Path
+    checkpoint_every_s: float
     facts: Line
 
     @property
     def record(self) -> Path:
         """The file next to the volume that holds the run's line, in case the line does not reach the sweep."""
-        return self.job.output.with_suffix(".json")
+        return self.output.with_suffix(".json")
 
 
 @dataclass(frozen=True)
@@ -97,21 +101,13 @@ def plan_sweep(grid: SweepGrid, folder: Path, checkpoint_every_s: float = 600.0)
                 "label": setting.label,
                 "changes": _as_json(setting.changes),
                 "input": _as_json(setting.before),
-                "options": _as_json(asdict(setting.options())),
+                "options": _as_json(asdict(setting.plan().options)),
             }
             for seed in grid.seeds:
                 name = _name(scan, setting, seed)
-                job = ReconstructionJob(
-                    scan,
-                    folder.resolve() / VOLUMES / f"{name}.h5",
-                    setting.method,
-                    setting.preset,
-                    setting.changes,
-                    seed,
-                    before=input_options(setting.before),
-                    checkpoint_every_s=checkpoint_every_s,
-                )
-                runs.append(SweepRun(name, job, {"run": name, **shared, "seed": seed, "volume": f"{VOLUMES}/{name}.h5"}))
+                output = folder.resolve() / VOLUMES / f"{name}.h5"
+                facts = {"run": name, **shared, "seed": seed, "volume": f"{VOLUMES}/{name}.h5"}
+                runs.append(SweepRun(name, setting, seed, scan, output, checkpoint_every_s, facts))
     return runs
 
 
@@ -189,8 +185,9 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) -> Line:
     started = time.perf_counter()
     rt = runtime_of_process(device)
-    result, metrics = go_on(run.job, lambda: rt, report)
-    if not is_whole(result):
+    plan = run.setting.plan(run.seed)
+    result, metrics = resume_or_restart(plan, run.scan, run.output, lambda: rt, report, run.checkpoint_every_s)
+    if not is_complete(result):
         raise KeyboardInterrupt
     line = {
         **run.facts,
@@ -208,7 +205,7 @@ def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) ->
 
 def _recorded(run: SweepRun) -> Line | None:
     """Returns the line stored next to the volume, if both exist and the line is of this run."""
-    if not run.job.output.is_file():
+    if not run.output.is_file():
         return None
     try:
         line = json.loads(run.record.read_text(encoding="utf-8"))
