@@ -8,7 +8,6 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.recognise import recognise
-from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 
 # by name: the function of formats/ that reads it, imported when it is asked for
 FORMATS = {
@@ -37,12 +36,11 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
     checks.one_of("format", form, FORMATS)
     module, _, function = FORMATS[form].partition(".")
     room = import_module(f"phyradgs_cl.importers.formats.{module}")
-    with held_warnings():
-        try:
-            scan: Scan = getattr(room, function)(path, options or ImportOptions())
-        except InputError as error:
-            if not error.subject.startswith("grid "):
-                raise
-            raise InputError(f"{path} {error.subject}", error.found, error.expected, error.remedy) from error
-        scan.check_timing()
+    try:
+        scan: Scan = getattr(room, function)(path, options or ImportOptions())
+    except InputError as error:
+        if not error.subject.startswith("grid "):
+            raise
+        raise InputError(f"{path} {error.subject}", error.found, error.expected, error.remedy) from error
+    scan.check_timing()
     return scan

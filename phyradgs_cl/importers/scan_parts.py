@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals
 from phyradgs_cl.importers.timing import Timing
-from phyradgs_cl.io import default_grid
 
 
 def put_together(

@@ -3,7 +3,6 @@ from .checkpoint import former_checkpoint_path as former_checkpoint_path
 from .checkpoint import partial_path as partial_path
 from .checkpoint import read_checkpoint as read_checkpoint
 from .checkpoint import write_checkpoint as write_checkpoint
-from .hdf5.grid import default_grid as default_grid
 from .lock import only_run as only_run
 from .output import check_writable as check_writable
 from .output import written_beside as written_beside

@@ -1,12 +1,8 @@
-"""How much memory a reading may take: what the file's header promises, and what this machine has."""
+"""Memory of this machine and of this process, as the operating system reports it."""
 
 import os
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-
-from phyradgs_cl.io.hdf5.look.__main__ import in_use_bytes
 
 try:
     import resource
@@ -14,13 +10,11 @@ except ImportError:  # not POSIX
     resource = None  # type: ignore[assignment]
 
 HOST_SHARE = 0.8
-"""Of this machine's memory: what one array may take."""
-_FREE_BYTES = 256 << 20  # that libraries map for themselves, and a thread for its heap
-_lock = threading.Lock()
+"""The share of this machine's memory that one array may take."""
 
 
 def host_bytes() -> float:
-    """This machine's memory; infinite where the system does not say."""
+    """Returns this machine's memory; infinity where the system does not report it."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
@@ -28,7 +22,7 @@ def host_bytes() -> float:
 
 
 def free_bytes() -> float:
-    """Memory that this process may still take without others losing theirs; infinite where the system does not say."""
+    """Returns the memory that this process may still take; infinity where the system does not report it."""
     free = host_bytes()
     with suppress(OSError, ValueError, IndexError):
         free = 1024.0 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
@@ -36,19 +30,10 @@ def free_bytes() -> float:
     return free if limit < 0 else min(free, limit - in_use_bytes("VmSize:"))
 
 
-@contextmanager
-def at_most(more_bytes: int) -> Iterator[None]:
-    """Whoever asks the system for more than ``more_bytes`` (and some) in the body gets none, where Linux counts:
-    libraries that unfold compressed data would go on until there is no memory left."""
-    in_use = in_use_bytes("VmSize:")
-    if resource is None or not in_use:
-        yield
-        return
-    with _lock:
-        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-        wanted = in_use + more_bytes + _FREE_BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (wanted if soft < 0 else min(wanted, soft), hard))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+def in_use_bytes(field: str) -> int:
+    """Returns the memory of this process from a field of Linux' /proc/self/status: "VmHWM:" for the peak of resident memory,
+    "VmSize:" for the address space; 0 on other systems."""
+    try:
+        return 1024 * int(Path("/proc/self/status").read_text().partition(field)[2].split()[0])
+    except (OSError, ValueError, IndexError):
+        return 0

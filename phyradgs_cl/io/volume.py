@@ -14,13 +14,21 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, triple
-from phyradgs_cl.io.hdf5.datasets import in_unit, new_group, read_array, read_values, read_word, write_number
+from phyradgs_cl.io.hdf5.datasets import (
+    ATTENUATION,
+    LENGTH,
+    in_unit,
+    new_group,
+    new_hdf5,
+    read_array,
+    read_grid,
+    read_values,
+    read_word,
+    write_grid,
+    write_number,
+)
 from phyradgs_cl.io.hdf5.facts import PROVENANCE, Schema, read_facts
-from phyradgs_cl.io.hdf5.grid import read_grid, write_grid
-from phyradgs_cl.io.hdf5.new import new_hdf5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.hdf5.units import ATTENUATION, LENGTH
-from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.sha256 import sha256_of
 from phyradgs_cl.text import plain_text
 
@@ -77,8 +85,8 @@ def write_volume(
         if values is not None:
             checks.shape(name, values, grid.shape)
             checks.finite(name, values)
-    with written_beside(path) as temporary, new_hdf5(temporary) as file:
-        file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
+    arrays = [volume, disagreement, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
+    with new_hdf5(path, sum(values.nbytes for values in arrays if values is not None)) as file:
         entry = new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
         _write_data(entry, np.asarray(volume, np.float32), grid, disagreement)

@@ -13,7 +13,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import foreign_suffix
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
-from phyradgs_cl.io.hdf5.held_warnings import held_warnings
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.prepare import flat_correction
 
@@ -26,7 +25,7 @@ _KINDS = {
 
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
     """A scan file as line integrals, its flats taken as ``prepare.flats`` says; see ``io.read_scan``."""
-    with expecting(path, "scan"), held_warnings():
+    with expecting(path, "scan"):
         scan = read_scan(path, flat_correction(flats))
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 

@@ -1,4 +1,4 @@
-"""Every reader of the package on one file or folder: what `worker` calls, by name."""
+"""The readers of the package that are not HDF5's, on one file or folder: what `worker` calls, by name."""
 
 import shutil
 from collections.abc import Callable
@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from corpus.imports import FORMS
 
 from phyradgs_cl.importers import ImportOptions, import_scan
-from phyradgs_cl.io import checkpoint_path, load_scanner, load_volume, read_checkpoint, read_volume
+from phyradgs_cl.io import checkpoint_path, load_scanner, read_checkpoint
 from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.settings import read_config
-from phyradgs_cl.workflow.files import load_scan, summary
 from phyradgs_cl.workflow.sweep import read_grid
 
 DATA = Path("/nowhere")
@@ -33,7 +31,6 @@ class Reader:
 
 def _import(form: str) -> Callable[[Path], object]:
     options = {
-        "data-exchange": ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0),
         "phyradgs-real": ImportOptions(pixel_size_mm=(3.0, 2.5)),
     }
     return lambda path: import_scan(path, options.get(form), form)
@@ -50,12 +47,6 @@ def _checkpoint(path: Path) -> object:
 
 
 READERS: dict[str, Reader] = {
-    "scan": Reader("fly.h5", load_scan),
-    "raw counts": Reader("counts.h5", load_scan),
-    "facts of a scan": Reader("fly.h5", summary),
-    "volume": Reader("volume.h5", read_volume),
-    "facts of a volume": Reader("volume.h5", summary),
-    "bare volume": Reader("bare.h5", load_volume),
     "scanner": Reader("scanner.toml", lambda path: load_scanner(path, DATA)),
     "configuration": Reader("run.toml", read_config),
     "sweep": Reader("sweep", _sweep, "grid.toml"),
@@ -69,12 +60,7 @@ READERS: dict[str, Reader] = {
     "import of tiff, TIFF": Reader("tiff", _import("tiff"), "proj_1.tif"),
     "import of tiff, TOML": Reader("tiff", _import("tiff"), "scan.toml"),
     "import of naf": Reader("chest.pickle", _import("naf")),
-    "import of data-exchange": Reader("dx.h5", _import("data-exchange")),
-    "import of nxtomo": Reader("nx.h5", _import("nxtomo")),
 }
-SLOW = ("import of data-exchange", "import of nxtomo")
-"""Each begins with a process of its own."""
-assert {reader.of for reader in READERS.values()} >= {name for name, _, _ in FORMS.values()} - {"phyradgs"}
 
 
 def changed_copy(reader: Reader, good: Path, folder: Path, content: bytes) -> Path:

@@ -46,7 +46,8 @@ def complaint(case: Case, outcome: Outcome) -> str:
     """What is wrong with what came of a case; nothing where all is as it must be."""
     if not case.refused:
         return "" if outcome.status == 0 and "Traceback" not in outcome.error else "must be read"
-    if outcome.status != 2 or len(outcome.lines) != 1 or not outcome.lines[0].startswith("phyradgs: "):
+    errors = [line for line in outcome.lines if line.startswith("phyradgs: ")]  # warnings have no such beginning
+    if outcome.status != 2 or len(errors) != 1 or "Traceback" in outcome.error:
         return "must be refused in one line"
     if outcome.left:
         return f"left {outcome.left}"

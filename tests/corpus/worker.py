@@ -33,7 +33,7 @@ def reset_peak() -> None:
 
 
 def cpu_s() -> float:
-    """Of this process. The one that tries HDF5 files has a limit of its own, and lives on from file to file."""
+    """Seconds of processor time of this process."""
     use = resource.getrusage(resource.RUSAGE_SELF)
     return use.ru_utime + use.ru_stime
 

@@ -2,14 +2,12 @@
 
 import json
 import os
-import subprocess
 import sys
 import time
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import hostile_of_importers as hostile
@@ -140,19 +138,6 @@ def test_what_is_not_recognised_is_said(tmp_path) -> None:
         make(tmp_path / case / "what")
         with pytest.raises(InputError, match="what: found"):
             import_scan(tmp_path / case / "what")
-
-
-def test_a_file_that_crashes_the_hdf5_library_does_not_end_this_process() -> None:
-    """A few bytes changed in an NXtomo file: the library follows an attribute into nowhere."""
-    path = Path(__file__).with_name("data") / "crashes_hdf5.h5"
-    program = (
-        "from contextlib import suppress; from phyradgs_cl.errors import InputError;"
-        "from phyradgs_cl.importers import import_scan\n"
-        "with suppress(InputError):\n"  # a later library may even read it
-        f"    import_scan({str(path)!r}, form='nxtomo')"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 def test_what_the_user_names_is_the_user_s_business(tmp_path, make_truth) -> None:

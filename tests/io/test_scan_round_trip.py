@@ -22,10 +22,11 @@ from phyradgs_cl.acquisition import (
     SpeedRamp,
     Static,
 )
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import default_grid, file_kind, read_scan, scan_summary, sha256_of, write_scan
+from phyradgs_cl.io import file_kind, read_scan, scan_summary, sha256_of, write_scan
 
 ANGLE_TOLERANCE_RAD = 1e-12  # degrees in the file: two roundings of angles of order 1
 LENGTH_TOLERANCE_MM = 1e-9  # that angle at 785 mm

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
+from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import default_grid, load_scanner, with_detector_count
+from phyradgs_cl.io import load_scanner, with_detector_count
 from phyradgs_cl.simulation import scanner_options
 
 DATA = Path(__file__).parents[2] / "data"

@@ -17,19 +17,15 @@ from phyradgs_cl.workflow.files import load_scan
 from phyradgs_cl.workflow.sweep import RESULTS, plan_sweep, read_grid
 from phyradgs_cl.workflow.sweep.tables import is_sound, write_tables
 
-DEEP = json.loads("[" * 400 + "]" * 400)
 ABSURD = {
     "half a surrogate pair": "x\udcff\ud800",
     "a control": "x\x1b[2J\0",
     "a list": ["x", 1],
     "a table": {"a": {"b": 1}},
     "a truth value": True,
-    "400 digits": 10**399,
     "beyond floats": 1e308,
     "NaN": float("nan"),
     "negative": -1,
-    "deep": DEEP,
-    "long": "x" * 3_000_000,
     "nothing": None,
 }
 FIELDS = ("method", "scan", "scan_sha256", "seconds", "gaussians", "record", "options", "input", "segments")
@@ -60,7 +56,7 @@ def test_every_field_may_be_absurd(files, tmp_path, cli, case, capsys, caplog) -
     """In all fields at once, for report, info and evaluate: they end well, or in one line."""
     scan, volume = files
     facts = dict.fromkeys(FIELDS, ABSURD[case])
-    facts["options"] = {"motion": {"name": ABSURD[case], "strips": ABSURD[case]}} if case != "deep" else DEEP
+    facts["options"] = {"motion": {"name": ABSURD[case], "strips": ABSURD[case]}}
     text = json.dumps(facts)
     bad = written(volume, tmp_path / "v.h5", text, json.dumps({"psnr_db": ABSURD[case], "ssim": 1.0}))
     for command in (
@@ -115,7 +111,7 @@ def test_a_benchmark_s_lines_of_another_type_are_left_out(tmp_path) -> None:
     words = ("study", "volume", "run", "acquisition", "protocol", "axis", "device", "platform")
     good = dict.fromkeys((*words, "version", "python", "numpy"), "a")
     good |= dict.fromkeys(("voxels", "pixels", "seed", "views"), 3) | {"metrics": {"psnr_db": 1.0}}
-    cases = [ABSURD[case] for case in ("a list", "400 digits", "deep", "long", "a truth value", "NaN")]
+    cases = [ABSURD[case] for case in ("a list", "a truth value", "NaN")]
     wrong = [(name, value) for name in (*good, "seconds", "source", "options") for value in cases]
     wrong += [("metrics", {"psnr_db": value}) for value in ("x", True, float("nan"))]
     for name, value in wrong:

@@ -12,9 +12,8 @@ from phyradgs_cl.importers.reading import hdf5_frames
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.scan_parts import cone, put_together
 from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
-from phyradgs_cl.io.hdf5.datasets import read_array, read_title
+from phyradgs_cl.io.hdf5.datasets import ANGLE, TIME, read_array, read_title
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.hdf5.units import ANGLE, TIME
 
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"

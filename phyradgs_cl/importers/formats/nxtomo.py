@@ -18,8 +18,8 @@ from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.scan_parts import cone, put_together
 from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
 from phyradgs_cl.io.hdf5 import datasets as h5
+from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.header import find_entry

@@ -4,9 +4,8 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions, needed
-from phyradgs_cl.io.hdf5.datasets import read_length, read_values
+from phyradgs_cl.io.hdf5.datasets import LENGTH, Quantity, read_length, read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.hdf5.units import LENGTH, Quantity
 
 
 def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:

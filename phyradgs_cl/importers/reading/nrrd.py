@@ -8,7 +8,7 @@ import numpy as np
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.bounded import read_head, read_raw
 from phyradgs_cl.importers.reading.voxels import RAS, Voxels, header_numbers
-from phyradgs_cl.io.hdf5.units import LENGTH
+from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 _NAMES = {
     "i1": ("signed char", "int8", "int8_t"),

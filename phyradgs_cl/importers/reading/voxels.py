@@ -10,7 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.io import LoadedVolume
-from phyradgs_cl.io.hdf5.units import LENGTH
+from phyradgs_cl.io.hdf5.datasets import LENGTH
 from phyradgs_cl.io.tables import LARGEST
 
 RAS = np.array([-1.0, -1.0, 1.0])  # what turns right, anterior, superior into LPS, and back

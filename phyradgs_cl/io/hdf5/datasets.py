@@ -1,56 +1,95 @@
-"""Typed reads from an Hdf5Source: numbers with units, words and whole numbers, each checked at once."""
+"""Typed values in HDF5: numbers with units, words, whole numbers and voxel grids. Every value is checked when it is read."""
 
 import logging
 import math
+import os
 import posixpath
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
 
 import h5py
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutOfMemoryError
+from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.hdf5.units import Quantity
-from phyradgs_cl.io.memory import HOST_SHARE, at_most, host_bytes
+from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
+from phyradgs_cl.io.output import written_beside
 
-_BUFFERS = 4  # of a chunk's size: as stored, and between filters
+_SPARE_BYTES = 1 << 16  # what HDF5 writes beside the arrays
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class Quantity:
+    """A physical quantity. ``factors``: from unit names to the package's unit. ``assumed``: the unit of a dataset without
+    units. ``largest``: in the package's unit; larger numbers are damage and would overflow later."""
+
+    name: str
+    assumed: str
+    largest: float
+    factors: MappingProxyType[str, float]
+
+    def factor(self, unit: str) -> float | None:
+        """Returns the multiplier for a value in ``unit``, or None for an unknown unit."""
+        return self.factors.get(unit.strip())
+
+    @property
+    def accepted(self) -> str:
+        """The short unit names, for messages."""
+        return ", ".join(name for name in self.factors if len(name) <= 4 and name.isascii())
+
+
+def _quantity(name: str, assumed: str, largest: float, factors: dict[tuple[str, ...], float]) -> Quantity:
+    flat = {unit: factor for names, factor in factors.items() for unit in names}
+    return Quantity(name, assumed, largest, MappingProxyType(flat))
+
+
+LENGTH = _quantity("length", "mm", 1e9, {
+    ("mm", "millimeter", "millimetre", "millimeters", "millimetres"): 1.0,
+    ("cm", "centimeter", "centimetre", "centimeters", "centimetres"): 10.0,
+    ("m", "meter", "metre", "meters", "metres"): 1000.0,
+    ("um", "\u00b5m", "\u03bcm", "micrometer", "micrometre", "micrometers", "micrometres"): 1e-3,
+})  # fmt: skip
+TIME = _quantity("time", "s", 1e12, {
+    ("s", "sec", "second", "seconds"): 1.0,
+    ("ms", "millisecond", "milliseconds"): 1e-3,
+    ("us", "\u00b5s", "\u03bcs", "microsecond", "microseconds"): 1e-6,
+})  # fmt: skip
+ANGLE = _quantity("angle", "deg", 1e8, {
+    ("deg", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "radian", "radians"): 1.0
+})  # fmt: skip
+ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
+    ("1/mm", "mm^-1", "mm-1"): 1.0, ("1/cm", "cm^-1", "cm-1"): 0.1, ("1/m", "m^-1", "m-1"): 1e-3
+})  # fmt: skip
+
+
 def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf") -> np.ndarray:
-    """All values of a dataset in their own type; InputError unless NumPy's kind of it is in ``kinds``."""
+    """Reads a dataset in its own type. InputError unless NumPy's kind of that type is in ``kinds``."""
     subject = source.name(address)
     try:
-        kind = dataset.dtype.kind
-        if kind not in kinds:
-            wanted = "numbers" if "f" in kinds else "whole numbers"
-            raise InputError(subject, f"type {dataset.dtype}", wanted, "store them as plain HDF5 numbers")
-        return np.asarray(_unfolded(dataset))
+        if dataset.dtype.kind not in kinds:
+            expected = "numbers" if "f" in kinds else "whole numbers"
+            raise InputError(subject, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
+        if dataset.nbytes > HOST_SHARE * host_bytes():
+            raise MemoryError
+        return np.asarray(dataset[()])
     except MemoryError as error:
         found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
         raise OutOfMemoryError(subject, found, "data that this machine's memory can hold") from error
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(subject, _damage(error), "readable data") from error
-
-
-def _unfolded(dataset: h5py.Dataset) -> object:
-    if dataset.nbytes > HOST_SHARE * host_bytes():
-        raise MemoryError
-    chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
-    with at_most(dataset.nbytes + _BUFFERS * chunk_bytes):
-        return dataset[()]
-
-
-def _damage(error: Exception) -> str:
-    bomb = ", or that unfold to more than their header promises" if "filter" in str(error) else ""
-    return f"data that HDF5 cannot read{bomb} ({error})"
+        raise InputError(subject, f"data that HDF5 cannot read ({error})", "readable data") from error
 
 
 def read_array(
     source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None
 ) -> np.ndarray:
-    """A required numeric dataset as float64 in the package's unit; every value finite."""
+    """Reads a required numeric dataset as finite float64, in the package's unit of ``quantity``."""
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     values = read_values(source, address, dataset).astype(np.float64)
@@ -58,8 +97,16 @@ def read_array(
     return in_unit(source, address, values, quantity) if quantity else values
 
 
+def read_number(source: Hdf5Source, address: str, quantity: Quantity | None = None) -> float:
+    """Reads a required finite number, in the package's unit of ``quantity``. Datasets of one element are accepted."""
+    dataset = source.dataset(address)
+    if dataset.size != 1:
+        raise source.error(address, f"shape {dataset.shape}", "one number")
+    return float(read_array(source, address, dataset.shape, quantity).reshape(()))
+
+
 def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    """A required number above zero; a dataset of one element will do."""
+    """Reads a required number above zero. Datasets of one element are accepted."""
     value = read_number(source, address, quantity)
     if value <= 0:
         raise source.error(address, str(value), f"a {quantity.name} above 0", "correct the value")
@@ -68,32 +115,22 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     return value
 
 
-def read_number(source: Hdf5Source, address: str, quantity: Quantity | None = None) -> float:
-    """A required finite number in the package's unit; a dataset of one element will do."""
-    dataset = source.dataset(address)
-    if dataset.size != 1:
-        raise source.error(address, f"shape {dataset.shape}", "one number")
-    values = read_values(source, address, dataset).astype(np.float64)
-    checks.finite(source.name(address), values)
-    return float((in_unit(source, address, values, quantity) if quantity else values).reshape(()))
-
-
 def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None]) -> np.ndarray:
-    """A required dataset of whole numbers as int64."""
+    """Reads a required dataset of whole numbers as int64."""
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     return read_values(source, address, dataset, kinds="iu").astype(np.int64)
 
 
 def read_word(source: Hdf5Source, address: str, allowed: Collection[str] | None = None) -> str:
-    """A required string, one of ``allowed`` where they are given."""
+    """Reads a required string, one of ``allowed`` where that is given."""
     dataset = source.dataset(address)
-    if dataset.size != 1:  # many entries may all be one long text, which the file's size does not bound
+    if dataset.size != 1:  # a million entries may share one long text, which the file's size does not bound
         raise source.error(address, f"shape {dataset.shape}", "a string")
     try:
-        word = as_text(_unfolded(dataset))
+        word = _text(dataset[()])
     except (MemoryError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise source.error(address, _damage(error), "a string") from error
+        raise source.error(address, f"data that HDF5 cannot read ({error})", "a string") from error
     if word is None:
         raise source.error(address, f"type {dataset.dtype}, shape {dataset.shape}", "a string")
     if allowed is not None:
@@ -102,13 +139,43 @@ def read_word(source: Hdf5Source, address: str, allowed: Collection[str] | None 
 
 
 def read_title(source: Hdf5Source, address: str, default: str) -> str:
-    """A string that may be missing or empty."""
+    """Reads a string; ``default`` where it is missing or empty."""
     return (read_word(source, address) if source.find(address) is not None else "") or default
 
 
+def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
+    """Reads a text attribute; None where the object or the attribute is missing."""
+    thing = source.find(address)
+    if thing is None:
+        return None
+    subject = f"{source.name(address)} @{name}"
+    try:
+        if name not in thing.attrs:
+            return None
+        shape = thing.attrs.get_id(name).shape
+        if math.prod(shape) != 1:
+            raise InputError(subject, f"shape {shape}", "a string")
+        value = thing.attrs[name]
+    except (OSError, RuntimeError, TypeError, ValueError, LookupError) as error:
+        raise InputError(subject, f"an attribute that HDF5 cannot read ({error})", "a string") from error
+    text = _text(value)
+    if text is None:
+        raise InputError(subject, checks.shown(value), "a string")
+    return text
+
+
+def _text(value: object) -> str | None:
+    """Returns the string in h5py's answer (str, bytes or an array of one), or None for anything else."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return str(value) if isinstance(value, str) else None
+
+
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Finite values (any shape) in the package's unit; InputError for some beyond all reason."""
-    values = values * unit_factor(source, address, quantity)
+    """Converts finite values (any shape) to the package's unit. InputError for values beyond ``quantity.largest``."""
+    values = values * _unit_factor(source, address, quantity)
     size = np.abs(values).max(initial=0.0)
     if size > quantity.largest:
         expected = f"at most {quantity.largest:g} of the package's unit for a {quantity.name}"
@@ -116,12 +183,11 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
     return values
 
 
-def unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    """Factor from the dataset's units to the package's; a missing attribute is assumed, and logged."""
+def _unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     unit = read_attribute(source, address, "units")
     if unit is None:
         unit = quantity.assumed
-        # A name that ends in the unit (time_s, angle_deg) says it well enough.
+        # A name that ends in the unit (time_s, angle_deg) states it well enough.
         if not posixpath.basename(address).endswith(f"_{unit}"):
             _log.warning("%s: no units attribute; %s assumed", source.name(address), unit)
     factor = quantity.factor(unit)
@@ -130,38 +196,48 @@ def unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     return factor
 
 
-def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
-    """A text attribute of an object that exists, or None."""
-    found = source.find(address)
-    if found is None:
-        return None
-    subject = f"{source.name(address)} @{name}"
-    try:
-        if name not in found.attrs:
-            return None
-        shape = found.attrs.get_id(name).shape
-        value = found.attrs[name] if math.prod(shape) == 1 else f"shape {shape}"
-        text = as_text(value) if math.prod(shape) == 1 else None
-    except (OSError, RuntimeError, TypeError, ValueError, LookupError) as error:
-        raise InputError(subject, f"an attribute that HDF5 cannot read ({error})", "a string") from error
-    if text is None:
-        raise InputError(subject, checks.shown(value), "a string")
-    return text
+def read_grid(source: Hdf5Source, address: str) -> Grid:
+    """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset, each (z, y, x)."""
+    shape = read_integers(source, f"{address}/shape", (3,))
+    voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
+    offset_mm = np.zeros(3)
+    if source.optional(f"{address}/offset") is not None:
+        offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH)
+    if shape.min() < 1:
+        raise source.error(f"{address}/shape", str(shape.tolist()), "three counts of at least 1")
+    if math.prod(shape.tolist()) > MOST_VOXELS:
+        expected = f"at most {MOST_VOXELS:.3g} voxels"
+        raise source.error(f"{address}/shape", str(shape.tolist()), expected, "correct the counts")
+    if voxel_size_mm.min() < 1 / LENGTH.largest:
+        raise source.error(f"{address}/voxel_size", str(voxel_size_mm.tolist()), "three lengths above 0")
+    return Grid(triple(shape.tolist()), triple(voxel_size_mm.tolist()), triple(offset_mm.tolist()))
 
 
-def as_text(value: object) -> str | None:
-    """A string from what h5py gives for one (str, bytes, an array of one), else None."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(-1)[0]
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
-    return str(value) if isinstance(value, str) else None
+@contextmanager
+def new_hdf5(path: str | Path, size_bytes: int) -> Iterator[h5py.File]:
+    """Creates an HDF5 file for arrays of ``size_bytes``, whole or not at all (``written_beside``). Reserves the room first,
+    since the HDF5 library can crash on a full disk; OutputError where there is none."""
+    with written_beside(path) as temporary:
+        if hasattr(os, "posix_fallocate"):
+            with open(temporary, "r+b") as reserved:
+                os.posix_fallocate(reserved.fileno(), 0, size_bytes + _SPARE_BYTES)
+        with h5py.File(temporary, "w") as file:
+            file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
+            yield file
+
+
+def write_grid(parent: h5py.Group, grid: Grid) -> None:
+    """Writes the group ``grid`` of ``parent``."""
+    group = new_group(parent, "grid", "NXcollection")
+    write_number(group, "shape", grid.shape)
+    write_number(group, "voxel_size", grid.voxel_size_mm, "mm")
+    write_number(group, "offset", grid.offset_mm, "mm")
 
 
 def write_number(
     group: h5py.Group, name: str, values: object, units: str | None = None, **attributes: str
 ) -> h5py.Dataset:
-    """A small dataset with its units attribute."""
+    """Writes a small dataset with its units attribute."""
     dataset = group.create_dataset(name, data=values)
     if units is not None:
         dataset.attrs["units"] = units
@@ -170,7 +246,7 @@ def write_number(
 
 
 def new_group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
-    """A group with its NeXus class."""
+    """Creates a group with its NeXus class."""
     group = parent.create_group(name)
     group.attrs["NX_class"] = nx_class
     return group

@@ -10,9 +10,8 @@ import h5py
 import numpy as np
 
 from phyradgs_cl.acquisition import PoseTable, Scan
-from phyradgs_cl.io.hdf5.datasets import new_group, read_array, write_number
+from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME, new_group, read_array, write_number
 from phyradgs_cl.io.hdf5.source import open_hdf5
-from phyradgs_cl.io.hdf5.units import LENGTH, TIME
 from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.header import read_header

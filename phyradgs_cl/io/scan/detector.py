@@ -8,8 +8,8 @@ from phyradgs_cl.acquisition import ConeGeometry, Shutter
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5 import datasets as h5
+from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.hdf5.units import LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 
 

@@ -12,9 +12,8 @@ from phyradgs_cl.acquisition.field_of_view import default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io.hdf5.datasets import read_attribute, read_number, read_title, read_word
+from phyradgs_cl.io.hdf5.datasets import read_attribute, read_grid, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.facts import read_facts
-from phyradgs_cl.io.hdf5.grid import read_grid
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import detector, schema
 from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
@@ -89,7 +88,7 @@ def find_entry(source: Hdf5Source) -> str:
     if len(entries) == 1:
         return entries[0]
     found = f"{len(entries)} NXentry groups" if entries else "no NXentry group"
-    raise source.error("/entry", found, "a group 'entry'", source.near_miss("/", "entry"))
+    raise source.error("/entry", found, "a group 'entry'", source.misspelling("/", "entry"))
 
 
 def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry) -> tuple[Grid, bool]:

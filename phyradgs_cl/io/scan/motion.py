@@ -18,9 +18,16 @@ from phyradgs_cl.acquisition import (
 )
 from phyradgs_cl.acquisition.trajectory import ConstantSpeed, sampled
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.hdf5.datasets import new_group, read_array, read_attribute, write_number
+from phyradgs_cl.io.hdf5.datasets import (
+    ANGLE,
+    LENGTH,
+    TIME,
+    new_group,
+    read_array,
+    read_attribute,
+    write_number,
+)
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.hdf5.units import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan import schema
 
 _log = logging.getLogger(__name__)

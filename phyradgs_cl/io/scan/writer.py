@@ -10,10 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.hdf5.datasets import new_group, write_number
-from phyradgs_cl.io.hdf5.grid import write_grid
-from phyradgs_cl.io.hdf5.new import new_hdf5
-from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.io.hdf5.datasets import new_group, new_hdf5, write_grid, write_number
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.motion import storable, write_motion
 from phyradgs_cl.text import plain_text
@@ -44,8 +41,7 @@ def write_scan(
         remedy = "give the exposure its real length"
         raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
-    with written_beside(path) as temporary, new_hdf5(temporary) as file:
-        file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
+    with new_hdf5(path, frames.nbytes) as file:
         entry = new_group(file, "entry", "NXentry")
         entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"
         entry["definition"], entry["title"] = "NXtomo", plain_text(scan.title)
