@@ -1,8 +1,8 @@
 """How near a default of ``fista`` comes to the best of a sweep: the weight that it takes from the data, or its passes.
 
-    python benchmarks/sweep.py run VOLUMES docs/results/prior_weight.jsonl
-    python benchmarks/sweep.py run VOLUMES docs/results/passes.jsonl --option iterations --holdout 2
-    python benchmarks/sweep.py table docs/results/prior_weight.jsonl
+    python benchmarks/sweep.py VOLUMES docs/results/prior_weight.jsonl
+    python benchmarks/sweep.py VOLUMES docs/results/passes.jsonl --option iterations --holdout 2
+    python docs/make_results.py      # the tables of both in docs/results/settings.md
 
 A line per volume, scan and factor: PSNR in dB with ``factor`` times the default of the option, and with ``--holdout`` the
 error on so many percent of the pixels, which are kept from it. Runs that are there are not made again. Scans are those of
@@ -14,7 +14,6 @@ import argparse
 import json
 from pathlib import Path
 
-import numpy as np
 from scans import files_of, read_lines
 
 from phyradgs_cl.acquisition import PerRow, Scan, Static
@@ -58,57 +57,29 @@ def run(given: argparse.Namespace) -> None:
                 print(*line.values(), flush=True)
 
 
-def table(given: argparse.Namespace) -> None:
-    """PSNR with the default, with the best factor for all volumes of a scan, with each volume's own best, and, where pixels
-    were held out, with the factor of their least error."""
-    scans: dict[tuple[object, ...], dict[str, dict[float, dict[str, float]]]] = {}
-    for line in read_lines(given.lines):
-        of = scans.setdefault(tuple(line[name] for name in SCAN), {}).setdefault(str(line["volume"]), {})
-        of[float(line["factor"])] = line  # type: ignore[arg-type, assignment]
-    print("| scan | views | photons | voxels, pixels | volumes | default's | one factor's best | own best | held-out's |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for scan, volumes in sorted(scans.items(), key=str):
-        factors = sorted(set.union(*(set(of) for of in volumes.values())))
-        volumes = {name: of for name, of in volumes.items() if len(of) == len(factors)}  # a sweep may be half made
-        psnr_db = np.array([[of[factor]["psnr_db"] for factor in factors] for of in volumes.values()])
-        means, best, shown = psnr_db.mean(0), int(psnr_db.mean(0).argmax()), ""
-        if all("holdout_rms" in of[factor] for of in volumes.values() for factor in factors):
-            errors = np.array([[of[factor]["holdout_rms"] for factor in factors] for of in volumes.values()])
-            shown = f"{np.take_along_axis(psnr_db, errors.argmin(1)[:, None], 1).mean():.2f}"
-        kind, views, dose, size, pixels = scan
-        cells = [kind, views, f"{dose:g}", f"{size}³, {pixels}²", len(volumes), f"{means[factors.index(1.0)]:.2f}"]
-        cells += [f"{means[best]:.2f} (×{factors[best]:g})", f"{psnr_db.max(1).mean():.2f}", shown]
-        print("| " + " | ".join(map(str, cells)) + " |")
-
-
 def _key(line: dict[str, object]) -> tuple[object, ...]:
     return tuple(line[name] for name in ("volume", *SCAN, "seed", "factor"))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    verbs = parser.add_subparsers(required=True)
-    running = verbs.add_parser("run")
-    running.add_argument("volumes")
-    running.add_argument("--names", help="with commas; all")
-    running.add_argument("--size", type=int, default=64, help="voxels per side; up to 48 far fewer than what is projected")
-    running.add_argument("--pixels", type=int, help="per side of the detector; twice --size")
-    running.add_argument("--kinds", nargs="+", default=["still"], choices=list(MOTIONS))
-    running.add_argument("--views", nargs="+", type=int, default=[25, 50], help="of fly-scans 25 or 50")
-    running.add_argument("--doses", nargs="+", type=float, default=[1e3, 1e4, 1e5])
-    running.add_argument("--factors", nargs="+", type=float, default=[0.5, 0.71, 1.0, 1.41, 2.0])
-    running.add_argument("--option", choices=list(USUAL), default="prior_weight")
-    running.add_argument("--holdout", type=float, default=0.0, help="percent of the pixels")
-    running.add_argument("--seed", type=int, default=0)
-    showing = verbs.add_parser("table")
-    for verb, function in ((running, run), (showing, table)):
-        verb.add_argument("lines", type=Path, help="a file of one line of JSON per run")
-        verb.set_defaults(function=function)
+    parser.add_argument("volumes")
+    parser.add_argument("lines", type=Path, help="a file of one line of JSON per run")
+    parser.add_argument("--names", help="with commas; all")
+    parser.add_argument("--size", type=int, default=64, help="voxels per side; up to 48 far fewer than what is projected")
+    parser.add_argument("--pixels", type=int, help="per side of the detector; twice --size")
+    parser.add_argument("--kinds", nargs="+", default=["still"], choices=list(MOTIONS))
+    parser.add_argument("--views", nargs="+", type=int, default=[25, 50], help="of fly-scans 25 or 50")
+    parser.add_argument("--doses", nargs="+", type=float, default=[1e3, 1e4, 1e5])
+    parser.add_argument("--factors", nargs="+", type=float, default=[0.5, 0.71, 1.0, 1.41, 2.0])
+    parser.add_argument("--option", choices=list(USUAL), default="prior_weight")
+    parser.add_argument("--holdout", type=float, default=0.0, help="percent of the pixels")
+    parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    if "fly" in getattr(given, "kinds", ()) and not set(given.views) <= set(PROTOCOLS):
+    if "fly" in given.kinds and not set(given.views) <= set(PROTOCOLS):
         parser.error("fly-scans have --views 25 or 50")
-    given.pixels = getattr(given, "pixels", None) or 2 * getattr(given, "size", 0)
-    given.function(given)
+    given.pixels = given.pixels or 2 * given.size
+    run(given)
 
 
 if __name__ == "__main__":

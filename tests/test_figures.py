@@ -2,6 +2,8 @@
 
 import importlib.util
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -91,3 +93,9 @@ def test_the_picture_after_is_better_than_the_one_before(name) -> None:
     scores = re.findall(r": (\S+) dB", " ".join(axes.get_title() for axes in figure.axes))
     before_db, after_db = map(float, scores)
     assert after_db > before_db + 2
+
+
+def test_tables_of_the_results_are_those_of_the_recorded_runs() -> None:
+    command = [sys.executable, str(DOCS / "make_results.py"), "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"run docs/make_results.py: {done.stdout}{done.stderr}"

@@ -1,7 +1,7 @@
 """Mutation testing of a room: python -m tests.mutation ROOM [--count N] [--seed N] [--timeout S] [--again FILE].
 
 Changes a copy of the sources in one place after the other and runs the room's tests, which are to fail. One line per
-mutant on standard output; docs/results/mutants.md has a verdict on those that live. POSIX only: a test run is a fork of a
+mutant on standard output; docs/results/tests.md has a verdict on those that live. POSIX only: a test run is a fork of a
 process that has imported everything else already.
 """
 

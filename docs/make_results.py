@@ -1,0 +1,268 @@
+"""Fills the tables of docs/results/*.md from the recorded runs beside them: python docs/make_results.py [--check]
+
+A table stands between ``<!-- table: NAME -->`` and ``<!-- end of table -->``; NAME is a key of ``TABLES``. With
+``--check`` nothing is written, and the exit status is 1 where a page differs from its data.
+"""
+
+import csv
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+RESULTS = Path(__file__).resolve().parent / "results"
+BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end of table -->)", re.S)
+METHODS = (
+    # label of the page, row with the motion ignored, row with the motion known, row of the still scan
+    ("FDK", "FDK", "FDK per-row", "FDK"),
+    ("SART", "SART", "SART per-row", "SART"),
+    ("OS-SART", "OS-SART", "OS-SART per-row", "OS-SART"),
+    ("SIRT", "SIRT", "SIRT per-row", "SIRT"),
+    ("CGLS", "CGLS", "CGLS per-row", "CGLS"),
+    ("ASD-POCS", "ASD-POCS", "ASD-POCS per-row", "ASD-POCS"),
+    ("FISTA-TV", "FISTA-TV", "FISTA-TV per-row", "FISTA-TV"),
+    ("`fista`, on one grid", "", "FISTA with DCT on one grid per-row", "FISTA with DCT on one grid"),
+    ("**`fista`, the default**", "", "FISTA with DCT per-row", "FISTA with DCT"),
+    ("`fused`", "", "Fused exact in time", "Fused"),
+    ("R2-Gaussian", "R2-Gaussian", "R2-Gaussian w/ ST", "R2-Gaussian"),
+    ("PhyRadGS, 8 × 5 (the paper's)", "PhyRadGS w/o ST", "PhyRadGS", "PhyRadGS w/o ST"),
+    ("PhyRadGS, exact in time", "PhyRadGS w/o ST", "PhyRadGS exact in time", "PhyRadGS w/o ST"),
+)
+Row = dict[str, str]
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def lines_of(name: str) -> list[dict[str, Any]]:
+    """The lines of a JSONL file in docs/results."""
+    return [json.loads(line) for line in (RESULTS / name).read_text(encoding="utf-8").splitlines()]
+
+
+def rows_of(name: str) -> dict[tuple[str, str, str], Row]:
+    """The rows of a benchmark's CSV by protocol, row and acquisition."""
+    with open(RESULTS / name, encoding="utf-8") as file:
+        return {(row["protocol"], row["row"], row["acquisition"]): row for row in csv.DictReader(file)}
+
+
+def quality(name: str, protocol: str) -> str:
+    """PSNR and SSIM of every method: motion ignored, motion known, and of a scan that stops for each projection."""
+    rows = rows_of(name)
+    text = []
+    for label, ignored, known, still in METHODS:
+        cells = [rows.get((protocol, ignored, "fly-scan")), rows.get((protocol, known, "fly-scan"))]
+        if cells[1] is None:
+            continue
+        comparable = cells[0] is not None and cells[0]["volumes"] == cells[1]["volumes"]
+        gain = f"{number(cells[1]) - number(cells[0]):+.2f}" if comparable else "–"
+        bound = rows.get((protocol, still, "stop-and-shoot"))
+        seconds = " / ".join(seconds_of(cell) for cell in cells)
+        text.append([label, *(both(cell) for cell in cells), gain, both(bound), seconds])
+    heads = ["method", "motion ignored", "motion known", "gain", "stop-and-shoot", "processor s ignored / known"]
+    return markdown(heads, text)
+
+
+def number(row: Row, name: str = "psnr_db") -> float:
+    """A number of a CSV's row."""
+    return float(row[name])
+
+
+def both(row: Row | None) -> str:
+    """PSNR and SSIM as the pages print them, with the spread of the PSNR over seeds where there is one."""
+    if row is None:
+        return "–"
+    few = f" ({row['volumes']} volumes)" if row["volumes"] == "2" and row["size"] == "M" else ""
+    spread = f" ± {float(row['psnr_db_spread']):.2f}" if row["psnr_db_spread"] else ""
+    return f"{number(row):.2f}{spread} / {number(row, 'ssim'):.3f}{few}"
+
+
+def seconds_of(row: Row | None) -> str:
+    """Processor seconds of a row."""
+    return f"{float(row['processor_s']):.0f}" if row is not None and row["processor_s"] else "–"
+
+
+def strips() -> str:
+    """Table 2 of the paper: PhyRadGS over strips and sub-intervals."""
+    rows = [row for key, row in rows_of("table2_S.csv").items() if key[0] == "rapid" and key[2] == "fly-scan"]
+    names = {"PhyRadGS w/o ST": "static"}
+    cells = [
+        [names.get(row["row"], row["row"]), f"{number(row):.2f}", f"{number(row, 'ssim'):.3f}", row["paper_psnr_db"] or "–"]
+        for row in rows
+    ]
+    return markdown(["strips M, sub-intervals N", "PSNR (dB)", "SSIM", "the paper's PSNR"], cells)
+
+
+def phantom() -> str:
+    """The paper's sphere phantom: PSNR, shape and density of its beads."""
+    rows = rows_of("phantom_M.csv")
+    text = []
+    for label, ignored, known, still in METHODS:
+        for kind, name in (("ignored", ignored), ("known", known)):
+            row = rows.get(("rapid", name, "fly-scan"))
+            if row is None or (label.startswith("PhyRadGS, exact") and kind == "ignored"):
+                continue
+            bound = rows.get(("rapid", still, "stop-and-shoot"))
+            shape = [f"{100 * number(row, 'roundness'):.1f}", f"{number(row, 'centre_shift_mm'):.2f}"]
+            shape += [f"{number(row, 'edge_rise_mm'):.2f}", f"{100 * number(row, 'bias_balls'):.1f}"]
+            pseudo = f"{number(row, 'psnr_db_pseudo'):.2f}"
+            last = f"{number(bound):.2f}" if bound is not None else "–"
+            text.append([label, kind, pseudo, row["paper_psnr_db"] or "–", f"{number(row):.2f}", *shape, last])
+    heads = ["method", "motion", "PSNR to pseudo-truth", "the paper's", "PSNR to truth", "out of round, %", "shift, mm"]
+    return markdown([*heads, "rise, mm", "bias, %", "stop-and-shoot, to truth"], text)
+
+
+def motion_models() -> str:
+    """Whole reconstructions by the motion models of the splats."""
+    lines = [line for line in lines_of("motion_models_pruned.jsonl") if line["size"] == 64 and line["iterations"] == 3000]
+    found: dict[str, dict[str, Any]] = {}
+    for line in lines:
+        found.setdefault(line["volume"], {})[line["motion"]] = line
+    models = ["static", "8x5", "exact 0.005"]
+    whole = {volume: by for volume, by in sorted(found.items()) if all(model in by for model in models)}
+    text = [
+        [volume, *(f"{by[model]['psnr_db']:.2f} / {by[model]['ssim']:.3f}" for model in models)]
+        for volume, by in whole.items()
+    ]
+    means = [[mean(by[model][key] for by in whole.values()) for key in ("psnr_db", "ssim")] for model in models]
+    text.append([f"**mean of {len(whole)}**", *(f"{psnr:.2f} / {ssim:.3f}" for psnr, ssim in means)])
+    return markdown(["PSNR in dB / SSIM", "static", "8 × 5", "exact, bound 0.005"], text)
+
+
+def detector_models() -> str:
+    """What modelling an effect of the detector gives each method: modelled PSNR, and the gain over ignoring it."""
+    lines = lines_of("detector_models.jsonl")
+    methods = list(dict.fromkeys(line["method"] for line in lines))
+    effects = list(dict.fromkeys(line["effect"] for line in lines))
+    cell = {(line["effect"], line["method"]): line for line in lines}
+    text = []
+    for effect in effects:
+        of_effect = [cell.get((effect, method)) for method in methods]
+        shown = [f"{x['modelled_db']:.1f} ({x['modelled_db'] - x['ignored_db']:+.2f})" if x else "" for x in of_effect]
+        text.append([effect, *shown])
+    return markdown(["effect", *methods], text)
+
+
+def sweep(name: str, held_out: bool) -> str:
+    """PSNR with the default of an option, with the best one factor for all volumes, and with each volume's own best."""
+    scans: dict[tuple[Any, ...], dict[str, dict[float, dict[str, Any]]]] = {}
+    for line in lines_of(name):
+        key = (line["kind"], line["views"], int(line["dose"]), line["size"], line["pixels"])
+        scans.setdefault(key, {}).setdefault(line["volume"], {})[line["factor"]] = line
+    text = []
+    for (kind, views, dose, size, pixels), volumes in sorted(scans.items()):
+        factors = sorted(set.union(*(set(by) for by in volumes.values())))
+        volumes = {name: by for name, by in volumes.items() if len(by) == len(factors)}  # a sweep may be half made
+        of_factor = {factor: mean(by[factor]["psnr_db"] for by in volumes.values()) for factor in factors}
+        best = max(of_factor, key=of_factor.__getitem__)
+        own = mean(max(by[factor]["psnr_db"] for factor in factors) for by in volumes.values())
+        cells = [kind, str(views), str(dose), f"{size}³, {pixels}²", str(len(volumes)), f"{of_factor[1.0]:.2f}"]
+        cells += [f"{of_factor[best]:.2f} (×{best:g})", f"{own:.2f}"]
+        if held_out:
+            least = [min(by.values(), key=lambda line: line["holdout_rms"])["psnr_db"] for by in volumes.values()]
+            cells.append(f"{mean(least):.2f}")
+        text.append(cells)
+    heads = ["scan", "views", "photons", "voxels, pixels", "volumes", "default", "best factor for all", "each volume's best"]
+    return markdown([*heads, "least held-out error"] if held_out else heads, text)
+
+
+def beside_rtk() -> str:
+    """FDK, projector and adjoint beside RTK's, on two processors."""
+    text = []
+    for processor, suffix in (("AMD EPYC", ""), ("Intel Xeon", "_intel")):
+        fdk = json.loads((RESULTS / f"rtk_fdk{suffix}.json").read_text())["speed"]
+        rays = json.loads((RESULTS / f"ray_speed{suffix}.json").read_text())["beside_rtk"]
+        cells = [f"{fdk[key]:.3f}" for key in ("seconds", "rtk_seconds")]
+        cells += [f"{fdk[key]:.1f}" for key in ("ratio", "processor_ratio")]
+        text.append([processor, "FDK", *cells])
+        for step, name in (("forward", "forward projection (Joseph)"), ("adjoint", "matched backprojection (Joseph)")):
+            x = rays[step]
+            cells = [f"{x[who]['wall_s']:.3f}" for who in ("ours", "rtk")]
+            cells += [f"{x[f'times_as_fast_{clock}']:.1f}" for clock in ("wall", "processor")]
+            text.append([processor, name, *cells])
+    return markdown(["processor", "operator", "ours, s", "RTK, s", "times as fast", "by processor time"], text)
+
+
+def ray_motions() -> str:
+    """The cost of every motion model in passes of a scanner at rest, on two processors."""
+    files = ("ray_speed.json", "ray_speed_intel.json")
+    by_file = {name: json.loads((RESULTS / name).read_text())["by_motion"] for name in files}
+    text = []
+    for motion in by_file[files[1]]:
+        cells = [motion]
+        for times in by_file.values():
+            for step in ("forward", "adjoint"):
+                passes = times[motion][step]["processor_s"] / times["static"][step]["processor_s"]
+                cells.append(f"{passes:.1f}")
+        text.append(cells)
+    return markdown(["motion", "EPYC: forward", "adjoint", "Xeon: forward", "adjoint"], text)
+
+
+def before_after() -> str:
+    """Methods and splats before and after the fast kernels of fly-scans and inlined built-ins."""
+    text = []
+    for x in lines_of("before_after_intel.jsonl"):
+        (kind,) = {key for key in x["before"] if key != "psnr_db"}
+        unit = "ms an iteration" if kind == "iteration_ms" else "processor s"
+        cells = []
+        for when in ("before", "after"):
+            quality_db = x[when].get("psnr_db")
+            cells.append(f"{x[when][kind]:.1f}" + (f" ({quality_db:.2f} dB)" if quality_db is not None else ""))
+        text.append([x["case"], unit, *cells, f"{x['times_as_fast']:.1f}"])
+    return markdown(["run", "unit", "before", "now", "times as fast"], text)
+
+
+def estimates() -> str:
+    """What ``estimate`` said over what the run then took."""
+    text = []
+    for run in json.loads((RESULTS / "estimates.json").read_text())["runs"]:
+        ratio = run["ratio"]
+        shares = [f"{ratio[key]:.2f}" for key in ("seconds", "host_bytes", "device_bytes")]
+        text.append([run["method"], f"{run['said']['seconds']:.1f}", f"{run['happened']['seconds']:.1f}", *shares])
+    return markdown(["method", "estimate, s", "taken, s", "ratio", "host memory", "device buffers"], text)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "table1_S_rapid": lambda: quality("table1_S.csv", "rapid"),
+    "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
+    "table1_S_columns": lambda: quality("table1_S_columns.csv", "rapid"),
+    "table1_M_rapid": lambda: quality("table1_M.csv", "rapid"),
+    "table1_M_standard": lambda: quality("table1_M.csv", "standard"),
+    "table2_S": strips,
+    "phantom_M": phantom,
+    "motion_models": motion_models,
+    "detector_models": detector_models,
+    "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),
+    "passes": lambda: sweep("passes.jsonl", held_out=True),
+    "beside_rtk": beside_rtk,
+    "ray_motions": ray_motions,
+    "before_after": before_after,
+    "estimates": estimates,
+}
+
+
+def filled(text: str) -> str:
+    """A page with its tables made anew from the data."""
+    return BLOCK.sub(lambda block: block[1] + TABLES[block[2]]() + block[3], text)
+
+
+def main() -> None:
+    differ = []
+    for page in sorted(RESULTS.glob("*.md")):
+        before = page.read_text(encoding="utf-8")
+        after = filled(before)
+        if after != before:
+            differ.append(page.name)
+            if "--check" not in sys.argv:
+                page.write_text(after, encoding="utf-8")
+    print("pages that differ from their data:" if "--check" in sys.argv else "pages written:", ", ".join(differ) or "none")
+    sys.exit(bool(differ) and "--check" in sys.argv)
+
+
+if __name__ == "__main__":
+    main()
