@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
 from phyradgs_cl.acquisition import ConeGeometry
-from phyradgs_cl.drawing import CURVE, EDGE, EXPOSED, RESTING
+from phyradgs_cl.drawing import ACCENT, EDGE, EXPOSED, SAMPLE
 
 GEOMETRY = ConeGeometry(500.0, 800.0, (6, 8), (50.0, 50.0))
 ANGLE_DEG = 30.0
@@ -49,11 +49,11 @@ def _draw_gantry(axes: Axes) -> None:
     axes.add_patch(Circle((0, 0), GEOMETRY.source_to_axis_mm, fill=False, color="0.8"))
     for edge in edges:
         axes.plot(*zip(source, edge, strict=True), color="0.75", lw=0.8)
-    axes.plot(*zip(source, hit, strict=True), color=CURVE, lw=1)
-    axes.plot(*zip(*edges, strict=True), color=RESTING, lw=4, solid_capstyle="butt")
+    axes.plot(*zip(source, hit, strict=True), color=SAMPLE, lw=1)
+    axes.plot(*zip(*edges, strict=True), color=ACCENT, lw=4, solid_capstyle="butt")
     axes.plot(*source, "o", color=EDGE, ms=9)
-    axes.plot(*POINT_MM[:2], "o", color=CURVE, ms=6)
-    axes.plot(*hit, "s", color=CURVE, ms=5)
+    axes.plot(*POINT_MM[:2], "o", color=SAMPLE, ms=6)
+    axes.plot(*hit, "s", color=SAMPLE, ms=5)
     for end, name in (((210, 0), "x"), ((0, 210), "y")):
         _arrow(axes, (0, 0), end, "0.3")
         axes.text(*np.multiply(end, 1.12), name, ha="center", va="center", fontsize=_SMALL, color="0.3")
@@ -67,14 +67,14 @@ def _draw_gantry(axes: Axes) -> None:
     axes.plot([500, 600], [0, 0], color=EDGE, lw=0.8, ls=":")
     axes.text(605, 100, "angle θ > 0:\ncounter-\nclockwise", fontsize=_SMALL, color=EDGE, va="center")
     axes.text(*(source + (0, 45)), "source", ha="center", fontsize=_SMALL, color=EDGE)
-    axes.text(*(POINT_MM[:2] + (-12, 22)), "point", ha="right", fontsize=_SMALL, color=CURVE)
+    axes.text(*(POINT_MM[:2] + (-12, 22)), "point", ha="right", fontsize=_SMALL, color=SAMPLE)
     across, away = step_u / np.linalg.norm(step_u), -source / np.linalg.norm(source)
     place = edges[0] + 45 * away
-    _arrow(axes, place, place + 190 * across, RESTING)
-    axes.text(*(place + 95 * across + 38 * away), "û", ha="center", va="center", fontsize=13, color=RESTING)
+    _arrow(axes, place, place + 190 * across, ACCENT)
+    axes.text(*(place + 95 * across + 38 * away), "û", ha="center", va="center", fontsize=13, color=ACCENT)
     for edge, column, side in ((edges[0], 0, -1), (edges[1], columns - 1, 1)):
         words = f"column {column}"
-        axes.text(*(edge + side * 85 * across + 25 * away), words, ha="center", va="center", fontsize=_SMALL, color=RESTING)
+        axes.text(*(edge + side * 85 * across + 25 * away), words, ha="center", va="center", fontsize=_SMALL, color=ACCENT)
     axes.set(aspect="equal", xlim=(-560, 880), ylim=(-540, 540))
     axes.set_title("the gantry, seen from above", fontsize=_TITLE)
     axes.set_axis_off()
@@ -88,10 +88,10 @@ def _draw_panel(axes: Axes) -> None:
         axes.text(-0.9, row, str(row), ha="center", va="center", fontsize=_SMALL)
     for column in range(columns):
         axes.text(column, -0.95, str(column), ha="center", va="center", fontsize=_SMALL)
-    _arrow(axes, (-1.9, -0.3), (-1.9, 2.2), RESTING)
-    axes.text(-1.9, 2.75, "v̂ = z", ha="center", va="center", fontsize=13, color=RESTING)
-    _arrow(axes, (-0.3, -1.8), (2.2, -1.8), RESTING)
-    axes.text(2.5, -1.8, "û", ha="left", va="center", fontsize=13, color=RESTING)
+    _arrow(axes, (-1.9, -0.3), (-1.9, 2.2), ACCENT)
+    axes.text(-1.9, 2.75, "v̂ = z", ha="center", va="center", fontsize=13, color=ACCENT)
+    _arrow(axes, (-0.3, -1.8), (2.2, -1.8), ACCENT)
+    axes.text(2.5, -1.8, "û", ha="left", va="center", fontsize=13, color=ACCENT)
     for place, first, last, words in (
         (columns + 0.1, -0.3, rows - 0.7, "direction 1: row 0 first"),
         (columns + 1.3, rows - 0.7, -0.3, f"direction −1: row {rows - 1} first"),
@@ -115,7 +115,7 @@ def _draw_file(axes: Axes) -> None:
         axes.text(column, rows - 0.1, str(column), ha="center", va="center", fontsize=_SMALL)
     axes.set(aspect="equal", xlim=(-1.3, columns - 0.3), ylim=(-2.3, rows + 0.3))
     words = f"row {stored[0]} of the file is\nrow {rows} − 1 − {stored[0]} = {marked[0]} of the frame"
-    axes.text((columns - 1) / 2, -1.5, words, ha="center", va="center", fontsize=_SMALL, color=CURVE)
+    axes.text((columns - 1) / 2, -1.5, words, ha="center", va="center", fontsize=_SMALL, color=SAMPLE)
     axes.set_title("its TIFF, row 0 on top:\nimage[row, column]", fontsize=_TITLE)
     axes.set_axis_off()
 
@@ -124,7 +124,7 @@ def _draw_pixels(axes: Axes, marked: tuple[int, int], words: dict[tuple[int, int
     """Draws all pixels, row 0 below; ``marked`` is the shadow, ``words`` stand in the pixels (row, column)."""
     rows, columns = GEOMETRY.detector_shape
     for row, column in np.ndindex(rows, columns):
-        face = CURVE if (row, column) == marked else EXPOSED if (row, column) in words else "white"
+        face = SAMPLE if (row, column) == marked else EXPOSED if (row, column) in words else "white"
         axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=face, edgecolor="0.6", lw=0.7))
     for (row, column), text in words.items():
         ink = "white" if (row, column) == marked else "black"

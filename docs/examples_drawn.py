@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.api import calibrate, reconstruct, simulate
 from phyradgs_cl.calibrate.moved import Change, moved
 from phyradgs_cl.check import check
-from phyradgs_cl.drawing import CURVE
+from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.runtime import Runtime
 
@@ -48,7 +48,7 @@ def check_figure(size: int = 48) -> Figure:
         _draw_slice(each, reconstruct(scan).volume, right, title)
     _draw_slice(axes[-1], right.reference, right, "truth")
     (line,) = (one for one in found.findings if one.question == "centre of rotation")
-    figure.suptitle(f"{line.verdict}: {line.question}: {line.text}", fontsize=_SMALL, color=CURVE)
+    figure.suptitle(f"{line.verdict}: {line.question}: {line.text}", fontsize=_SMALL, color=SAMPLE)
     return figure
 
 

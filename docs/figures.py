@@ -28,9 +28,7 @@ from matplotlib.patches import Arc, Polygon
 from phyradgs_cl.acquisition import ConeGeometry, TimeCells, make_protocol
 from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.api import reconstruct, simulate
-from phyradgs_cl.drawing import CURVE as SAMPLE
-from phyradgs_cl.drawing import EDGE, EXPOSED
-from phyradgs_cl.drawing import RESTING as FROZEN
+from phyradgs_cl.drawing import ACCENT, EDGE, EXPOSED, SAMPLE
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.phantoms import shepp_logan
@@ -71,8 +69,8 @@ def shutter_figure() -> None:
     discrete.set_title(f"micro-views: {strips} strips × {sub_intervals} sub-intervals", fontsize=10)
     for axes in (continuous, discrete):
         middle = (exposure + readout) / 2
-        axes.axvline(middle, color=FROZEN, lw=1.2, ls="--")
-        axes.text(middle, 1.2, "static: mid-window", ha="center", fontsize=8, color=FROZEN)
+        axes.axvline(middle, color=ACCENT, lw=1.2, ls="--")
+        axes.text(middle, 1.2, "static: mid-window", ha="center", fontsize=8, color=ACCENT)
         axes.set(xlim=(-0.1, 2.0), ylim=(-0.22, 1.3), xlabel="time (exposures)", yticks=[0, 1])
         axes.set_yticklabels(["first line", "last line"])
         axes.spines[["top", "right"]].set_visible(False)
@@ -90,10 +88,10 @@ def _draw_orbit(axes: Axes) -> None:
         source, panel = radial, -0.45 * radial
         for side in (-1, 1):
             edge = panel + side * 0.5 * across
-            axes.plot([source[0], edge[0]], [source[1], edge[1]], color=FROZEN, lw=0.6, alpha=alpha)
+            axes.plot([source[0], edge[0]], [source[1], edge[1]], color=ACCENT, lw=0.6, alpha=alpha)
         ends = np.stack([panel - 0.5 * across, panel + 0.5 * across])
-        axes.plot(ends[:, 0], ends[:, 1], color=FROZEN, lw=3, alpha=alpha)
-        axes.plot(*source, "o", color=FROZEN, ms=6, alpha=alpha)
+        axes.plot(ends[:, 0], ends[:, 1], color=ACCENT, lw=3, alpha=alpha)
+        axes.plot(*source, "o", color=ACCENT, ms=6, alpha=alpha)
     body = 0.25 * np.stack([np.cos(turn), np.sin(turn)], -1)
     axes.add_patch(Polygon(body, facecolor="0.85", edgecolor="0.5"))
     axes.text(0, 0, "object", ha="center", va="center", fontsize=8)
@@ -136,12 +134,12 @@ def splat_figure() -> None:
     value, error = figure.subplots(1, 2)
     value.plot(u_mm, truth, color="0.6", lw=4, label="quadrature")
     value.plot(u_mm, exact, color=SAMPLE, lw=1.2, label="exact splat")
-    value.plot(u_mm, affine, color=FROZEN, lw=1.2, ls="--", label="affine splat")
+    value.plot(u_mm, affine, color=ACCENT, lw=1.2, ls="--", label="affine splat")
     value.set(xlabel="detector column (mm)", title="line integral")
     value.legend(fontsize=8)
     percent = 100 / truth.max()
     error.plot(u_mm, percent * (exact - truth), color=SAMPLE, lw=1.2)
-    error.plot(u_mm, percent * (affine - truth), color=FROZEN, lw=1.2, ls="--")
+    error.plot(u_mm, percent * (affine - truth), color=ACCENT, lw=1.2, ls="--")
     error.set(xlabel="detector column (mm)", title="error (% of the peak)")
     for axes in (value, error):
         axes.title.set_fontsize(10)
@@ -189,7 +187,7 @@ def sampling_figure() -> None:
     static = error(static_cells(*where))
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.axhline(static, color=FROZEN, ls="--", lw=1, label="static, mid-window")
+    axes.axhline(static, color=ACCENT, ls="--", lw=1, label="static, mid-window")
     for (m, values), tone in zip(strips.items(), ("#d9a520", "#c07c12", "#8a5a0a"), strict=True):
         axes.plot(samples[:7], values, ".-", color=tone, lw=1, label=f"micro-views, M = {m}")
     axes.plot(samples, per_line, ".-", color=SAMPLE, lw=1.2, label="every line at its own times")

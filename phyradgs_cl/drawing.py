@@ -1,4 +1,4 @@
-"""What figures share: images with a scale bar, colours, and a figure that terminals and notebooks both show.
+"""The parts that all figures share, of notebooks, reports and the documentation: colours, axes, curves, images.
 
 matplotlib is imported when something is drawn.
 """
@@ -6,6 +6,7 @@ matplotlib is imported when something is drawn.
 import importlib
 import math
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +16,26 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-EXPOSED, EDGE, CURVE, RESTING = "#f3d37a", "#8a6d1a", "#b3261e", "#2b5c8a"
-_BAR = 0.3  # of a picture's width, at most
+# On the page of a report each colour is a variable of this name, which a dark page changes.
+COLOURS = {
+    "ink": "#1b2430",
+    "soft": "#5a6675",
+    "faint": "#e9ecf0",
+    "accent": "#1f5fa8",
+    "lit": "#f0cf74",
+    "edge": "#86681a",
+    "sample": "#b3261e",
+    "volume": "#dfe5ec",
+}
+INK, SOFT, FAINT, ACCENT, EXPOSED, EDGE, SAMPLE, BOX = COLOURS.values()
+_LONGEST_BAR = 0.3  # of a picture's width
+_LOG_RATIO = 20.0  # largest over smallest value, above which an axis is logarithmic
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":
-    """An empty figure: pyplot's where somebody has imported that, so that ``show()`` finds it; else one by itself."""
+    """Returns an empty figure. It is pyplot's where pyplot is imported, so that ``show()`` finds it."""
     if "ipykernel" in sys.modules:
-        with suppress(ImportError):  # a cell shows what it ends with, once
+        with suppress(ImportError):  # a cell shows the figure that it ends with, once
             importlib.import_module("matplotlib_inline.backend_inline")
     elif "matplotlib.pyplot" in sys.modules:
         return sys.modules["matplotlib.pyplot"].figure(figsize=(width_inch, height_inch), layout="constrained")
@@ -31,12 +44,31 @@ def new_figure(width_inch: float, height_inch: float) -> "Figure":
     return Figure(figsize=(width_inch, height_inch), layout="constrained")
 
 
+def style_axes(axes: "Axes", x_label: str, y_label: str) -> None:
+    """Labels the axes, and draws two of the four sides and light lines across."""
+    axes.set_xlabel(x_label, color=INK)
+    axes.set_ylabel(y_label, color=INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(SOFT)
+    axes.tick_params(color=SOFT, labelcolor=SOFT, labelsize="small")
+    axes.grid(axis="y", color=FAINT)
+    axes.set_axisbelow(True)
+
+
+def draw_curve(axes: "Axes", x: Sequence[float], y: Sequence[float], x_label: str, y_label: str) -> None:
+    """Draws a curve; the vertical axis is logarithmic where positive values differ by more than a factor of 20."""
+    axes.plot(x, y, color=ACCENT, lw=1.8)
+    if 0 < _LOG_RATIO * min(y) < max(y):
+        axes.set_yscale("log")
+    style_axes(axes, x_label, y_label)
+
+
 def draw_image(
     axes: "Axes", image: np.ndarray, title: str, *, size_mm: tuple[float, float] | None = None, **how: Any
 ) -> None:
-    """An image (rows, columns), row 0 below, with a bar of its values, and of its length where ``size_mm`` (v, u) is known.
+    """Draws an image (rows, columns), row 0 at the bottom, with a colour bar.
 
-    how: as of ``imshow``.
+    size_mm: height and width, for a scale bar. how: further arguments of ``imshow``.
     """
     rows, columns = image.shape
     height, width = (rows, columns) if size_mm is None else size_mm
@@ -44,15 +76,15 @@ def draw_image(
     axes.set_title(title, fontsize=9)
     axes.set_axis_off()
     if size_mm is not None:
-        bar_mm = round_length(_BAR * width)
+        bar_mm = round_length(_LONGEST_BAR * width)
         left, bottom = 0.04 * width, 0.04 * height
-        axes.plot([left, left + bar_mm], [bottom, bottom], color=CURVE, lw=2, solid_capstyle="butt")
-        axes.text(left, bottom + 0.02 * height, f"{bar_mm:g} mm", color=CURVE, fontsize=8, va="bottom")
+        axes.plot([left, left + bar_mm], [bottom, bottom], color=SAMPLE, lw=2, solid_capstyle="butt")
+        axes.text(left, bottom + 0.02 * height, f"{bar_mm:g} mm", color=SAMPLE, fontsize=8, va="bottom")
     if axes.figure is not None:
         axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
 
 
 def round_length(most: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten up to ``most``."""
+    """Returns the largest 1, 2 or 5 times a power of ten up to ``most``."""
     power = 10.0 ** math.floor(math.log10(most))
     return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))

@@ -1,4 +1,4 @@
-"""A frame of a scan, and when its lines are open."""
+"""Figures of a scan: a frame, and the exposure windows of its lines."""
 
 from typing import TYPE_CHECKING
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.shutter import Shutter
-from phyradgs_cl.drawing import CURVE, EDGE, EXPOSED, RESTING, draw_image, new_figure
+from phyradgs_cl.drawing import ACCENT, EDGE, EXPOSED, FAINT, SAMPLE, SOFT, draw_image, new_figure, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -14,56 +14,55 @@ if TYPE_CHECKING:
 
     from phyradgs_cl.acquisition.scan import Scan
 
+_MOST_CORNERS = 129  # of a side of a window
+
 
 def plot_frame(scan: "Scan", frame: int) -> "Figure":
-    """One frame (rows, columns) of line integrals in mm on the panel, and the windows of its lines in s."""
+    """Returns a figure of one frame (rows, columns) of line integrals, in mm on the panel, and its exposure windows in s."""
     checks.whole("frame", frame, 0, scan.frames - 1)
     figure = new_figure(10, 4.2)
     picture, windows = figure.subplots(1, 2, width_ratios=(1, 1.1))
     image = scan.projections[frame].astype(np.float64)
     image[~scan.valid[frame]] = np.nan
-    size_mm = tuple(
-        n * d for n, d in zip(scan.geometry.detector_shape, scan.geometry.pixel_size_mm, strict=True)
-    )
-    draw_image(
-        picture,
-        image,
-        f"frame {frame} of {scan.frames}: line integrals",
-        size_mm=(size_mm[0], size_mm[1]),
-        cmap="gray",
-    )
-    if scan.is_fly:
-        draw_windows(windows, scan.shutter, scan.lines)
-        turn = _turned_deg(scan, frame)
-        windows.set_title(f"gantry from {turn[0]:.1f}° to {turn[1]:.1f}°", fontsize=9)
-    else:
+    rows, columns = scan.geometry.detector_shape
+    dv_mm, du_mm = scan.geometry.pixel_size_mm
+    title = f"frame {frame} of {scan.frames}: line integrals"
+    draw_image(picture, image, title, size_mm=(rows * dv_mm, columns * du_mm), cmap="gray")
+    if not scan.is_fly:
         windows.set_axis_off()
         windows.text(0.5, 0.5, "the gantry stands still", ha="center", va="center")
+        return figure
+    shutter, middle = scan.shutter, scan.lines // 2
+    draw_windows(windows, shutter, scan.lines)
+    windows.axvline(shutter.middle_s, color=ACCENT, ls="--", lw=1.2, label="motion static: one pose")
+    lit_s = shutter.line_windows_s(scan.lines)[middle]
+    windows.plot(lit_s, [middle, middle], color=SAMPLE, lw=2, label=f"{shutter.axis[:-1]} {middle}")
+    windows.set_ylim(-0.5, scan.lines - 0.5)
+    windows.legend(fontsize=7, loc="upper left" if shutter.direction > 0 else "lower left")
+    first_deg, last_deg = _turned_deg(scan, frame)
+    windows.set_title(f"gantry from {first_deg:.1f}° to {last_deg:.1f}°", fontsize=9)
     return figure
 
 
-def draw_windows(axes: "Axes", shutter: Shutter, lines: int) -> None:
-    """When each of ``lines`` lines opens and closes, in s after the frame's start; what a pulse lights is coloured."""
-    line = np.arange(lines)
-    opening = shutter.delay_s(lines)
-    lit = shutter.line_windows_s(lines)
+def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.0) -> None:
+    """Draws when each of ``lines`` lines opens and closes, and the part of it in which a pulsed beam is on."""
+    line = np.unique(np.linspace(0, lines - 1, _MOST_CORNERS).round().astype(int))
+    lit_s = shutter.line_windows_s(lines)[line] + start_s
     if shutter.pulse_s is not None:
-        axes.fill_betweenx(
-            line, opening, opening + shutter.exposure_s, color="0.88", step="mid", label="open, no beam"
-        )
-    axes.fill_betweenx(
-        line, lit[:, 0], lit[:, 1], facecolor=EXPOSED, edgecolor=EDGE, step="mid", label="exposed"
-    )
-    axes.axvline(shutter.middle_s, color=RESTING, ls="--", lw=1.2, label="motion static: one pose")
-    middle = lines // 2
-    axes.plot(lit[middle], [middle, middle], color=CURVE, lw=2, label=f"{shutter.axis[:-1]} {middle}")
-    axes.set(xlabel="time after the frame's start (s)", ylabel=shutter.axis[:-1], ylim=(-0.5, lines - 0.5))
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=7, loc="upper left" if shutter.direction > 0 else "lower left")
+        open_s = shutter.delay_s(lines)[line] + start_s
+        shape = _outline(open_s, open_s + shutter.exposure_s, line)
+        axes.fill(*shape, facecolor=FAINT, edgecolor=SOFT, ls=":", label="open, no beam")
+    axes.fill(*_outline(lit_s[:, 0], lit_s[:, 1], line), facecolor=EXPOSED, edgecolor=EDGE, alpha=0.8, label="exposed")
+    style_axes(axes, "time after the frame's start (s)", f"detector {shutter.axis[:-1]}")
+
+
+def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the corners (times, lines) of a window between two times per line."""
+    return np.concatenate([first_s, last_s[::-1]]), np.concatenate([line, line[::-1]])
 
 
 def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
-    """The source's azimuth as a frame's first line opens, and as its last one closes."""
+    """Returns the source's azimuth when a frame's first line opens and when its last line closes."""
     times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
     pose = scan.trajectory.pose(frame, times_s)
     first, last = np.rad2deg(np.unwrap(np.arctan2(pose[:, 1], pose[:, 0])))

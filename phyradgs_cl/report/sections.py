@@ -8,9 +8,18 @@ from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnT
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import TOLD
 from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
-from phyradgs_cl.report.charts.curve import convergence_charts, histogram, tuning_chart, views_chart
-from phyradgs_cl.report.charts.geometry import orbit_drawing, side_drawing
-from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing, shutter_words
+from phyradgs_cl.report.charts import (
+    Chart,
+    convergence_charts,
+    frames_chart,
+    histogram,
+    orbit_chart,
+    shutter_chart,
+    shutter_words,
+    side_chart,
+    tuning_chart,
+    views_chart,
+)
 from phyradgs_cl.report.facts import flattened, label, number, shown, unit
 from phyradgs_cl.report.markup import Markup, element, joined
 from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
@@ -91,7 +100,7 @@ def geometry_section(scan: Scan) -> Markup:
     arc = ", and the arc through which it moves in the first; grey, the panel at the arc's end"
     above = f"From above: where the source stands in the middle of every frame{arc if scan.is_fly else ''}."
     side = "From the side: the cone of the first frame."
-    return _section("geometry", "Geometry", _charts([(above, orbit_drawing(scan)), (side, side_drawing(scan))]))
+    return _section("geometry", "Geometry", _charts([(above, orbit_chart(scan)), (side, side_chart(scan))]))
 
 
 def shutter_section(run: Run, scan: Scan) -> Markup | None:
@@ -104,9 +113,9 @@ def shutter_section(run: Run, scan: Scan) -> Markup | None:
     if run.motion is not None:
         one += f" {_motion_words(run.motion)}"
     several = "The first frames on one axis of time."
-    charts = [(one, shutter_drawing(scan, run.motion))]
+    charts = [(one, shutter_chart(scan, run.motion))]
     if scan.is_fly:
-        charts.append((several, frames_drawing(scan)))
+        charts.append((several, frames_chart(scan)))
     return _section("shutter", "Shutter in space and time", _charts(charts))
 
 
@@ -269,7 +278,7 @@ def _motion_words(motion: Motion) -> str:
     return f"The run's motion is {motion_facts(motion)['name']}: {words}."
 
 
-def _charts(charts: Iterable[tuple[str, Markup]]) -> Markup:
+def _charts(charts: Iterable[Chart]) -> Markup:
     figures = [element("figure", drawing, element("figcaption", words)) for words, drawing in charts]
     return element("div", *figures, class_="charts")
 

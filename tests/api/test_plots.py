@@ -32,7 +32,7 @@ def test_a_frame_has_its_picture_its_windows_and_its_arc(scan) -> None:
     said = {text.get_text() for axes in figure.axes for text in axes.texts}
     assert "1 mm" in said  # the bar of a panel of 4 mm
     windows = figure.axes[1]
-    assert windows.get_xlabel() == "time after the frame's start (s)" and windows.get_ylabel() == "row"
+    assert windows.get_xlabel() == "time after the frame's start (s)" and windows.get_ylabel() == "detector row"
     low, high = windows.dataLim.intervalx
     assert (low, high) == pytest.approx((0.0, 1.86))
     still = replace(scan, is_fly=False).plot()

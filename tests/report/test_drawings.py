@@ -1,29 +1,29 @@
-"""Geometry, shutter and curves: drawn where they are, for every kind of scan."""
+"""Charts of geometry, shutter and curves: what they draw, for every kind of scan."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 
 from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
 from phyradgs_cl.acquisition.motion import MODELS
-from phyradgs_cl.report.charts.axes import Axes, decades, ticks
-from phyradgs_cl.report.charts.curve import convergence_charts, tuning_chart
-from phyradgs_cl.report.charts.geometry import orbit_drawing, panel_corners, side_drawing
-from phyradgs_cl.report.charts.shutter import frames_drawing, shutter_drawing
+from phyradgs_cl.drawing import SAMPLE
+from phyradgs_cl.report import charts
 
 
-def shapes(svg: str, tag: str, class_: str) -> list[np.ndarray]:
-    """Points (N, 2) of the polylines or polygons of a class."""
-    found = re.findall(rf'<{tag} points="([^"]*)" class="{class_}"', svg)
-    return [np.array([[float(v) for v in p.split(",")] for p in points.split()]) for points in found]
+def drawn(draw: Callable[..., None], *arguments: object) -> Axes:
+    axes = Figure().add_subplot()
+    draw(axes, *arguments)
+    return axes
 
 
-def dots(svg: str, class_: str) -> np.ndarray:
-    """Centres (N, 2) of the circles of a class."""
-    found = re.findall(rf'<circle cx="([\d.-]+)" cy="([\d.-]+)" r="[\d.]+" class="{class_}"', svg)
-    return np.array(found, float).reshape(-1, 2)
+def outlines(axes: Axes) -> list[np.ndarray]:
+    return [patch.get_xy() for patch in axes.patches if isinstance(patch, Polygon)]
 
 
 @pytest.fixture(scope="module")
@@ -45,72 +45,65 @@ def kinds(scan_maker, small_scan) -> dict[str, object]:
 
 def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds) -> None:
     for name, scan in kinds.items():
-        drawings = [frames_drawing(scan), orbit_drawing(scan), side_drawing(scan)]
-        for drawing in (*drawings, *(shutter_drawing(scan, model()) for model in MODELS)):
-            assert "nan" not in drawing and "inf" not in drawing, name
+        drawings = [charts.frames_chart(scan), charts.orbit_chart(scan), charts.side_chart(scan)]
+        models = MODELS if name in ("fly", "still") else [MicroViews]
+        for drawing in (*drawings, *(charts.shutter_chart(scan, model()) for model in models)):
+            assert drawing.startswith("<svg") and "nan" not in drawing and "inf" not in drawing, name
+
+
+def test_a_chart_is_of_its_page(small_scan) -> None:
+    """It names itself, loads nothing, has the page's colours, and shares no name with another chart."""
+    first, second = charts.orbit_chart(small_scan), charts.side_chart(small_scan)
+    assert 'aria-label="Geometry from above. 8 source positions' in first and 'role="img"' in first
+    for svg in (first, second):
+        assert not re.search(r"http|<style|url\(|#[0-9a-f]{6}\b", svg)
+        names, uses = re.findall(r' id="(\w+)"', svg), re.findall(r'href="#(\w+)"', svg)
+        assert set(uses) == set(names) and len(names) == len(set(names))
+    assert not set(re.findall(r' id="(\w+)"', first)) & set(re.findall(r' id="(\w+)"', second))
+    hostile = charts.chart(lambda axes: axes.set_xlabel("</svg><script>$\\frac$"), "<b>", '"')
+    assert "<script" not in hostile and "$\\frac$" in hostile and "<b>" not in hostile
 
 
 def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(kinds, small_scan) -> None:
-    (outline,) = shapes(shutter_drawing(small_scan, None), "polygon", "lit")
-    lowest, highest = outline[np.isclose(outline[:, 1], outline[:, 1].max())], outline[outline[:, 1].argmin()]
-    span = np.ptp(outline[:, 0])
-    assert np.ptp(lowest[:, 0]) / span == pytest.approx(1 / 1.86, abs=0.01)
-    assert highest[0] > lowest[:, 0].min()  # later lines open later
-    svg = shutter_drawing(kinds["pulsed"], None)
-    (lit,), (opened,) = shapes(svg, "polygon", "lit"), shapes(svg, "polygon", "open")
+    (outline,) = outlines(drawn(charts.draw_shutter, small_scan, None))
+    lowest, highest = outline[outline[:, 1] == 0], outline[outline[:, 1] == outline[:, 1].max()]
+    shutter = small_scan.shutter
+    assert np.ptp(lowest[:, 0]) == pytest.approx(shutter.exposure_s) == pytest.approx(np.ptp(highest[:, 0]))
+    assert highest[:, 0].max() - lowest[:, 0].min() == pytest.approx(shutter.span_s)
+    opened, lit = outlines(drawn(charts.draw_shutter, kinds["pulsed"], None))
     assert np.ptp(lit[:, 0]) < 0.2 * np.ptp(opened[:, 0])
 
 
 def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
     motion = MicroViews(strips=4, sub_intervals=3)
-    svg = shutter_drawing(small_scan, motion)
-    drawn, (outline,) = dots(svg, "sample"), shapes(svg, "polygon", "lit")
-    cells = motion.cells(small_scan, 0)
-    share = (drawn[:, 0] - outline[:, 0].min()) / np.ptp(outline[:, 0])
-    expected = (cells.time_s - small_scan.frame_start_s[0]) / small_scan.shutter.span_s
-    assert len(drawn) == 12 and np.allclose(share, expected, atol=0.01)
+    lines = drawn(charts.draw_shutter, small_scan, motion).lines
+    (dots,) = [line.get_xydata() for line in lines if line.get_color() == SAMPLE]
+    expected = motion.cells(small_scan, 0).time_s - small_scan.frame_start_s[0]
+    assert len(dots) == 12 and np.allclose(dots[:, 0], expected)
 
 
-def test_the_orbit_is_to_scale(small_scan) -> None:
-    svg = orbit_drawing(small_scan)
-    frames, (box,) = dots(svg, "frame"), shapes(svg, "polygon", "volume")
-    centre = box.mean(axis=0)
-    radii = np.linalg.norm(frames - centre, axis=1)
-    assert np.allclose(radii / np.ptp(box[:, 0]), 5.0 / 2.0, rtol=0.01)
-    first = dots(svg, "source")[0] - centre  # at angle 0 the source lies to the right
-    assert first[0] > 0 and abs(first[1]) < 1
-
-
-def test_the_panel_ends_half_a_pixel_beyond_its_outer_pixels(small_scan) -> None:
-    pose = small_scan.geometry.pose(0.0)
-    corners = panel_corners(pose, small_scan.geometry.detector_shape)
+def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_its_pixels(small_scan) -> None:
+    positions = charts.source_positions(small_scan)[:, :3]
+    assert np.allclose(np.linalg.norm(positions, axis=1), 5.0) and len(positions) == 8
+    corners = charts.panel_corners(small_scan.geometry.pose(0.0), small_scan.geometry.detector_shape)
     assert np.allclose(corners.mean(axis=0), [-2, 0, 0])
     assert np.allclose(np.ptp(corners, axis=0), [0, 14 * 0.25, 16 * 0.25])
 
 
 def test_a_record_becomes_a_chart_for_each_quantity_that_changes() -> None:
     record = [{"iteration": k, "loss": 1.0 / k, "gaussians": 5.0, "seconds": k} for k in range(1, 2001)]
-    (chart,) = convergence_charts(record)
-    assert chart[0] == "Loss: from 1 to 0.0005 at iteration 2000."
-    (curve,) = shapes(chart[1], "polyline", "curve")
-    assert len(curve) < 700 and np.all(np.diff(curve[:, 0]) >= 0)
-    assert not convergence_charts([]) and not convergence_charts([{"loss": 1.0}])
+    (chart,) = charts.convergence_charts(record)
+    assert chart[0] == "Loss: from 1 to 0.0005 at iteration 2000." and ">0.0005</text>" in chart[1]
+    axes = drawn(charts.draw_convergence, [(line["iteration"], line["loss"]) for line in record], "loss")
+    assert axes.get_yscale() == "log" and len(axes.lines[0].get_xydata()) == 2000
+    assert not charts.convergence_charts([]) and not charts.convergence_charts([{"loss": 1.0}])
 
 
 def test_what_was_tuned_is_drawn_with_the_choice_on_the_curve() -> None:
-    found = {"option": "tv_weight", "chosen": 0.002, "values": [0.001, 0.004, 0.016], "holdout_rms": [3.0, 2.0, 4.0]}
-    caption, drawing = tuning_chart(found)
+    tuned = {"option": "tv_weight", "chosen": 0.002, "values": [0.001, 0.004, 0.016], "holdout_rms": [3.0, 2.0, 4.0]}
+    caption, drawing = charts.tuning_chart(tuned)
     assert "tv_weight: 0.002" in caption and "nan" not in drawing
-    (curve,), marks = shapes(drawing, "polyline", "curve"), dots(drawing, "mark")
-    assert curve[1, 0] == pytest.approx(curve[[0, 2], 0].mean(), abs=0.1)  # values by their ratio
-    assert np.allclose(marks[-1], curve[:2].mean(axis=0), atol=0.1) and len(marks) == 4
-    by_number = tuning_chart({**found, "chosen": 0.004, "values": [0.0, 0.004, 0.016]})[1]
-    assert "nan" not in by_number and shapes(by_number, "polyline", "curve")[0][1, 0] < curve[1, 0]
-
-
-def test_ticks_are_round_and_inside() -> None:
-    assert list(ticks(0, 1)) == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1.0])
-    assert list(ticks(3, 3)) == [3]
-    assert list(decades(0.02, 3)) == pytest.approx([0.02, 0.05, 0.1, 0.2, 0.5, 1, 2])
-    heights = [Axes((0, 1), (1, 100), log=True).at(0, y)[1] for y in (1, 10, 100)]
-    assert heights[1] == pytest.approx((heights[0] + heights[2]) / 2)
+    axes = drawn(charts.draw_tuning, tuned)
+    assert axes.get_xscale() == "log" and axes.lines[-1].get_xydata()[0] == pytest.approx([0.002, 2.5])
+    from_zero = drawn(charts.draw_tuning, {**tuned, "chosen": 0.004, "values": [0.0, 0.004, 0.016]})
+    assert from_zero.get_xscale() == "linear" and from_zero.lines[-1].get_xydata()[0] == pytest.approx([0.004, 2.0])

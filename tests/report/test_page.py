@@ -62,7 +62,7 @@ def test_a_page_is_whole_and_asks_nothing_of_the_world(page, page_text) -> None:
         assert control["id"] in labelled or control["type"] == "radio"  # radio buttons lie in their labels
     assert all(svg["role"] == "img" and svg["aria-label"] for svg in page.all("svg"))
     assert all(i["alt"] and i["src"].startswith("data:image/png;base64,") for i in page.all("img"))
-    assert not page.all("link") and not re.findall(r"https?://[^\s\"'<]*|@import|url\(", page_text)
+    assert not page.all("link") and not re.findall(r"https?://[^\s\"'<]*|@import|url\((?!#)", page_text)
     policy = next(m["content"] for m in page.all("meta") if "http-equiv" in m)
     digest = base64.b64encode(hashlib.sha256(page.texts["script"][-1].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy
@@ -78,10 +78,6 @@ def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
         f"Residual: from {residuals[0]:.4g} to {residuals[-1]:.4g} at iteration 3",
     ):
         assert told in page.words
-    curve = next(p for p in page.all("polyline") if p.get("class") == "curve")
-    heights = [float(point.split(",")[1]) for point in curve["points"].split()]
-    drops = np.diff(heights[:3]) / -np.diff(residuals)
-    assert np.allclose(drops, drops[0], rtol=0.02)  # one scale for all points
 
 
 def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse) -> None:
