@@ -75,10 +75,9 @@ class Commands(TyperGroup):
     def invoke(self, ctx: Any) -> object:
         try:
             return super().invoke(ctx)
-        except signals.InterruptedAfterwards:
-            raise Interrupted(signals.COMPLETE) from None
-        except KeyboardInterrupt:
-            raise Interrupted(signals.farewell) from None
+        except KeyboardInterrupt as error:
+            is_complete = isinstance(error, signals.InterruptedAfterwards)
+            raise Interrupted(signals.COMPLETE if is_complete else signals.farewell()) from None
 
 
 app = typer.Typer(
@@ -110,9 +109,13 @@ def root(
 
 def run(arguments: list[str], program: typer.Typer = app) -> int:
     """Runs one command of ``program``; the exit status."""
-    signals.start_afresh()
     if not takes_part(arguments):
         return 0
+    with signals.answer_signals():
+        return _run(arguments, program)
+
+
+def _run(arguments: list[str], program: typer.Typer) -> int:
     try:
         with naming_host_memory():
             status = program(arguments, standalone_mode=False)
@@ -130,6 +133,6 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
         give_up_stdout()
         return 0
     except Interrupted as interrupted:
-        return complain(str(interrupted), signals.status())
+        return complain(str(interrupted), signals.exit_status())
     except (KeyboardInterrupt, typer.Abort):
-        return complain(signals.farewell, signals.status())
+        return complain(signals.farewell(), signals.exit_status())

@@ -1,23 +1,15 @@
-"""Entry point: answers signals, loads the command line (cli.py, inside the package or beside it) and runs it."""
+"""Entry point: loads the command line (cli.py, inside the package or beside it) and runs it."""
 
+import importlib.util
+import signal
 import sys
+from types import ModuleType
 
-from phyradgs_cl import signals
-
-if __name__ == "__main__":
-    signals.take_over()  # before anything that takes time
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from types import ModuleType
+from phyradgs_cl.resources import resource
 
 
-def load_cli() -> "ModuleType":
+def load_cli() -> ModuleType:
     """The module cli.py, wherever this installation keeps it."""
-    import importlib.util
-
-    from phyradgs_cl.resources import resource
-
     spec = importlib.util.spec_from_file_location("phyradgs_cl_cli", resource("cli.py"))
     if spec is None or spec.loader is None:
         raise ImportError("cli.py cannot be loaded: install phyradgs-cl again")
@@ -29,9 +21,13 @@ def load_cli() -> "ModuleType":
 
 def main() -> None:
     """Runs the command line and exits with its status; Ctrl-C gives one line and status 130 at any time."""
-    signals.take_over()
-    status = load_cli().run(sys.argv[1:])
-    signals.let_go()
+    try:
+        status = load_cli().run(sys.argv[1:])
+    except KeyboardInterrupt:  # while libraries load
+        sys.stderr.write("phyradgs: interrupted, nothing written\n")
+        status = 130
+    for number in (signal.SIGINT, signal.SIGTERM):  # the interpreter's own end would answer with a traceback
+        signal.signal(number, signal.SIG_IGN)
     sys.exit(status)
 
 

@@ -27,9 +27,9 @@ def floors_of_the_page() -> dict[str, int]:
 
 
 FLOOR_OF = {"__init__": 0, **floors_of_the_page()}
-# Within floor 0: text knows nothing, errors are text, checks raise them.
-GROUND_FLOOR = {name: set() for name in ("__init__", "text", "resources", "signals")}
-GROUND_FLOOR |= {"errors": {"text"}, "checks": {"errors", "text"}}
+# Within floor 0: text knows nothing, errors are text, checks and signals know errors.
+GROUND_FLOOR = {name: set() for name in ("__init__", "text", "resources")}
+GROUND_FLOOR |= {"errors": {"text"}, "checks": {"errors", "text"}, "signals": {"errors"}}
 
 
 @cache

@@ -7,7 +7,6 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from phyradgs_cl import signals  # noqa: E402
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
 from tables.command import EXAMPLE, bench_command  # noqa: E402
 
@@ -21,7 +20,4 @@ def run(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    signals.take_over()
-    status = run(sys.argv[1:])
-    signals.let_go()
-    sys.exit(status)
+    sys.exit(run(sys.argv[1:]))

@@ -135,7 +135,6 @@ def bench_command(
         f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to go on, "
         "with --table-only for their tables"
     )
-    signals.say_at_the_end(interrupted)
     try:
         if table_only:
             written = remake_tables(job, chosen_seeds)
@@ -145,7 +144,7 @@ def bench_command(
             written = run_bench(job, lambda: Runtime(wish), BenchTicker())
     except KeyboardInterrupt:
         complain(interrupted)
-        raise typer.Exit(signals.status()) from None
+        raise typer.Exit(signals.exit_status()) from None
     for path in written:
         say(str(path))
 

@@ -10,8 +10,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, RunPlan, reconstruct
-from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.signals import keep_finished_work
 from tables.job import BenchJob, plain
 from tables.phantom_case import PSEUDO, PSEUDO_VIEWS, PhantomCase
 from tables.rows import Row

@@ -17,9 +17,9 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import file_kind, load_attenuation, only_run
 from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, RunPlan, reconstruct
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.environment import environment
+from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
 from tables.case import Case, SyntheticCase
 from tables.figures import truth_of, write_figures, write_slices

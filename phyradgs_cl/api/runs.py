@@ -38,10 +38,10 @@ from phyradgs_cl.reconstructors import (
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
-from phyradgs_cl.reconstructors.interrupt import keep_finished_work
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.reconstructors.tune.trials import TUNED
 from phyradgs_cl.reconstructors.tune.wish import is_told, with_chosen
+from phyradgs_cl.signals import keep_finished_work
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan
 from phyradgs_cl.text import near_miss
 

@@ -18,9 +18,9 @@ from phyradgs_cl.importers import load_beads
 from phyradgs_cl.io import check_writable, only_run, written_beside
 from phyradgs_cl.io.scan.copy import copy_with_motion
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import to_digits_of
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 

@@ -13,9 +13,9 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, read_scan
 from phyradgs_cl.io.scan.copy import copy_with_offset
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
 
 EXAMPLE = "Example: phyradgs check scan.h5"

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.files import file_argument, file_option, option
 from phyradgs_cl.exporters import CLOUDS, EXPORTS, DicomLabels, export_volume, format_of
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting
 
 EXAMPLE = "Example: phyradgs export volume.h5 -o volume.nii --mu-water-per-mm 0.0195"

@@ -25,7 +25,7 @@ from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_template import template_of
 from phyradgs_cl.importers.options import FIELDS, WORDS, option_name
 from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import refuse_foreign_suffix
 
 EXAMPLE = (

@@ -27,7 +27,7 @@ def last_words(error: BaseException) -> int:
     """One line on stderr, whatever has become of it, by a rank that ends all; the exit status."""
     rank = launched().rank
     if isinstance(error, KeyboardInterrupt):
-        text, status = signals.farewell, signals.status()
+        text, status = signals.farewell(), signals.exit_status()
     elif isinstance(error, PhyradgsError):
         text, status = str(error), error.exit_code
     else:

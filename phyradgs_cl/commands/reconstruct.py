@@ -17,12 +17,12 @@ from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.reconstructors.result import COMPARED
 from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow import profile_report, run_reconstruction
 
 EXAMPLE = (
@@ -91,4 +91,4 @@ def reconstruct_command(
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
         complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to go on")
-        raise typer.Exit(signals.status())
+        raise typer.Exit(signals.exit_status())

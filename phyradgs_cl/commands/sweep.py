@@ -49,13 +49,12 @@ def sweep_command(
 def make_sweep(folder: Path, prepared: Callable[[], SweepJob]) -> None:
     """Runs the sweep that is ``prepared`` into ``folder``, with progress, and says what was written."""
     interrupted = f"interrupted: finished runs are in {folder / RESULTS}; repeat the command to go on"
-    signals.say_at_the_end(interrupted)
     try:
         with SweepTicker() as ticker:
             written, failed = run_sweep(prepared(), ticker)
     except KeyboardInterrupt:
         complain(interrupted)
-        raise typer.Exit(signals.status()) from None
+        raise typer.Exit(signals.exit_status()) from None
     for path in written:
         say(str(path))
     if failed:

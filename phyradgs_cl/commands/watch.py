@@ -43,14 +43,13 @@ def watch_command(
     """Reconstruct the scans of a folder as they arrive, each once; failures are set aside with their message."""
     job = WatchJob(folder, output, settings.plan(), poll_s, settle_s, once, checkpoint_every)
     interrupted = f"interrupted: finished volumes are in {output}; the next start goes on from there"
-    signals.say_at_the_end(interrupted)
     telling = _Telling(output)
     try:
         run_watch(job, settings.runtime, telling.tell, telling.report)
     except KeyboardInterrupt:
         telling.end_line()
         complain(interrupted)
-        raise typer.Exit(signals.status()) from None
+        raise typer.Exit(signals.exit_status()) from None
 
 
 class _Telling:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks, signals
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.exporters.placed import Placed
 from phyradgs_cl.io.output import temporary_name
@@ -154,5 +154,3 @@ def folder_written_beside(path: Path) -> Iterator[Path]:
             found = error.strerror or str(error)
             raise OutputError(str(path), found, "a folder that can be written", "choose another") from error
         raise
-    finally:
-        signals.unfinished.discard(str(temporary))

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io.output import beside
 
@@ -37,11 +36,9 @@ def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
     except OSError as error:
         found = f"{error.strerror or error} for its lock {path}"
         raise OutputError(str(output), found, "a folder that can be written", "choose another") from error
-    signals.unfinished.add(str(path))
     try:
         yield
     finally:
         with suppress(OSError):
             path.unlink()  # still locked: whoever waits for this file will see that it is not there any more
-        signals.unfinished.discard(str(path))
         lock.release()

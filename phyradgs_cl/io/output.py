@@ -15,7 +15,6 @@ from functools import cache
 from pathlib import Path
 from zlib import crc32
 
-from phyradgs_cl import signals
 from phyradgs_cl.errors import OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -26,7 +25,7 @@ _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part$")
 
 def check_writable(path: str | Path) -> None:
     """Raise OutputError now if ``path`` could not be written later: makes, and removes, an empty file in its folder."""
-    _remove(_create_beside(_target(path)))
+    _create_beside(_target(path)).unlink()
 
 
 def make_folder(folder: Path, subject: Path) -> None:
@@ -51,11 +50,10 @@ def written_beside(path: str | Path) -> Iterator[Path]:
         if target.exists():
             shutil.copymode(target, temporary)
         os.replace(temporary, target)
-        signals.unfinished.discard(str(temporary))
         _flush_folder(target.parent)
     except BaseException as error:
         with suppress(OSError):
-            _remove(temporary)
+            temporary.unlink()
         if isinstance(error, OSError) or (isinstance(error, RuntimeError) and "errno = " in str(error)):
             raise _output_error(target, error) from error
         raise
@@ -90,7 +88,6 @@ def _create_beside(target: Path) -> Path:
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
-        signals.unfinished.discard(str(temporary))
         found = f"{error.strerror or error} in folder {target.parent}"
         remedy = "choose another folder or change its permissions"
         raise OutputError(str(target), found, "a folder that can be written", remedy) from error
@@ -102,11 +99,9 @@ def temporary_name(target: Path) -> Path:
     for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
-            signals.remove(str(path))
+            _discard(path)
     writer_now = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = target.with_name(f".{target.name[:_LONGEST]}.{writer_now}.part")
-    signals.unfinished.add(str(temporary))  # Ctrl-C may end the process at any line
-    return temporary
+    return target.with_name(f".{target.name[:_LONGEST]}.{writer_now}.part")
 
 
 @cache
@@ -128,9 +123,12 @@ def _is_dead(process: int) -> bool:
     return False
 
 
-def _remove(temporary: Path) -> None:
-    signals.unfinished.discard(str(temporary))
-    temporary.unlink()
+def _discard(path: Path) -> None:
+    """Removes a file or a folder, if it can be removed."""
+    try:
+        path.unlink()
+    except OSError:  # a folder, or removed by another process
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _flush_folder(folder: Path) -> None:

@@ -13,8 +13,8 @@ from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.checkpoint import checked_history
-from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, State, history_arrays
+from phyradgs_cl.signals import stop_on_interrupt
 
 SILENT_S = 10.0
 

@@ -11,7 +11,7 @@ from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.io.volume import interruption
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, slices_png
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
 

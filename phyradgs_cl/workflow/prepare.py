@@ -14,8 +14,8 @@ from phyradgs_cl.io import check_writable, hashing, only_run, write_scan
 from phyradgs_cl.prepare import STEPS, TOLD
 from phyradgs_cl.reconstructors import Preprocessing
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
 

@@ -42,9 +42,9 @@ from phyradgs_cl.reconstructors import (
     method_of,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT, option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
+from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 

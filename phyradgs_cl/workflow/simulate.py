@@ -12,8 +12,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_attenuation, load_beads
 from phyradgs_cl.io import LoadedVolume, Scanner, check_writable, only_run, write_scan
 from phyradgs_cl.phantoms import PHANTOMS, EllipsoidPhantom
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
 from phyradgs_cl.text import near_miss
 from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting

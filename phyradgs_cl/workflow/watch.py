@@ -17,8 +17,8 @@ from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, Output
 from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, only_run, partial_path, written_beside
 from phyradgs_cl.io.output import beside, make_folder
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, RunPlan, ignore_progress
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import check_interval, is_complete, resume_or_restart
 

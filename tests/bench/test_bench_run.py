@@ -25,8 +25,8 @@ from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import only_run
 from phyradgs_cl.io.lock import BusyError
-from phyradgs_cl.reconstructors.interrupt import stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.signals import stop_on_interrupt
 from phyradgs_cl.simulation import phantom_scene
 
 TINY = BenchSize("T", 12, 16, 8)

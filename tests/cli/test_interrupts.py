@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from phyradgs_cl import signals
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.simulation import options as simulation_options
 from phyradgs_cl.workflow import evaluate, reconstruct, simulate
 
@@ -107,29 +107,11 @@ PROCESSES = {
         typer.echo = lambda *words, **options: (echo(*words, **options), press())
         """
     ),
-    "in a destructor, which swallows exceptions": at_a_kernel(
-        "lambda *_, **__: [Thing()].clear()", "class Thing:\n    __del__ = press\n"
-    ),
-    "in a library that swallows whatever comes": at_a_kernel(
-        "kernel",
-        "def kernel(*_, **__):\n    with contextlib.suppress(BaseException):\n        press()\n",
-    ),
-    "while a folder is half written": at_a_kernel(
-        "kernel",
-        """
-        def kernel(*_, **__):
-            from phyradgs_cl import signals
-            signals.unfinished.add(os.path.abspath("volume.part"))
-            os.mkdir("volume.part")
-            open("volume.part/slice", "w").close()
-            press()
-        """,
-    ),
     "while the output is half written": """
         import h5py
         h5py.Group.require_group = h5py.Group.create_group = press
         import phyradgs_cl.workflow.simulate as w
-        w.finish_despite_interrupt = contextlib.nullcontext  # as in a command that does not hold signals
+        w.finish_despite_interrupt = contextlib.nullcontext  # as in a command that does not make signals wait
     """,
 }
 
@@ -142,6 +124,24 @@ def test_a_process_ends_with_one_line_and_130(tmp_path, monkeypatch, stage):
     lines = done.stderr.splitlines(keepends=True)
     assert "".join(line for line in lines if not line.startswith("frame 4/4")) == NOTHING
     assert done.stdout == "" and list(tmp_path.iterdir()) == []
+
+
+def test_a_library_that_swallows_the_signal_delays_the_end(tmp_path) -> None:
+    """The command ends after the output is written: a loop, or a block that writes, sees that a signal has come."""
+    body = at_a_kernel(
+        "kernel",
+        """
+        import phyradgs_cl.runtime as r
+        make = r.Runtime.kernel
+        def kernel(*words, **options):
+            with contextlib.suppress(BaseException):
+                press()
+            return make(*words, **options)
+        """,
+    )
+    done = run_process([*COMMANDS["simulate"], "-o", str(tmp_path / "scan.h5")], body)
+    assert done.returncode == 130 and done.stderr.endswith(COMPLETE)
+    assert list(tmp_path.iterdir()) == [tmp_path / "scan.h5"]
 
 
 # A signal at the second report of a loop: it comes again at once, as wrappers pass it on.
@@ -225,16 +225,11 @@ def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
 
 
 def test_a_signal_that_is_ignored_stays_ignored():
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with stop_on_interrupt() as request, finish_despite_interrupt():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with signals.answer_signals(), stop_on_interrupt() as request, finish_despite_interrupt():
         signal.raise_signal(signal.SIGINT)
-    assert not request.is_set
-    signals.take_over()
-    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    signals.let_go()
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    assert not request.is_set and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("method", ["sart", "phyradgs"])
@@ -258,14 +253,6 @@ def test_a_benchmark_ends_with_its_own_line(tmp_path, name, status, module, step
     done = run_process(["bench", "quick", "-o", str(tmp_path)], body)
     expected = f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to go on\n"
     assert (done.returncode, done.stderr) == (status, expected)
-
-
-def test_signals_are_answered_before_anything_heavy_loads():
-    program = "import sys; before = set(sys.modules); import phyradgs_cl.__main__; print(*set(sys.modules) - before)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
-    assert "phyradgs_cl.__main__" in loaded
-    assert not {"numpy", "typer", "importlib.metadata", "pyopencl", "signal"} & loaded
 
 
 def run_process(arguments, body):

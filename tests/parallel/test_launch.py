@@ -91,8 +91,6 @@ def test_without_mpi4py_one_line_says_what_to_install(tmp_path, rank) -> None:
 
 def test_the_last_words_of_a_rank(monkeypatch, capfd) -> None:
     monkeypatch.setenv("PMI_SIZE", "3")
-    monkeypatch.setattr(commands.signals, "farewell", commands.signals.NOTHING)
-    monkeypatch.setattr(commands.signals, "number", 2)
     for rank, name in (("0", ""), ("2", "rank 2: ")):
         monkeypatch.setenv("PMI_RANK", rank)
         for error, words, status in (

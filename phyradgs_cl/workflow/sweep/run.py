@@ -22,8 +22,8 @@ from phyradgs_cl.io.json_lines import Line, append_line, json_text, read_lines, 
 from phyradgs_cl.io.lock import BusyError
 from phyradgs_cl.io.output import make_folder, shortened
 from phyradgs_cl.reconstructors import Progress, ProgressReport, ignore_progress
-from phyradgs_cl.reconstructors.interrupt import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.runtime.environment import environment
+from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid
