@@ -1,11 +1,16 @@
 """How close a reconstruction is to the truth."""
 
-from phyradgs_cl.metrics.align import VOXEL_BY_VOXEL, Aligned, aligned, in_words, reference_on
-from phyradgs_cl.metrics.compare import compare
-from phyradgs_cl.metrics.psnr import psnr
-from phyradgs_cl.metrics.resample import resampled, shared_slices
+from phyradgs_cl.metrics.align import (
+    VOXEL_BY_VOXEL,
+    Aligned,
+    aligned,
+    in_words,
+    reference_on,
+    resampled,
+    shared_slices,
+)
+from phyradgs_cl.metrics.quality import compare, psnr, ssim, ssim_map
 from phyradgs_cl.metrics.slices import slices_png
-from phyradgs_cl.metrics.ssim import ssim, ssim_map
 
 __all__ = [
     "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "in_words", "psnr", "reference_on", "resampled", "shared_slices",

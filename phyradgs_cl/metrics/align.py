@@ -4,19 +4,20 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid, triple
-from phyradgs_cl.metrics.resample import resampled, shared_slices
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
+_ROUNDING = 1e-6  # of a voxel
 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """A volume and a reference (nz, ny, nx), both on ``grid``. ``how``: in words, what was done to compare them; ``share``
-    of the reference's box that is compared."""
+    """A volume and a reference (nz, ny, nx), both on ``grid``. ``how``: how they were brought there, in words. ``share``: of
+    the reference's box that is compared."""
 
     volume: Values
     reference: Values
@@ -26,10 +27,10 @@ class Aligned:
 
 
 def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid) -> Aligned | None:
-    """Both volumes (nz, ny, nx) on one grid; None where no voxel centre of the reference lies in the volume's box.
+    """Brings both volumes (nz, ny, nx) to one grid; None where no voxel centre of the reference lies in the volume's box.
 
-    The volume's own grid, where its voxels are the reference's, or whole blocks of them: the reference is then averaged over
-    the blocks. Any other volume is resampled, trilinearly, onto those of the reference's voxels that lie in its box.
+    Where the volume's voxels are whole blocks of the reference's, the reference is averaged over the blocks. Any other
+    volume is resampled trilinearly onto the reference's voxels that lie in its box.
     """
     if grid.is_close(reference_grid):
         return Aligned(volume, reference, grid)
@@ -50,7 +51,7 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """The reference (nz, ny, nx) on a volume's ``grid``, by the rule of ``aligned``; None where the volume is resampled."""
+    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where that resamples the volume."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)
@@ -58,7 +59,7 @@ def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values 
 
 
 def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
-    """Means over blocks of ``factors`` (z, y, x) voxels of a volume that whole blocks fill."""
+    """Returns means over blocks of ``factors`` (z, y, x) voxels of a volume that whole blocks fill."""
     if factors == (1, 1, 1):
         return values
     split = [part for n, factor in zip(values.shape, factors, strict=True) for part in (n // factor, factor)]
@@ -67,7 +68,7 @@ def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
 
 
 def in_words(grid: Grid) -> str:
-    """A grid in a few words, x y z as everywhere where people read of sizes."""
+    """Describes a grid in a few words, in the order x y z, as all texts for users do."""
     sizes, offsets = (v[::-1] for v in (grid.voxel_size_mm, grid.offset_mm))
     digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
     words = f"{_times(grid.shape)} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
@@ -75,7 +76,7 @@ def in_words(grid: Grid) -> str:
 
 
 def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice, slice, slice]] | None:
-    """How many voxels of ``finer`` fill one of ``grid`` (z, y, x), and which fill all; None where whole voxels do not."""
+    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and which fill all; None for partial voxels."""
     factors = triple(max(1, round(d / f)) for d, f in zip(grid.voxel_size_mm, finer.voxel_size_mm, strict=True))
     counts = triple(n * factor for n, factor in zip(grid.shape, factors, strict=True))
     if any(n > most for n, most in zip(counts, finer.shape, strict=True)):
@@ -83,6 +84,38 @@ def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice,
     sides_mm = triple(d / factor for d, factor in zip(grid.voxel_size_mm, factors, strict=True))
     part = Grid(counts, sides_mm, grid.offset_mm).slices_in(finer)
     return None if part is None else (factors, part)
+
+
+def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
+    """Returns the block (z, y, x) of voxels of ``onto`` whose centres lie in the box of ``grid``; None without any."""
+    block = []
+    for centres_mm, (low_mm, high_mm), side_mm in zip(onto.axes_mm(), grid.box_mm, onto.voxel_size_mm, strict=True):
+        rounding_mm = _ROUNDING * side_mm
+        inside = np.flatnonzero((centres_mm >= low_mm - rounding_mm) & (centres_mm <= high_mm + rounding_mm))
+        if not inside.size:
+            return None
+        block.append(slice(int(inside[0]), int(inside[-1]) + 1))
+    return triple(block)
+
+
+def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
+    """Samples a volume (nz, ny, nx) trilinearly at the voxel centres of another grid, 0 outside its box.
+
+    Between the outermost centres and the faces the value is that of the centres. The second result is the share of the
+    voxels of ``onto`` that lie in the box.
+    """
+    step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
+    first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
+    values = scipy.ndimage.affine_transform(
+        volume.astype(np.float32, copy=False), step, first, output_shape=onto.shape, order=1, mode="nearest"
+    )
+    share = 1.0
+    for axis, (at, ratio) in enumerate(zip(first, step, strict=True)):
+        place = at + ratio * np.arange(onto.shape[axis])
+        inside = (place >= -0.5) & (place <= grid.shape[axis] - 0.5)
+        share *= float(inside.mean())
+        values *= inside.reshape([-1 if a == axis else 1 for a in range(3)])
+    return values, share
 
 
 def _times(zyx: tuple[int, int, int]) -> str:

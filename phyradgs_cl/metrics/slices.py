@@ -10,8 +10,7 @@ from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.drawing import draw_image, new_figure
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics.psnr import psnr
-from phyradgs_cl.metrics.ssim import ssim
+from phyradgs_cl.metrics.quality import psnr, ssim
 from phyradgs_cl.text import plain_text
 
 if TYPE_CHECKING:
@@ -24,12 +23,12 @@ _INCH, _DPI = 3.2, 110
 def slices_png(
     path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str, grid: Grid | None = None
 ) -> None:
-    """Write a PNG: a row for each orthogonal middle slice; columns result, truth, difference. z and y point up.
+    """Writes a PNG: a row for each middle slice, the columns result, truth and difference. z and y point up.
 
-    Grey values run over the truth's range, so that a wrong gain shows; the difference has a scale of its own, symmetric
-    about 0. result, reference: (z, y, x), without a reference one column; ``title``: the heading's first line; ``grid`` of
-    both, for a bar of a length. InputError: not 3D, shapes that differ, NaN or infinity. OutputError: the file cannot be
-    written.
+    Grey values run over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about 0.
+    result, reference: (z, y, x); without a reference there is one column. ``title``: the heading's first line. ``grid``: of
+    both, for the scale bar. Raises InputError for arrays that are not 3D, shapes that differ, NaN and infinity, and
+    OutputError for a file that cannot be written.
     """
     volume = np.asarray(result)
     shape("result", volume, (None, None, None))
@@ -52,7 +51,7 @@ def _numbers(result: Image, reference: Image) -> str:
 
 
 def draw_slices(figure: "FigureBase", volume: Image, truth: Image | None, grid: Grid | None) -> None:
-    """The middle slices of a volume (z, y, x) in 1/mm below each other, those of a truth and of the difference beside."""
+    """Draws the three middle slices of a volume (z, y, x) in 1/mm, and those of a truth and of the difference."""
     if truth is not None:
         shape("reference", truth, volume.shape)
         finite("reference", truth)

@@ -1,30 +1,55 @@
-"""Phantoms: objects whose attenuation is known, for simulations and for truth to compare with; `make_phantom` is the door.
+"""Phantoms: objects of known attenuation, for simulations and as the truth of comparisons; ``make_phantom`` makes one.
 
-All have `name`, `kind` and `voxelise(grid)`; an "analytic" one also `line_integrals(source, target)` in closed form, a
-"voxel" one `volume` and `grid`. Attenuation scales with 1 / half-size, so that line integrals do not depend on the size.
+All have ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has ``line_integrals(source, target)`` in
+closed form, a "voxel" one ``volume`` and ``grid``. Attenuation scales with 1 / half-size, so that line integrals do not
+depend on the size.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.checks import one_of, positive
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.checks import finite, one_of, positive, shape
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms.closed_form import shepp_logan, sphere_phantom
 from phyradgs_cl.phantoms.ellipsoids import Cylinder, Ellipsoid, EllipsoidPhantom, rotation_about_z
 from phyradgs_cl.phantoms.procedural_foot import foot
 from phyradgs_cl.phantoms.procedural_jaw import jaw
-from phyradgs_cl.phantoms.shepp_logan import shepp_logan
-from phyradgs_cl.phantoms.spheres import sphere_phantom
-from phyradgs_cl.phantoms.voxels import VoxelPhantom
 
 __all__ = [
     "PHANTOMS", "Cylinder", "Ellipsoid", "EllipsoidPhantom", "Phantom", "VoxelPhantom", "foot", "jaw",
     "make_phantom", "rotation_about_z", "shepp_logan", "sphere_phantom"
 ]  # fmt: skip
 
+
+@dataclass(frozen=True, eq=False)
+class VoxelPhantom:
+    """Attenuation (nz, ny, nx) float32 in 1/mm on a grid. Raises InputError for shapes that differ, NaN and infinity."""
+
+    volume: NDArray[np.float32]
+    grid: Grid
+    name: str
+    kind: ClassVar[str] = "voxel"
+
+    def __post_init__(self) -> None:
+        shape(f"phantom {self.name}", self.volume, self.grid.shape)
+        finite(f"phantom {self.name}", self.volume)
+        object.__setattr__(self, "volume", np.ascontiguousarray(self.volume, dtype=np.float32))
+
+    def voxelise(self, grid: Grid, supersampling: int = 1) -> NDArray[np.float32]:
+        """Returns the volume (nz, ny, nx). Raises InputError for another grid, because nothing is resampled."""
+        if grid != self.grid:
+            remedy = "make the phantom at this resolution and size"
+            raise InputError(f"grid for phantom {self.name}", str(grid), str(self.grid), remedy)
+        return self.volume
+
+
 Phantom = EllipsoidPhantom | VoxelPhantom
-# (half_size_mm, resolution, seed) -> phantom; closed forms have no use for the last two.
+# (half_size_mm, resolution, seed) -> phantom; closed forms ignore the last two.
 Factory = Callable[[float, int, int], Phantom]
 
 
@@ -45,10 +70,10 @@ PHANTOMS: dict[str, Factory] = {
 
 
 def make_phantom(name: str, half_size_mm: float, resolution: int = 128, seed: int = 0) -> Phantom:
-    """A phantom by its name, a key of `PHANTOMS`, in a cube of side 2 · `half_size_mm` about the origin.
+    """Returns the phantom of a name, a key of ``PHANTOMS``, in a cube of side 2 · ``half_size_mm`` about the origin.
 
-    Voxel phantoms have `resolution` voxels per side; `seed` is of the procedural ones' shape and texture. Raises
-    InputError for an unknown name (the message lists the known ones), or a size or count that is not positive.
+    Voxel phantoms have ``resolution`` voxels per side; ``seed`` draws the shape and texture of procedural ones. Raises
+    InputError for an unknown name, and for a size or count that is not positive.
     """
     one_of("phantom", name, PHANTOMS)
     positive("half_size_mm", half_size_mm)

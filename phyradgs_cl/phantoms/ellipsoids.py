@@ -1,6 +1,6 @@
-"""Phantoms made of additive ellipsoids and cylinders: line integrals in closed form, no voxels in between.
+"""Phantoms of additive ellipsoids and cylinders, with line integrals in closed form.
 
-An affine map takes an ellipsoid to the unit ball and a ray to a ray: the chord follows from the ray's distance to the
+An affine map takes an ellipsoid to the unit ball and a ray to a ray, so the chord follows from the ray's distance to the
 centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1).
 """
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.checks import finite, positive, shape
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields import Grid
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -24,18 +24,17 @@ RAYS_PER_CHUNK = 1 << 15  # a chunk's intermediates stay in a core's cache: 2-3 
 
 
 def rotation_about_z(angle_rad: float) -> Matrix:
-    """Rotation that takes an ellipsoid's own axes to the world's, counter-clockwise seen from +z."""
+    """Returns the rotation from an ellipsoid's own axes to the world's, counter-clockwise seen from +z."""
     c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
     return ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """One solid ellipsoid whose attenuation adds to whatever else is there.
+    """One solid ellipsoid, whose attenuation adds to that of other bodies.
 
-    Centre (x, y, z); semi-axes along the ellipsoid's own axes, which are the columns of the 3x3 ``rotation``;
-    ``attenuation_per_mm`` may be negative, to carve a hole. Raises InputError for semi-axes that are not positive, values
-    that are not finite, or a matrix that is no rotation.
+    Centre (x, y, z); semi-axes along the columns of the 3x3 ``rotation``. A negative ``attenuation_per_mm`` carves a hole.
+    Raises InputError for semi-axes that are not positive, values that are not finite, and a matrix that is no rotation.
     """
 
     centre_mm: Triple
@@ -58,18 +57,18 @@ class Ellipsoid:
 
     @property
     def to_unit_ball(self) -> Array:
-        """(3, 3): maps a world vector (x, y, z) in mm to the frame where the surface has radius 1."""
+        """Matrix (3, 3) that maps a world vector (x, y, z) in mm to the frame where the surface has radius 1."""
         r = np.asarray(self.rotation)
         return r.T / np.asarray(self.semi_axes_mm)[:, None]
 
     @property
     def half_box_mm(self) -> Array:
-        """(3,): half the sides (x, y, z) of the smallest axis-aligned box around the ellipsoid."""
+        """Half the sides (3,), x y z, of the smallest axis-aligned box around the ellipsoid."""
         return np.linalg.norm(np.asarray(self.rotation) * np.asarray(self.semi_axes_mm), axis=1)
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The ends of a line of which all of the body is within ``reach_mm``."""
+        """The ends of a line segment; the whole body lies within ``reach_mm`` of it."""
         return self.centre_mm, self.centre_mm
 
     @property
@@ -77,12 +76,12 @@ class Ellipsoid:
         return max(self.semi_axes_mm)
 
     def chord_fraction(self, start: Array, step: Array) -> Array:
-        """(n,): the part of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        """Returns the part (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
         to_ball = self.to_unit_ball.T
         o = (start - np.asarray(self.centre_mm)) @ to_ball
         d = step @ to_ball
         dd = np.einsum("ij,ij->i", d, d)
-        dd[dd == 0] = 1.0  # no length: the fraction is multiplied by a length of zero
+        dd[dd == 0] = 1.0  # the fraction of a segment without length is multiplied by zero later
         nearest = -np.einsum("ij,ij->i", o, d) / dd
         # The distance from the foot point, not the discriminant, whose terms cancel for far sources.
         foot = o + nearest[:, None] * d
@@ -90,7 +89,7 @@ class Ellipsoid:
         return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
 
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-        """Whether points, by coordinates in mm that broadcast, lie inside."""
+        """Returns whether points lie inside, given by coordinates in mm that broadcast."""
         cx, cy, cz = self.centre_mm
         # One term per axis before they broadcast: coordinates of a grid stay one-dimensional.
         rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
@@ -99,8 +98,10 @@ class Ellipsoid:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A straight wire or rod between two points (x, y, z), its ends flat, whose attenuation adds to whatever else is there.
-    Raises InputError for ends that are one point, a radius that is not positive, values that are not finite."""
+    """A straight wire or rod with flat ends between two points (x, y, z), whose attenuation adds to that of other bodies.
+
+    Raises InputError for equal ends, a radius that is not positive, and values that are not finite.
+    """
 
     ends_mm: tuple[Triple, Triple]
     radius_mm: float
@@ -120,9 +121,8 @@ class Cylinder:
 
     @property
     def axis(self) -> Array:
-        """(3,): unit vector from the first end to the second."""
-        found: Array = np.subtract(self.ends_mm[1], self.ends_mm[0]) / self.length_mm
-        return found
+        """Unit vector (3,) from the first end to the second."""
+        return np.asarray(np.subtract(self.ends_mm[1], self.ends_mm[0]) / self.length_mm)
 
     @property
     def centre_mm(self) -> Triple:
@@ -135,12 +135,12 @@ class Cylinder:
 
     @property
     def half_box_mm(self) -> Array:
-        """(3,): half the sides (x, y, z) of the smallest axis-aligned box around the cylinder."""
+        """Half the sides (3,), x y z, of the smallest axis-aligned box around the cylinder."""
         along = np.abs(self.axis)
         return self.length_mm / 2 * along + self.radius_mm * np.sqrt(np.maximum(1 - along**2, 0))
 
     def chord_fraction(self, start: Array, step: Array) -> Array:
-        """(n,): the part of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        """Returns the part (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
         o = start - np.asarray(self.ends_mm[0])
         height, rise = o @ self.axis, step @ self.axis
         o, d = o - height[:, None] * self.axis, step - rise[:, None] * self.axis
@@ -154,7 +154,7 @@ class Cylinder:
         return np.maximum(np.clip(last, 0.0, 1.0) - np.clip(first, 0.0, 1.0), 0.0)
 
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-        """Whether points, by coordinates in mm that broadcast, lie inside."""
+        """Returns whether points lie inside, given by coordinates in mm that broadcast."""
         points = [c - c0 for c, c0 in zip((x, y, z), self.ends_mm[0], strict=True)]
         height = sum(a * p for a, p in zip(self.axis, points, strict=True))
         across = sum((p - a * height) ** 2 for a, p in zip(self.axis, points, strict=True))
@@ -164,9 +164,10 @@ class Cylinder:
 
 Body = Ellipsoid | Cylinder
 
+
 @dataclass(frozen=True)
 class EllipsoidPhantom:
-    """A sum of ellipsoids, and of cylinders, with exact line integrals."""
+    """A sum of ellipsoids and cylinders, with exact line integrals."""
 
     ellipsoids: tuple[Body, ...]
     name: str
@@ -176,10 +177,10 @@ class EllipsoidPhantom:
         object.__setattr__(self, "ellipsoids", tuple(self.ellipsoids))
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
-        """Attenuation integrated from `source` to `target`, (..., 3) world points (x, y, z) in mm that broadcast.
+        """Integrates attenuation from ``source`` to ``target``, world points (..., 3) in mm, x y z, that broadcast.
 
         Returns (...) float64, dimensionless; 0 for a segment that misses or has no length. Raises InputError for a last axis
-        that is not 3, or shapes that do not broadcast.
+        that is not 3, and for shapes that do not broadcast.
         """
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
@@ -199,7 +200,7 @@ class EllipsoidPhantom:
         return total * np.sqrt(np.einsum("ij,ij->i", step, step))
 
     def density(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Array:
-        """Attenuation in 1/mm at points given by coordinates in mm that broadcast; float64 (...)."""
+        """Returns the attenuation (...) float64 in 1/mm at points, given by coordinates in mm that broadcast."""
         px, py, pz = (np.asarray(c, dtype=np.float64) for c in (x, y, z))
         total = np.zeros(np.broadcast_shapes(px.shape, py.shape, pz.shape))
         for ellipsoid in self.ellipsoids:
@@ -207,7 +208,7 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Mean attenuation (nz, ny, nx) float32 in 1/mm, from `supersampling` points along each axis of a voxel."""
+        """Returns mean attenuation (nz, ny, nx) float32 in 1/mm, of ``supersampling`` points along each axis of a voxel."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)
@@ -229,7 +230,7 @@ def _broadcast_points(source: ArrayLike, target: ArrayLike) -> tuple[Array, Arra
 
 
 def _add_ellipsoid(volume: Array, ellipsoid: Body, grid: Grid, samples: int) -> None:
-    """Add to `volume` (nz, ny, nx) in place, visiting only the ellipsoid's box, a slice at a time."""
+    """Adds a body to ``volume`` (nz, ny, nx) in place, within its box and a slice at a time."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     centre, half = ellipsoid.centre_mm[::-1], ellipsoid.half_box_mm[::-1]
     ranges, fine = [], []

@@ -1,7 +1,7 @@
 """Implicit bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
-Functions of position in the cube [-1, 1]^3, averaged over voxels: every resolution samples the same object. Distances
-are positive outside. Points run (x, y, z), arrays (z, y, x), float32.
+They are functions of position in the cube [-1, 1]^3, averaged over voxels, so that every resolution samples the same object.
+Distances are positive outside. Points run (x, y, z), arrays (z, y, x), float32.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class Capsule:
     r1: float
 
     def grown(self, width: float) -> "Capsule":
-        """The same with `width` added to both radii."""
+        """Returns the capsule with ``width`` added to both radii."""
         return Capsule(self.p0, self.p1, self.r0 + width, self.r1 + width)
 
 
@@ -47,28 +47,28 @@ class Lattice:
         return (slice(0, self.count),) * 3
 
     def axis(self) -> Field:
-        """(count,) coordinates."""
+        """Returns the coordinates (count,) of one axis."""
         return ((np.arange(self.count) + 0.5) * self.step - 1.0).astype(np.float32)
 
     def points(self, box: Box) -> tuple[Field, Field, Field]:
-        """Coordinates x (1, 1, nx), y (1, ny, 1), z (nz, 1, 1) of a box of voxels."""
+        """Returns the coordinates x (1, 1, nx), y (1, ny, 1), z (nz, 1, 1) of a box of voxels."""
         axis = self.axis()
         return axis[None, None, box[2]], axis[None, box[1], None], axis[box[0], None, None]
 
     def box(self, low: ArrayLike, high: ArrayLike) -> Box:
-        """The voxels (z, y, x) that may touch the world box from `low` to `high` (x, y, z)."""
+        """Returns the voxels (z, y, x) that may touch the world box from ``low`` to ``high`` (x, y, z)."""
         first = np.floor((np.asarray(low) + 1.0) / self.step).astype(int) - 1
         last = np.ceil((np.asarray(high) + 1.0) / self.step).astype(int) + 1
         x, y, z = (slice(max(int(a), 0), max(int(b), 0)) for a, b in zip(first, last, strict=True))
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Part of each voxel that lies inside: linear in the distance across one voxel."""
+        """Returns the part of each voxel that lies inside, linear in the distance across one voxel."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 
 def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
-    """Distance to a tapered capsule (exact for equal radii), on broadcast coordinates."""
+    """Returns the distance to a tapered capsule (exact for equal radii), for coordinates that broadcast."""
     a, b = np.asarray(capsule.p0), np.asarray(capsule.p1)
     axis = (b - a).astype(np.float32)
     length2 = np.float32(max(float(axis @ axis), 1e-12))
@@ -79,12 +79,12 @@ def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
 
 
 def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: Field) -> Field:
-    """First-order distance to an axis-aligned ellipsoid: exact on the surface and in sign."""
+    """Returns the first-order distance to an axis-aligned ellipsoid, exact on the surface and in sign."""
     return ratio_distance([(p - c) for p, c in zip((x, y, z), centre, strict=True)], semi_axes)
 
 
 def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> Field:
-    """Distance to the surface sum (offset / semi-axis)^2 = 1, to first order; semi-axes may vary."""
+    """Returns the first-order distance to the surface Σ (offset / semi-axis)² = 1; semi-axes may be arrays."""
     scaled = sum((o / np.asarray(s, np.float32)) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     slopes = sum((o / np.asarray(s, np.float32) ** 2) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     radius = np.sqrt(scaled)
@@ -92,25 +92,25 @@ def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> 
 
 
 def capsule_box(lattice: Lattice, capsules: Sequence[Capsule], margin: float) -> Box:
-    """The voxels that lie within `margin` of any of the capsules' bounding boxes."""
+    """Returns the voxels within ``margin`` of the capsules' common bounding box."""
     ends = np.array([p for c in capsules for p in (c.p0, c.p1)])
     radii = np.array([r for c in capsules for r in (c.r0, c.r1)])[:, None] + margin
     return lattice.box((ends - radii).min(axis=0), (ends + radii).max(axis=0))
 
 
 def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
-    """Add a body to a smooth union kept as a sum of exp(-distance / blend)."""
+    """Adds a body in place to a smooth union, which is stored as a sum of exp(-distance / blend)."""
     union[box] += np.exp(np.clip(-distance / np.float32(blend), -60.0, 60.0))
 
 
 def union_distance(union: Field, blend: float) -> Field:
-    """The distance that the sum of `add_to_union` stands for; FAR where no body came near."""
+    """Returns the distance of a sum of ``add_to_union``; FAR where no body came near."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.float32(blend) * np.log(union), FAR)
 
 
 def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, box: Box) -> Field:
-    """Distance to the smooth union of capsules within a box of voxels."""
+    """Returns the distance to the smooth union of capsules within a box of voxels."""
     x, y, z = lattice.points(box)
     union = np.zeros((z.size, y.size, x.size), dtype=np.float32)
     for capsule in capsules:
@@ -124,7 +124,7 @@ def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, b
 
 
 def _intersect(part: Box, box: Box) -> Box:
-    """`part` cut to `box` and counted from the box's first voxel."""
+    """Returns ``part`` cut to ``box`` and counted from the box's first voxel."""
     z, y, x = (
         slice(max(p.start, b.start) - b.start, max(min(p.stop, b.stop) - b.start, 0))
         for p, b in zip(part, box, strict=True)
@@ -135,8 +135,10 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Isotropic noise (n, n, n) float32 of unit variance: `waves` random cosines between two wavelengths, averaged over
-    each voxel; the same draws from `rng` whatever the resolution."""
+    """Draws isotropic noise (n, n, n) float32 of unit variance: ``waves`` random cosines between two wavelengths.
+
+    They are averaged over each voxel, and the draws from ``rng`` do not depend on the resolution.
+    """
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length

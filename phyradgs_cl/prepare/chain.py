@@ -1,4 +1,4 @@
-"""The steps by name, in physical order, and a scan through those that are chosen."""
+"""The steps by name, in physical order, and their application to a scan."""
 
 import logging
 from collections.abc import Iterator, Mapping
@@ -8,13 +8,11 @@ from typing import Any
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare.air import AirOptions, normalise_air
-from phyradgs_cl.prepare.dead import DeadOptions, mask_dead
-from phyradgs_cl.prepare.flats import WAYS
+from phyradgs_cl.prepare.bad_pixels import DeadOptions, SparkOptions, mask_dead, mask_sparks
 from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
+from phyradgs_cl.prepare.light import WAYS, AirOptions, normalise_air
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
-from phyradgs_cl.prepare.sparks import SparkOptions, mask_sparks
 from phyradgs_cl.prepare.step import Facts, MakeModel, Step
 from phyradgs_cl.text import near_miss
 
@@ -28,16 +26,16 @@ STEPS: Mapping[str, Step] = {
     "hardening": correct_hardening,
     "rings": remove_rings,
 }
-"""In the order in which they are done, whatever the order in which they are asked for."""
+"""In the order in which they run, whatever the order in which the user names them."""
 DEFAULT_STEPS = "sparks,dead,rings"
-TOLD = "prepared"
-"""Where a scan's provenance lists what was done to it."""
+PREPARED_KEY = "prepared"
+"""Where a scan's provenance lists the steps that were applied."""
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``flats.WAYS``, asked when a file is read. steps: names of ``STEPS`` with commas between; the rest: a
-    table of options per step."""
+    """flats: one of ``light.WAYS``, used when a file is read. steps: names of ``STEPS``, separated by commas. The other
+    fields hold the options of each step."""
 
     flats: str = "mean"
     steps: str = ""
@@ -61,12 +59,12 @@ class PrepareOptions:
 
     @property
     def chosen(self) -> list[str]:
-        """The steps that are asked for, in their order."""
-        asked = {name.strip() for name in self.steps.split(",")}
-        return [name for name in STEPS if name in asked]
+        """The names of the steps to apply, in their order."""
+        names = {name.strip() for name in self.steps.split(",")}
+        return [name for name in STEPS if name in names]
 
     def step_facts(self) -> dict[str, object]:
-        """The steps and their options, by name; nothing where there are none."""
+        """Returns the steps and their options by name for the provenance; empty without any."""
         flats = {} if self.flats == "mean" else {"flats": self.flats}
         if not self.chosen:
             return {**flats}
@@ -77,7 +75,7 @@ STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
 
 
 def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
-    """The scan after the steps that are chosen; its provenance lists them with their options and numbers."""
+    """Applies the chosen steps to a scan. Its provenance lists them with their options and numbers."""
     for _, after, _ in one_by_one(scan, options, make_model):
         scan = after
     return scan
@@ -86,15 +84,15 @@ def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
 def one_by_one(
     scan: Scan, options: PrepareOptions, make_model: MakeModel
 ) -> Iterator[tuple[str, Scan, Facts]]:
-    """(name, scan after it, numbers) of every step that is chosen, as ``prepare`` does them."""
+    """Applies the chosen steps as ``prepare`` does, and yields (name, scan after it, numbers) for each."""
     if options.flats not in ("mean", scan.provenance.get("flats")):
         expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
         raise InputError("option flats", "a scan of line integrals", expected, "leave it out")
     for name in options.chosen:
-        chosen = getattr(options, name)
-        scan, numbers = STEPS[name](scan, chosen, make_model)
-        told: Any = scan.provenance.get(TOLD) or []
-        line = {"step": name, **numbers, "options": asdict(chosen)}
-        scan = replace(scan, provenance={**scan.provenance, TOLD: [*told, line]})
+        step_options = getattr(options, name)
+        scan, numbers = STEPS[name](scan, step_options, make_model)
+        earlier: Any = scan.provenance.get(PREPARED_KEY) or []
+        entry = {"step": name, **numbers, "options": asdict(step_options)}
+        scan = replace(scan, provenance={**scan.provenance, PREPARED_KEY: [*earlier, entry]})
         log.info("%s: %s", name, numbers)
         yield name, scan, numbers

@@ -1,11 +1,10 @@
-"""Beam hardening undone: line integrals as they are in the thinnest layer.
+"""Beam hardening: converts line integrals to those of the thinnest layer. There are three ways.
 
-By a polynomial that was measured with a wedge. Or by the tube's voltage: what is bone in the scan's own volume, one with
-little total variation, is reprojected, and the spectrum says what soft tissue is left (Joseph and Spital, J. Comput. Assist.
-Tomogr. 2 (1978) 100), again as the volume gets better. Where bone begins is stated, or it is tried: the frames that their
-own reprojection explains best win, those as they are and those of water alone among them. Or, of an object of one material,
-by the scan's consistency with its own reprojection: how line integrals grow with the path through the segmented volume says
-the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
+Polynomial: the user measured it with a wedge. Tube voltage: bone in the scan's own volume is reprojected, and the spectrum
+gives the soft tissue that remains (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100); this is repeated with the
+better volume. The user states the attenuation from which a voxel is bone, or candidates are tried: the frames that their own
+reprojection explains best win, uncorrected frames and a correction for water alone included. One material: line integrals
+against the path through the segmented volume give the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
 """
 
 import logging
@@ -20,35 +19,43 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import Spectrum, tube_spectrum
 from phyradgs_cl.detector.spectrum import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare.consistency import coarse_model, densest, object_in, smooth, unexplained
-from phyradgs_cl.prepare.masked import unmasked_frames
-from phyradgs_cl.prepare.step import Facts, MakeModel, Model
+from phyradgs_cl.prepare.step import (
+    Facts,
+    MakeModel,
+    Model,
+    coarse_model,
+    densest,
+    object_in,
+    smooth,
+    unexplained,
+    unmasked_frames,
+)
 
 log = logging.getLogger(__name__)
 
 Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
-"""From a volume (z, y, x), the attenuation in each voxel that is bone's."""
+"""Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
 _LARGEST = 1e3
-_PASSES = 2  # of bone from volume from bone
-_BONE_VOXELS = 128  # along the longest side, at most: what bone hardens is smooth
-# Of the densest, what is tried: where soft tissue ends and bone is whole; above 1 where bone is thinner than a voxel.
+_PASSES = 2  # bone from the volume, then the volume from corrected frames
+_BONE_VOXELS = 128  # along the longest side, at most: hardening by bone is smooth
+# Candidates (end of soft tissue, start of pure bone) as shares of the densest; above 1 where bone is thinner than a voxel.
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_AS_WELL = 0.1  # of what bone explains: with less bone, which does less harm where something else is left
-_NEARLY = 1.02  # times what water leaves: whoever states a voltage has a scan that is hardened
-_NEWTON = 3  # leave 1e-12
-_UNIFORM = 0.08  # of the line integrals' own size: what one material may leave unexplained
+_AS_WELL = 0.1  # of the part that bone explains: less bone wins, because it does less harm where another effect remains
+_NEARLY = 1.02  # times the rest that water leaves: a user who states a voltage has a hardened scan
+_NEWTON = 3  # steps leave an error of 1e-12
+_UNIFORM = 0.08  # relative RMS that one material may leave unexplained
 _SHADOW = 0.1  # of the longest path
-_WATER_TO = 8.0  # largest line integral that the voltage's polynomial is fitted to
+_WATER_TO = 8.0  # largest line integral to which the polynomial of a voltage is fitted
 _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class HardeningOptions:
-    """polynomial: of p², p³ and p⁴; kvp: tube voltage, kV, whose spectrum is taken; neither: fitted to one material.
-    Beside kvp, bone_per_mm: attenuation from which a voxel is bone, 0: tried; filter_mm: of aluminium; anode_deg: angle of a
-    tungsten anode, whose spectrum is SpekPy's, 0: Kramers' law."""
+    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, for its spectrum. Neither: fitted to one material.
+    With kvp, bone_per_mm: attenuation from which a voxel is bone, 0: candidates are tried. filter_mm: of aluminium.
+    anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0: Kramers' law."""
 
     polynomial: Polynomial = _NONE
     kvp: float = 0.0
@@ -69,7 +76,7 @@ class HardeningOptions:
 
 
 def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
-    """Line integrals p (any shape) as p + a p² + b p³ + c p⁴, float32; below 0 they are air and stay."""
+    """Returns p + a p² + b p³ + c p⁴ for line integrals p (any shape), float32; values below 0 are air and stay."""
     p = np.asarray(frames, np.float64)
     up = np.maximum(p, 0)
     square, cube, fourth = polynomial
@@ -77,16 +84,16 @@ def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
 
 
 def water_polynomial(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0.0) -> Polynomial:
-    """The polynomial that makes line integrals of water straight, up to 8, behind a tube as of ``tube_spectrum``."""
+    """Returns the polynomial that straightens line integrals of water, up to 8, for a spectrum of ``tube_spectrum``."""
     true = np.linspace(0.05, _WATER_TO, 80)
     seen = tube_spectrum(kvp, filter_mm, anode_deg).hardened(true)
     basis = np.stack([seen**2, seen**3, seen**4], axis=1) / true[:, None]
-    found = np.linalg.lstsq(basis, (true - seen) / true, rcond=None)[0]
-    return float(found[0]), float(found[1]), float(found[2])
+    square, cube, fourth = np.linalg.lstsq(basis, (true - seen) / true, rcond=None)[0].tolist()
+    return square, cube, fourth
 
 
 def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """The scan with straight line integrals."""
+    """Returns the scan with straight line integrals."""
     if options.kvp:
         return _by_voltage(scan, options, make_model)
     frames, fitted = unmasked_frames(scan), not any(options.polynomial)
@@ -97,7 +104,7 @@ def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeMod
 
 
 def _check_rising(polynomial: Polynomial, largest: float) -> None:
-    """InputError for a polynomial by which more attenuation is less, somewhere up to the ``largest`` line integral."""
+    """Raises InputError for a polynomial that falls anywhere up to the ``largest`` line integral."""
     p = np.linspace(0, max(largest, 1e-6), 100)
     falls = np.diff(straighten(p, polynomial)) <= 0
     if falls.any():
@@ -107,7 +114,8 @@ def _check_rising(polynomial: Polynomial, largest: float) -> None:
 
 def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     tube = (options.kvp, options.filter_mm, options.anode_deg)
-    frames, spectrum, water = unmasked_frames(scan), tube_spectrum(*tube), water_polynomial(*tube)
+    frames = unmasked_frames(scan)
+    spectrum, water = tube_spectrum(*tube), water_polynomial(*tube)
     facts: Facts = {"kvp": options.kvp}
     bone_in = partial(_from, options.bone_per_mm)
     if not options.bone_per_mm:
@@ -126,8 +134,10 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
 def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
-    """Line integrals (F, v, u) of soft tissue and bone, straight, and bone's share of the volume's attenuation; those of
-    water where no bone is found. blur: pixels, of frames for the model."""
+    """Returns straight line integrals (F, v, u) of soft tissue and bone, and bone's share of the volume's attenuation.
+
+    Without bone in the volume they are corrected for water. blur: of frames for the model, in pixels.
+    """
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(smooth(clean, blur))
@@ -142,39 +152,41 @@ def _straighten_two(
 def find_bone(
     frames: np.ndarray, spectrum: Spectrum, water: Polynomial, model: Model
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
-    """The shares of the densest up to which all is soft and from which all is bone, with which line integrals (F, v, u)
-    explain themselves best: infinity without bone, None where they do best as they are; and what either, and the best with
-    bone, leaves unexplained of them. InputError where there is no object."""
+    """Finds the candidate with which line integrals (F, v, u) explain themselves best.
 
-    def left_by(clean: np.ndarray) -> float:
+    Returns the shares of the densest up to which all is soft and from which all is bone (infinite: water alone; None: no
+    correction is best), and the unexplained rest of each alternative. Raises InputError where there is no object.
+    """
+
+    def rest_of(clean: np.ndarray) -> float:
         return unexplained(clean, model.volume(clean), inside, model)
 
     clean = straighten(frames, water)
     first = model.volume(clean)
     if densest(first) <= 0:
-        raise _nothing()
+        raise _no_object()
     inside = object_in(first)
-    none, alone = left_by(frames), left_by(clean)
+    uncorrected, water_alone = rest_of(frames), rest_of(clean)
     volume = model.regularised(clean)
     bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
-    left = {pair: left_by(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
-    least = min(left.values())
-    enough = [pair for pair in bones if left[pair] <= least + _AS_WELL * max(alone - least, 0.0)]
-    best = min(enough, key=lambda pair: float(bones[pair].sum()))
-    told = {"as_they_are": none, "water": alone, "bone": left[best]}
-    if left[best] < none and left[best] <= _NEARLY * alone:
-        return best, told
-    return ((np.inf, np.inf) if alone < none else None), told
+    rest = {pair: rest_of(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
+    least = min(rest.values())
+    good = [pair for pair in bones if rest[pair] <= least + _AS_WELL * max(water_alone - least, 0.0)]
+    best = min(good, key=lambda pair: float(bones[pair].sum()))
+    rests = {"as_they_are": uncorrected, "water": water_alone, "bone": rest[best]}
+    if rest[best] < uncorrected and rest[best] <= _NEARLY * water_alone:
+        return best, rests
+    return ((np.inf, np.inf) if water_alone < uncorrected else None), rests
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
-    """Straight line integrals, where what is ``bone`` (z, y, x) is known."""
+    """Returns straight line integrals for a given volume of ``bone`` (z, y, x)."""
     dense = np.maximum(model.frames(bone.astype(np.float32)), 0)
     return (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """The soft tissue that, with ``dense`` line integrals of bone, gives what was measured: Newton's method."""
+    """Solves for the soft tissue that, with ``dense`` line integrals of bone, gives the measured ones (Newton's method)."""
     soft, step = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)
@@ -183,48 +195,52 @@ def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> n
 
 
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
-    """The polynomial for ``straighten``, of p² alone, that line integrals (F, v, u) of one material follow with their path
-    through its volume. What the same way makes of straight line integrals of that volume is taken off.
+    """Fits the polynomial for ``straighten``, p² alone, to line integrals (F, v, u) of one material and their paths.
 
-    InputError for an object that is not of one material.
+    The bend that the same fit finds in straight line integrals of that volume is subtracted. Raises InputError for an object
+    of several materials.
     """
-    path, level, bend, left = _bend(frames, model)
-    if left > _UNIFORM:
-        told = f"{100 * left:.2g} % of the line integrals that the path through one material does not explain"
+    path, level, bend, rest = _bend(frames, model)
+    if rest > _UNIFORM:
+        found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
-        raise InputError("--steps hardening", told, f"at most {100 * _UNIFORM:.2g} %", remedy)
+        raise InputError("--steps hardening", found, f"at most {100 * _UNIFORM:.2g} %", remedy)
     straight = _bend(path * np.float32(level), model)[2]
     return straight - bend, 0.0, 0.0
 
 
 def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:
-    """Of line integrals (F, v, u): their path through the object (mm), its attenuation (1/mm), the b of p = t + b t² with t
-    in proportion to the path, and the share of them that this leaves unexplained."""
+    """Fits p = t + b t² to line integrals (F, v, u), with t in proportion to the path through the object.
+
+    Returns the path (F, v, u) in mm, the object's attenuation in 1/mm, b, and the relative RMS of the residual.
+    """
     volume = model.volume(frames)
     level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)])) if volume.max() > 0 else 0.0
     path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))
     through = path > _SHADOW * float(path.max())
     if level <= 0 or not through.any():
-        raise _nothing()
+        raise _no_object()
     length, seen = path[through].astype(np.float64), frames[through].astype(np.float64)
     powers = np.stack([length, length**2], axis=1)
-    found = np.linalg.lstsq(powers, seen, rcond=None)[0]
-    left = float(np.sqrt(np.mean((seen - powers @ found) ** 2) / np.mean(seen**2)))
-    return path, level, float(found[1] / found[0] ** 2), left
+    fit = np.linalg.lstsq(powers, seen, rcond=None)[0]
+    rest = float(np.sqrt(np.mean((seen - powers @ fit) ** 2) / np.mean(seen**2)))
+    return path, level, float(fit[1] / fit[0] ** 2), rest
 
 
-def _nothing() -> InputError:
+def _no_object() -> InputError:
     return InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
 
 
 def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
-    """What is bone where voxels (z, y, x) are one or the other."""
+    """Returns the bone of voxels (z, y, x) that are either soft tissue or bone."""
     return np.where(volume >= bone_per_mm, volume, 0)
 
 
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
-    """What is bone where voxels (z, y, x) mix: none of one that attenuates as soft tissue at most, all of one as bone; both
-    as shares of the densest, which the correction makes denser."""
+    """Returns the bone of voxels (z, y, x) that may mix both: none up to ``soft_to``, all from ``bone_from``.
+
+    Both are shares of the densest voxel, which the correction makes denser.
+    """
     if soft_to >= bone_from:
         return np.zeros_like(volume)
     soft, bone = soft_to * densest(volume), bone_from * densest(volume)

@@ -1,11 +1,11 @@
-"""Rings: the error that a pixel's gain adds to its line integrals in every view.
+"""Rings: a pixel's wrong gain adds the same error to its line integrals in every view.
 
-Over a full turn the mean of all views is the projection of the object averaged around the axis, which looks the same from
-both sides. What differs between a column and its mirror image at the axis is therefore of the panel. This difference, taken
-from two independent sets of views, says whether there are rings and how strong they are; without them frames stay as they
-are. ``mean`` takes the pattern from the mean over views, which it denoises in overlapping blocks of cosines with the
-strength that was measured: the object is what stands out of the pattern there. ``fitted`` then adds what a volume with
-little total variation leaves of the frames (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268).
+Over a full turn the mean of all views is the projection of the object averaged around the axis, and symmetric about it. A
+difference between a column and its mirror image is therefore an error of the panel. Its covariance between two independent
+sets of views tells whether there are rings and how strong they are; without rings the frames stay unchanged.
+``mean`` takes the pattern from the mean over views: it denoises the mean in overlapping blocks of cosines with the measured
+strength, and coefficients above the noise belong to the object. ``fitted`` also adds the mean residual of a reconstruction
+with a weak total-variation prior (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268).
 """
 
 from collections.abc import Callable
@@ -16,27 +16,26 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare.dead import axis_column
-from phyradgs_cl.prepare.masked import unmasked_frames
+from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.single_gains import find_single_gains
-from phyradgs_cl.prepare.step import Facts, MakeModel
+from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 METHODS = ("mean", "fitted")
-_NORMAL_MAD = 1.4826
 _LEAST_FRAMES = 8
-_LEAST_PAIRS = 0.25  # of all columns: from here columns are compared with their mirror images
-_LEAST_SHARE = 0.25  # of the variance of the mean's noise: weaker patterns are not worth a change
+_LEAST_PAIRS = 0.25  # of all columns: with fewer, columns are not compared with their mirror images
+_LEAST_SHARE = 0.25  # of the variance of the mean's noise: weaker patterns are not worth a correction
 _NEGLIGIBLE = 1e-4  # in line integrals: rings of a gain that is 0.01 % off
 _SURE = 12.0  # standard errors, of about 1/√pixels, of the pattern's variance over that of the noise
-_THRESHOLD = 3.5  # standard deviations of the pattern: larger coefficients are the object's
+_THRESHOLD = 3.5  # standard deviations of the pattern: larger coefficients belong to the object
 _SHIFTS = 8  # of the blocks, along each side
 _EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their mean, on a full turn
 
 
 @dataclass(frozen=True)
 class RingOptions:
-    """method: mean or fitted. window: side in pixels of the blocks of cosines; wider patterns stay, but for ``fitted``."""
+    """method: mean or fitted. window: side of the cosine blocks in pixels; only ``fitted`` removes wider patterns."""
 
     method: str = "mean"
     window: int = 10
@@ -48,8 +47,8 @@ class RingOptions:
 
 @dataclass(frozen=True)
 class Strength:
-    """Variances, in line integrals squared: of the pattern, of its part that a column shares, and of the noise of the mean
-    over all views. least: variance from which a pattern is certain."""
+    """Variances, in line integrals squared, of the pattern, of its part common to a column, and of the noise in the mean of
+    all views. least: variance from which a pattern is certain."""
 
     pattern: float
     column: float
@@ -62,18 +61,18 @@ class Strength:
 
 
 def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_turn: bool = True) -> Strength:
-    """Measures the pattern that all views of line integrals (F, v, u) share and no object makes.
+    """Measures the pattern that all views of line integrals (F, v, u) share and no object can cause.
 
-    The pattern's variance is the robust covariance of two sets of views, the even and the odd ones, in a second difference
-    along the row, between columns that mirror each other at ``axis_column`` (None: the middle). On an arc, ``full_turn``
-    False, the sets are its halves, which see the object differently.
+    Its variance is the robust covariance of two sets of views in second differences along rows, taken of the difference
+    between mirrored columns. The sets are the even and the odd views; on an arc (``full_turn`` False) its halves, which see
+    the object differently. ``axis_column``: the mirror, None: the middle.
     """
     return _strength(_means(frames, full_turn), axis_column)
 
 
 def _strength(means: np.ndarray, axis_column: float | None) -> Strength:
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
-    noise, rows = _variance(one - other) / 4, len(one) // 2
+    noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
     column = _covariance(one[:rows], other[rows : 2 * rows]) if rows else 0.0
@@ -83,14 +82,16 @@ def _strength(means: np.ndarray, axis_column: float | None) -> Strength:
 def ring_pattern(
     frames: np.ndarray, *, window: int = 10, axis_column: float | None = None, full_turn: bool = True
 ) -> np.ndarray:
-    """What the pixels' gains add to all line integrals (F, v, u), (v, u) float32; 0 everywhere where no pattern is certain.
-    window: side of the blocks in pixels; the rest as of ``ring_strength``."""
+    """Returns the error (v, u) float32 that the pixels' gains add to line integrals (F, v, u); 0 without a certain pattern.
+
+    window: side of the blocks in pixels. The other arguments are those of ``ring_strength``.
+    """
     strength = ring_strength(frames, axis_column=axis_column, full_turn=full_turn)
     return _pattern(frames, strength, window, axis_column if full_turn else np.inf)
 
 
 def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """The scan without its rings; the scan itself where no pattern is certain."""
+    """Returns the scan without its rings; the scan itself where no pattern is certain."""
     frames = unmasked_frames(scan)
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
@@ -99,30 +100,29 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     means, mirrored = _means(frames, full_turn), _mirror(frames.shape[2], column)
     usable = np.full(frames.shape[1:], scan.frames >= _LEAST_FRAMES) & (scan.valid.mean(axis=0) > 0.5)
     single = find_single_gains(means, mirrored, usable, full_turn)
-    if single.found:
+    facts: Facts = {"result": "nothing to do"}
+    if single.any:
         frames, means = frames - single.offset, means - single.offset
         scan = replace(scan, projections=scan.projections - single.offset)
+        facts = {"result": "removed", "single": single.words}
     strength = _strength(means, column)
-    facts: Facts = {"result": "removed" if single.found else "nothing to do"}
-    if single.found:
-        facts["single"] = single.words
     facts |= {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
     if scan.frames < _LEAST_FRAMES or not strength.is_certain:
         return scan, facts
     pattern = _pattern(frames, strength, options.window, column if full_turn else np.inf)
     if options.method == "fitted":
         model = make_model(scan)
-        left = frames - pattern
-        pattern = pattern + (left - model.frames(model.regularised(left))).mean(axis=0)
+        clean = frames - pattern
+        pattern = pattern + (clean - model.frames(model.regularised(clean))).mean(axis=0)
     facts |= {"result": "removed", "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
     remaining = find_single_gains(means - pattern, mirrored, usable, full_turn)
-    if remaining.found:
+    if remaining.any:
         facts["left"] = remaining.words
     return replace(scan, projections=frames - pattern), facts
 
 
 def is_full_turn(scan: Scan) -> bool:
-    """Whether the sources of all views lie evenly around a circle: equally far from their mean."""
+    """Returns whether the sources of all views lie evenly around a circle, that is equally far from their mean."""
     times_s = scan.frame_start_s + scan.shutter.middle_s
     sources = np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0][:3] for f in range(scan.frames)])
     distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
@@ -130,15 +130,17 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
-    """The means (2, v, u) of two independent sets of views."""
+    """Returns the means (2, v, u) of two independent sets of views."""
     half = (len(frames) + 1) // 2
     sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
     return np.stack([part.mean(axis=0, dtype=np.float64) for part in sets])
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
-    """The pattern (v, u) float32 of this strength. Both halves of the mean, alike and unlike at the axis, are denoised: the
-    first, of which rings are, has half the pattern's variance."""
+    """Returns the pattern (v, u) float32 of a given strength.
+
+    The symmetric and the antisymmetric part of the mean are denoised apart; each has half of the pattern's variance.
+    """
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
@@ -151,8 +153,10 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
-    """An image (v, u) without noise of two ``variances``, of each pixel and of each column: coefficients of overlapping
-    blocks of cosines, first those above a threshold, then Wiener's share by these."""
+    """Removes noise with two ``variances``, of each pixel and common to a column, from an image (v, u).
+
+    Coefficients of overlapping cosine blocks are thresholded first; that result guides a Wiener filter.
+    """
     sigma = np.full((window, window), variances[0])
     sigma[0] += window * variances[1]
     sigma = np.sqrt(np.maximum(sigma, 1e-30))
@@ -163,8 +167,10 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
 def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
-    """The mean over all blocks at a pixel of what is left of their cosines' coefficients, by the share that the
-    ``guide``'s say; the mean value of a block stays. Blocks of fewer coefficients count more."""
+    """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the guide's, and averages the blocks.
+
+    The mean value of a block stays. Blocks with fewer coefficients have more weight.
+    """
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)
@@ -185,7 +191,7 @@ def _blockwise(
 
 
 def _cosines(image: np.ndarray, window: int) -> np.ndarray:
-    """Coefficients (block v, block u, window, window) of an image (v, u) of whole blocks."""
+    """Returns coefficients (block v, block u, window, window) of an image (v, u) that whole blocks fill."""
     rows, columns = (n // window for n in image.shape)
     blocks = image.reshape(rows, window, columns, window).swapaxes(1, 2)
     return np.asarray(scipy.fft.dctn(blocks, axes=(2, 3), norm="ortho"))
@@ -197,7 +203,7 @@ def _joined(blocks: np.ndarray) -> np.ndarray:
 
 
 def _mirror(columns: int, axis_column: float | None) -> np.ndarray:
-    """The mirror image at the axis of those columns, counted from the first, that have one; of as many columns in a row."""
+    """Returns the mirror images about the axis, for the columns that have one, in descending order."""
     twice = columns - 1 if axis_column is None else 2 * axis_column
     if not abs(twice) < 2 * columns:
         return np.zeros(0, int)
@@ -206,8 +212,10 @@ def _mirror(columns: int, axis_column: float | None) -> np.ndarray:
 
 
 def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
-    """What of a mean over views (v, u) differs from its mirror image at the axis, over √2: white noise keeps its variance.
-    All of it where few columns have a mirror image."""
+    """Returns the difference of a mean over views (v, u) from its mirror image, over √2: white noise keeps its variance.
+
+    Where few columns have a mirror image it returns the mean itself.
+    """
     mirrored = _mirror(mean.shape[1], axis_column)
     if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
         return mean
@@ -215,14 +223,10 @@ def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
 
 
 def _rough(image: np.ndarray) -> np.ndarray:
-    """The second difference along rows, with the variance of white noise kept."""
+    """Returns the second difference along rows, scaled so that white noise keeps its variance."""
     return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)
 
 
-def _variance(values: np.ndarray) -> float:
-    return float((_NORMAL_MAD * np.median(np.abs(values - np.median(values)))) ** 2)
-
-
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Robust covariance (Gnanadesikan and Kettenring, Biometrics 28 (1972) 81): few pixels at edges do not count."""
-    return (_variance(one + other) - _variance(one - other)) / 4
+    """Returns a covariance that ignores the few pixels at edges (Gnanadesikan and Kettenring, Biometrics 28 (1972) 81)."""
+    return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4

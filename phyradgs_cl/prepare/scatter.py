@@ -1,10 +1,10 @@
-"""Scatter by a kernel: what a ray loses, P · (−ln P) and P · (−ln P)², comes back as wide Gaussians around it.
+"""Scatter by a kernel: each ray scatters P · (−ln P) and P · (−ln P)², which wide Gaussians spread around it.
 
-Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563; with the square, thick rays may scatter otherwise than thin
-ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The scatter over the primary light
-and the width are stated, or it is the sum of Gaussians, none of them negative, that explains best the light that the panel
-sees beside the object beyond that of the flats, in frames that may be lighter and darker. It may say too little of what is
-behind the object: the kernel is made higher as long as the frames that it leaves explain themselves as well.
+Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square lets thick rays scatter differently from thin
+ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the ratio of
+scatter to primary light and the width, or they are fitted: a non-negative sum of Gaussians explains the light beside the
+object beyond that of the flats, while each frame's light may vary. Such a fit may underestimate scatter behind the object.
+The kernel is therefore raised as long as the corrected frames explain themselves equally well.
 """
 
 import itertools
@@ -16,23 +16,31 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.prepare.air import enough_air, with_air_at_0
-from phyradgs_cl.prepare.consistency import coarse_model, object_in, smooth, unexplained
-from phyradgs_cl.prepare.masked import unmasked_frames
-from phyradgs_cl.prepare.step import Facts, MakeModel, Model
+from phyradgs_cl.prepare.light import enough_air, with_air_at_0
+from phyradgs_cl.prepare.step import (
+    Facts,
+    MakeModel,
+    Model,
+    coarse_model,
+    object_in,
+    smooth,
+    unexplained,
+    unmasked_frames,
+)
 
 Kernel = Mapping[tuple[float, int], float]
 """{(standard deviation as a share of the panel's longer side, power of the line integral): height}"""
 _POWERS = (1, 2)  # of a ray's line integral
-_REACHES = (0.12, 0.18, 0.27, 0.4)  # of the panel's longer side; narrower ones answer to the gains of columns
-_PASSES = 6  # of scatter from primary from scatter
-_LEAST_PRIMARY = 0.05  # of what was measured
-_SHADOW = 0.1  # of the largest line integral: from here a pixel lies behind the object
+_REACHES = (0.12, 0.18, 0.27, 0.4)  # of the panel's longer side; narrower ones respond to the gains of columns
+_PASSES = 6  # alternating estimates of scatter and primary light
+_LEAST_PRIMARY = 0.05  # of the measured light
+_SHADOW = 0.1  # of the largest line integral: pixels above it lie behind the object
 _FITTED_FRAMES = 24
 _USUAL_REACH = 0.18
-_RAISED, _MOST_RAISED = 1.25, 8  # the kernel's height, step by step
-_TRIALS = 6  # of heights between the best one's neighbours
-_BETTER, _AS_WELL = 0.65, 1.05  # times what the kernel of the air, and the best, leave unexplained
+_HEIGHT_STEP, _MOST_STEPS = 1.25, 8
+_TRIALS = 6  # of heights between the best step's neighbours
+_BETTER, _AS_WELL = 0.65, 1.05  # unexplained rest relative to that of the fitted kernel, and of the best height
+_LARGEST_HEIGHT, _BISECTIONS = 20.0, 20
 
 
 @dataclass(frozen=True)
@@ -47,17 +55,33 @@ class ScatterOptions:
         checks.fields_within("scatter.", self, {"to_primary": (0, 5), "reach": (0, 2)})
 
 
+def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan without scatter."""
+    frames = unmasked_frames(scan)
+    if options.to_primary > 0:
+        reach = options.reach or _USUAL_REACH
+        kernel: Kernel = {(reach, 1): _height_for(frames, options.to_primary, reach)}
+    else:
+        air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
+        kernel = raised(fit_scatter(frames, air, options.reach), frames, air, *coarse_model(scan, make_model))
+    clean = remove_scatter(frames, kernel)
+    terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
+    facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
+    return replace(scan, projections=clean), facts
+
+
 def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
-    """Line integrals (F, v, u) without the scatter of a kernel {(standard deviation as a share of the panel's longer side,
-    power of a ray's line integral): height}, float32."""
+    """Returns line integrals (F, v, u) float32 without the scatter of a kernel."""
     return -np.log(_primary(np.exp(-frames.astype(np.float64)), kernel)).astype(np.float32)
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
-    """The kernel, of the one width ``reach`` if that is not 0, that explains best the light of the pixels ``air`` of line
-    integrals (F, v, u) beyond 1. Frames may be lighter and darker, but not on the mean."""
-    chosen = _some(len(frames))
-    recorded, where = np.exp(-frames[chosen].astype(np.float64)), air[chosen]
+    """Fits the kernel to the light above 1 of the pixels ``air`` in line integrals (F, v, u), by non-negative least squares.
+
+    A ``reach`` other than 0 fixes its width. Single frames may be lighter or darker, but not their mean.
+    """
+    numbers = _some(len(frames))
+    recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
     kernel: dict[tuple[float, int], float] = {}
     light = recorded
@@ -73,60 +97,49 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """The kernel as high as leaves line integrals (F, v, u), blurred by so many pixels, best explained, with each frame's
-    ``air`` at 0; as it is where none does much better."""
+    """Returns the kernel scaled to the height with the least ``unexplained`` rest, unchanged where that gains little.
+
+    frames: line integrals (F, v, u), blurred by ``blur`` pixels for the model; each frame's ``air`` is shifted to 0.
+    """
     if not kernel:
         return kernel
     coarse = smooth(frames, blur)
     inside = object_in(model.volume(coarse))
 
-    def left(height: float) -> float:
+    def rest(height: float) -> float:
         clean = with_air_at_0(remove_scatter(coarse, times(height)), air)[0]
         return unexplained(clean, model.volume(clean), inside, model)
 
     def times(height: float) -> Kernel:
-        return {term: height * own for term, own in kernel.items()}
+        return {term: height * value for term, value in kernel.items()}
 
-    height, least = 1.0, (before := left(1.0))
-    for _ in range(_MOST_RAISED):
-        if (further := left(_RAISED * height)) > _AS_WELL * least:
+    fitted = rest(1.0)
+    height, least = 1.0, fitted
+    for _ in range(_MOST_STEPS):
+        higher = rest(_HEIGHT_STEP * height)
+        if higher > _AS_WELL * least:
             break
-        height, least = _RAISED * height, min(least, further)
-    if least >= _BETTER * before:
+        height, least = _HEIGHT_STEP * height, min(least, higher)
+    if least >= _BETTER * fitted:
         return kernel
-    beside = height / _RAISED, height * _RAISED
-    found = scipy.optimize.minimize_scalar(left, bounds=beside, method="bounded", options={"maxiter": _TRIALS})
-    return times(float(found.x))
-
-
-def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """The scan without scatter."""
-    frames = unmasked_frames(scan)
-    if options.to_primary > 0:
-        reach = options.reach or _USUAL_REACH
-        kernel: Kernel = {(reach, 1): _height_for(frames, options.to_primary, reach)}
-    else:
-        air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
-        kernel = raised(fit_scatter(frames, air, options.reach), frames, air, *coarse_model(scan, make_model))
-    clean = remove_scatter(frames, kernel)
-    terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
-    facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
-    return replace(scan, projections=clean), facts
+    bounds = height / _HEIGHT_STEP, height * _HEIGHT_STEP
+    best = scipy.optimize.minimize_scalar(rest, bounds=bounds, method="bounded", options={"maxiter": _TRIALS})
+    return times(float(best.x))
 
 
 def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
-    """The height that leaves this ratio, by bisection: the ratio grows with it."""
-    chosen = frames[_some(len(frames))]
-    low, high = 0.0, 20.0
-    for _ in range(20):
+    """Returns the height that gives a ratio of scatter to primary light, by bisection: the ratio grows with it."""
+    some = frames[_some(len(frames))]
+    low, high = 0.0, _LARGEST_HEIGHT
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        below = _ratio(chosen, remove_scatter(chosen, {(reach, 1): middle})) < to_primary
-        low, high = (middle, high) if below else (low, middle)
+        is_low = _ratio(some, remove_scatter(some, {(reach, 1): middle})) < to_primary
+        low, high = (middle, high) if is_low else (low, middle)
     return (low + high) / 2
 
 
 def _ratio(before: np.ndarray, after: np.ndarray) -> float:
-    """Scatter over primary behind the object."""
+    """Returns scatter over primary light behind the object, from line integrals with and without scatter."""
     shadow = after > _SHADOW * float(np.percentile(after, 99.9))
     primary = float(np.exp(-after[shadow].astype(np.float64)).sum())
     return float(np.exp(-before[shadow].astype(np.float64)).sum()) / max(primary, 1e-20) - 1
@@ -147,5 +160,5 @@ def _scattered(primary: np.ndarray, reach: float, power: int) -> np.ndarray:
 
 
 def _some(frames: int) -> np.ndarray:
-    """Which frames heights are fitted to."""
+    """Returns the numbers of the frames to which heights are fitted."""
     return np.unique(np.linspace(0, frames - 1, _FITTED_FRAMES).round().astype(int))

@@ -1,7 +1,7 @@
-"""Single columns and pixels whose gain is off: what stands out of the mean over views at one side of the axis alone.
+"""Single columns and pixels with a wrong gain: outliers of the mean over views on one side of the axis only.
 
-The mean over a full turn is the same at both sides of the axis for every object, and for a round one on an arc. Of a column
-or pixel is therefore what its neighbours do not have, nor the mirrored ones, in two independent sets of views.
+The mean over a full turn is symmetric about the axis for every object, on an arc for a round one. A wrong gain therefore
+shows as a deviation that neither its neighbours nor their mirror images have, in two independent sets of views.
 """
 
 from dataclasses import dataclass
@@ -9,26 +9,27 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-_NORMAL_MAD = 1.4826
-_DEVIATIONS = 8.0  # least distance in robust standard deviations, in both sets
+from phyradgs_cl.detector.noise_level import NORMAL_MAD
+
+_DEVIATIONS = 8.0  # least deviation in robust standard deviations, in both sets
 _LEAST = 2e-3  # in line integrals: gains that are 0.2 % off
-_NEIGHBOURS = 7  # columns, of whose median a pixel is taken
-_NEAR = 21  # columns that say what deviations are usual
-_AXIS = 3  # columns at each side of the axis, where an object's edges stand still: left alone
-_UNEQUAL = 0.25  # largest difference between the two sets, over their mean, beside two standard deviations
-_OBJECT = 0.5  # largest deviation of the mirrored pixel, over that which is found: above it, either side may be at fault
+_NEIGHBOURS = 7  # columns of the median from which a pixel may deviate
+_NEAR = 21  # columns that give the usual deviation
+_AXIS = 3  # columns at each side of the axis that stay, because an object's edges stand still there
+_UNEQUAL = 0.25  # largest difference between the two sets, relative to their mean, plus two standard deviations
+_OBJECT = 0.5  # largest deviation of the mirrored pixel, relative to the pixel's own: above it either may be wrong
 
 
 @dataclass(frozen=True)
 class SingleGains:
-    """offset: (v, u) float32, what gains add to line integrals, 0 elsewhere. columns, pixels: how many were found."""
+    """offset: (v, u) float32, the error that gains add to line integrals, 0 elsewhere. columns, pixels: their numbers."""
 
     offset: np.ndarray
     columns: int = 0
     pixels: int = 0
 
     @property
-    def found(self) -> bool:
+    def any(self) -> bool:
         return bool(self.columns or self.pixels)
 
     @property
@@ -42,47 +43,50 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Single gains by the means (2, v, u) of two sets of views. mirrored: mirror images of the columns that have one (others
-    are left alone). usable: (v, u) bool, pixels that are not masked."""
+    """Finds single gains in the means (2, v, u) of two sets of views.
+
+    mirrored: mirror images of the columns that have one; other columns stay. usable: (v, u) bool, pixels without a mask.
+    """
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
     paired = np.s_[:, mirrored[::-1]]
     usable = usable[paired] & usable[:, mirrored]
     means = means[..., mirrored[::-1]]
-    unlike = _apart(means - means[..., ::-1])
-    medians = [np.median(of, axis=1, keepdims=True) for of in (_apart(means), unlike)]
-    lines = _standing_out(medians[0], medians[1], usable.mean(axis=0, keepdims=True) > 0.5)
+    medians = [np.median(_deviation(m), axis=1, keepdims=True) for m in (means, means - means[..., ::-1])]
+    lines = _outliers(medians[0], medians[1], usable.mean(axis=0, keepdims=True) > 0.5)
     means = means - lines
     pixels = np.zeros(usable.shape)
     if full_turn:  # single pixels on an arc cannot be told from edges of the object
-        along, across = _apart(means), _apart(means.swapaxes(1, 2)).swapaxes(1, 2)
-        apart = np.where(np.abs(along) < np.abs(across), along, across)
-        pixels = _standing_out(apart, _apart(means - means[..., ::-1]), usable)
+        along, across = _deviation(means), _deviation(means.swapaxes(1, 2)).swapaxes(1, 2)
+        deviation = np.where(np.abs(along) < np.abs(across), along, across)
+        pixels = _outliers(deviation, _deviation(means - means[..., ::-1]), usable)
     offset[paired] = lines + pixels
     return SingleGains(offset, int(np.count_nonzero(lines)), int(np.count_nonzero(pixels)))
 
 
-def _apart(means: np.ndarray) -> np.ndarray:
-    """Means (set, v, u) less the median of their neighbours along the row."""
+def _deviation(means: np.ndarray) -> np.ndarray:
+    """Returns means (set, v, u) minus the median of their neighbours along the row."""
     return means - scipy.ndimage.median_filter(means, (1, 1, _NEIGHBOURS))
 
 
-def _standing_out(apart: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """(v, u), 0 where nothing stands out. apart: means (set, v, u) less their neighbours'; unlike: the same of what differs
-    between mirrored columns."""
+def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Returns the errors (v, u) of outliers, 0 elsewhere.
+
+    deviation: ``_deviation`` (set, v, u) of the means. unlike: the same for the difference between mirrored columns.
+    """
     around = (1, 3, 3)
-    mirrored = apart[..., ::-1]
+    mirrored = deviation[..., ::-1]
     low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)
-    beyond = apart - np.clip(apart, low, high)
-    usual = _NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike), (1, 1, _NEAR))
-    noise = _NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike[0] - unlike[1]), (5, 3 if usable.shape[0] > 1 else 5))
+    beyond = deviation - np.clip(deviation, low, high)
+    usual = NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike), (1, 1, _NEAR))
+    noise = NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike[0] - unlike[1]), (5, 3 if usable.shape[0] > 1 else 5))
     sigma = np.maximum(usual, noise).max(axis=0)
     offset, size = unlike.mean(axis=0), np.abs(unlike).min(axis=0)
-    found = usable & (size > np.maximum(_DEVIATIONS * sigma, _LEAST)) & (unlike[0] * unlike[1] > 0)
-    found &= np.abs(unlike[0] - unlike[1]) < _UNEQUAL * np.abs(offset) + 2 * sigma
-    found &= (beyond * offset > 0).all(axis=0) & (np.abs(beyond).min(axis=0) > _OBJECT * size)
-    found &= np.abs(mirrored).max(axis=0) < _OBJECT * size
+    is_outlier = usable & (size > np.maximum(_DEVIATIONS * sigma, _LEAST)) & (unlike[0] * unlike[1] > 0)
+    is_outlier &= np.abs(unlike[0] - unlike[1]) < _UNEQUAL * np.abs(offset) + 2 * sigma
+    is_outlier &= (beyond * offset > 0).all(axis=0) & (np.abs(beyond).min(axis=0) > _OBJECT * size)
+    is_outlier &= np.abs(mirrored).max(axis=0) < _OBJECT * size
     columns = usable.shape[1]
-    found &= np.abs(np.arange(columns) - (columns - 1) / 2) > _AXIS
-    return np.where(found, offset**3 / np.maximum(offset**2 + sigma**2, 1e-30), 0)
+    is_outlier &= np.abs(np.arange(columns) - (columns - 1) / 2) > _AXIS
+    return np.where(is_outlier, offset**3 / np.maximum(offset**2 + sigma**2, 1e-30), 0)

@@ -1,20 +1,29 @@
-"""What every step has in common: a scan in, a scan out, and numbers that say what was done."""
+"""Parts that several steps share: the signature of a step, masked pixels, and how well a scan explains itself."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.fields import GridChoice
 
 Facts = dict[str, Any]
+"""Numbers of a step, for the provenance."""
+_COARSE_VOXELS = 48  # along the longest side
+_INSIDE = 0.1  # of the densest voxel: denser ones belong to the object
+_SMOOTH = 1 / 24  # of the panel's longer side: hardening and scatter are smoother than errors of a coarse grid
 
 
 @dataclass(frozen=True)
 class Model:
-    """A scan's own way from frames (F, v, u) to a volume (z, y, x) and back, on its grid, for steps that ask the object.
-    regularised: one with little total variation that explains frames, which takes a while."""
+    """The scan's own reconstruction and forward projection on its grid, for steps that need the object.
+
+    volume: frames (F, v, u) to (z, y, x). frames: the forward projection. regularised: a slower reconstruction with a weak
+    total-variation prior.
+    """
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
@@ -23,3 +32,87 @@ class Model:
 
 MakeModel = Callable[[Scan], Model]
 Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]
+
+
+def unmasked_frames(scan: Scan) -> np.ndarray:
+    """Returns the scan's line integrals (F, v, u) with masked pixels interpolated."""
+    if scan.pixel_mask is None:
+        return scan.projections
+    return fill_masked(scan.projections, ~scan.valid)
+
+
+def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Returns frames (F, v, u) with masked pixels interpolated linearly along their row.
+
+    A row without valid pixels is interpolated between its neighbours; a frame without any becomes 0.
+    """
+    filled = frames.copy()
+    empty: np.ndarray = np.asarray(mask.all(axis=-1))
+    for f, v in zip(*np.nonzero(mask.any(axis=-1) & ~empty), strict=True):
+        bad = mask[f, v]
+        good = np.flatnonzero(~bad)
+        filled[f, v, bad] = np.interp(np.flatnonzero(bad), good, filled[f, v, good])
+    for f in np.flatnonzero(empty.any(axis=-1)):
+        filled[f, empty[f]] = _between_rows(filled[f], np.flatnonzero(~empty[f]), np.flatnonzero(empty[f]))
+    return filled
+
+
+def _between_rows(frame: np.ndarray, good: np.ndarray, bad: np.ndarray) -> np.ndarray | float:
+    """Returns the rows ``bad`` of a frame (v, u), interpolated from its rows ``good``."""
+    if good.size == 0:
+        return 0.0
+    after = np.clip(np.searchsorted(good, bad), 1, max(good.size - 1, 1))
+    low, high = good[after - 1], good[np.minimum(after, good.size - 1)]
+    share = np.clip((bad - low) / np.maximum(high - low, 1), 0, 1)[:, None]
+    return (1 - share) * frame[low] + share * frame[high]
+
+
+def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
+    """Returns the scan with the pixels ``bad`` (v, u) or (F, v, u) masked and interpolated, too."""
+    if not bad.any():
+        return scan
+    mask = bad if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | bad
+    filled = fill_masked(scan.projections, np.broadcast_to(mask, scan.projections.shape))
+    return replace(scan, pixel_mask=mask, projections=filled)
+
+
+def coarse_model(scan: Scan, make_model: MakeModel, most: int = _COARSE_VOXELS) -> tuple[Model, float]:
+    """Returns the scan's model on at most ``most`` voxels along the longest side, and the blur that its frames need.
+
+    The blur is a standard deviation in pixels.
+    """
+    factor = max(1.0, max(scan.grid.shape) / most)
+    return make_model(scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / factor)))), (factor - 1) / 2
+
+
+def smooth(frames: np.ndarray, sigma: float) -> np.ndarray:
+    """Returns frames (F, v, u) blurred along v and u by a Gaussian of ``sigma`` pixels."""
+    return scipy.ndimage.gaussian_filter(frames, (0, sigma, sigma)) if sigma > 0 else frames
+
+
+def object_in(volume: np.ndarray) -> np.ndarray:
+    """Returns the voxels (z, y, x) of the object and their neighbours, bool."""
+    return np.asarray(scipy.ndimage.binary_dilation(volume >= _INSIDE * densest(volume)))
+
+
+def densest(volume: np.ndarray) -> float:
+    """Returns the 99.9th percentile of a volume (z, y, x) in its middle, where a cone beam's views are complete enough."""
+    z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in volume.shape)
+    middle = (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
+    return float(np.percentile(volume[middle], 99.9))
+
+
+def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
+    """Returns the relative RMS of the smooth residual of line integrals (F, v, u) and their reprojected ``volume``.
+
+    Only voxels ``inside`` the object count. The residual that the same reprojection leaves is subtracted: that part comes
+    from the grid and the number of views. The rest comes from hardening, scatter and the like.
+    """
+
+    def reprojected(values: np.ndarray) -> np.ndarray:
+        return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))
+
+    once = reprojected(volume)
+    residual = frames - 2 * once + reprojected(model.volume(once))
+    residual = smooth(residual, _SMOOTH * max(frames.shape[1:]))
+    return float(np.sqrt(np.mean(residual**2) / max(float(np.mean(frames**2)), 1e-20)))

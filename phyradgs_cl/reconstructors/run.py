@@ -13,8 +13,8 @@ from phyradgs_cl.acquisition.motion import check_own_motion
 from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.metrics import resampled, shared_slices
-from phyradgs_cl.prepare import TOLD
-from phyradgs_cl.prepare.masked import with_masked
+from phyradgs_cl.prepare import PREPARED_KEY
+from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
@@ -69,8 +69,8 @@ def reconstruct(
             result = run(visible, options, report=report, **more)
     if hidden is not None and rt.ranks.rank == 0:
         result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result)
-    if TOLD in ready.provenance:
-        result.facts[TOLD] = ready.provenance[TOLD]
+    if PREPARED_KEY in ready.provenance:
+        result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
     if preprocessing.margin_mm is None:
         return result
     result.facts[MARGIN_MM] = preprocessing.margin_mm

@@ -6,7 +6,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
-from phyradgs_cl.prepare import TOLD
+from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report.charts import (
     Chart,
@@ -141,7 +141,7 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
     """What each step before the method did: a frame, the line integrals of all, and numbers; those of a scan file that was
     written by ``prepare`` in numbers alone."""
-    told = [] if run.scan is None else run.scan.provenance.get(TOLD)
+    told = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(told)]
     if not changes and not earlier:
         return None

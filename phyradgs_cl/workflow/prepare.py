@@ -11,7 +11,7 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, hashing, only_run, write_scan
-from phyradgs_cl.prepare import STEPS, TOLD
+from phyradgs_cl.prepare import PREPARED_KEY, STEPS
 from phyradgs_cl.reconstructors import Preprocessing
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.runtime import Runtime
@@ -38,7 +38,7 @@ def run_preparation(
         clean = _named(prepared(scan, options, make_runtime()), source, known)
         with finish_despite_interrupt():
             write_scan(output, clean)
-    told: Any = clean.provenance.get(TOLD, [])
+    told: Any = clean.provenance.get(PREPARED_KEY, [])
     return list(told)
 
 

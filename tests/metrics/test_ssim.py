@@ -52,7 +52,7 @@ def test_laws_and_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ssim(result * 0.01, truth * 0.01) == pytest.approx(ssim(result, truth), rel=1e-9)
     result, truth = _pair()
     whole = ssim(result, truth)
-    module = import_module("phyradgs_cl.metrics.ssim")  # the package's attribute is the function
+    module = import_module("phyradgs_cl.metrics.quality")  # the package's attribute is the function
     monkeypatch.setattr(module, "_VOXELS_PER_BATCH", 700)
     assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import ellipsoids as module
 from phyradgs_cl.phantoms.ellipsoids import Cylinder, Ellipsoid, EllipsoidPhantom, rotation_about_z
 

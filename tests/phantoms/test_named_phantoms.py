@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan, sphere_phantom
 
 

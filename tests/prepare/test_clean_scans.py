@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition.trajectory import FrameSweeps
 from phyradgs_cl.api import compare, prepare, reconstruct
 from phyradgs_cl.detector import pixel_gains, tigre_noise
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.prepare import DEFAULT_STEPS, TOLD
+from phyradgs_cl.prepare import DEFAULT_STEPS, PREPARED_KEY
 
 VIEWS, PANEL, VOXELS = 180, 48, 32
 # Ellipsoids: attenuation per mm, centre x, y, z and half axes x, y, z in mm.
@@ -75,7 +75,7 @@ def test_a_clean_scan_stays_bit_for_bit(rt, make, name, distances, arc_deg) -> N
     clean = make(name, distances, arc_deg)
     prepared = prepare(clean, DEFAULT_STEPS, device=rt)
     np.testing.assert_array_equal(prepared.projections, clean.projections)
-    assert prepared.valid.all() and prepared.provenance[TOLD][-1]["result"] == "nothing to do"
+    assert prepared.valid.all() and prepared.provenance[PREPARED_KEY][-1]["result"] == "nothing to do"
 
 
 @pytest.mark.parametrize("rings", [0.01, 0.02, 0.05])
@@ -91,7 +91,7 @@ def test_most_of_what_rings_cost_comes_back(rt, make, name, share, rings) -> Non
     prepared = prepare(ringed, DEFAULT_STEPS, device=rt)
     assert ringed_db < clean_db - 0.2
     assert psnr_db(prepared) - ringed_db > share * (clean_db - ringed_db), (clean_db, ringed_db, psnr_db(prepared))
-    assert prepared.provenance[TOLD][-1]["spread"] == pytest.approx(rings, rel=0.15)
+    assert prepared.provenance[PREPARED_KEY][-1]["spread"] == pytest.approx(rings, rel=0.15)
 
 
 def _spoilt(clean: Scan, rows: slice, columns: slice, gain: float) -> Scan:
@@ -116,7 +116,7 @@ def test_a_single_gain_is_regained_and_nothing_else_changes(rt, make, name, rows
     assert left[rows, columns].mean() < 0.2 * np.log(gain)
     left[rows, columns] = 0
     assert not left.any()
-    assert prepared.provenance[TOLD][-1]["single"].startswith(words)
+    assert prepared.provenance[PREPARED_KEY][-1]["single"].startswith(words)
 
 
 def test_what_mirrors_itself_or_stands_at_the_axis_is_the_objects(rt, make) -> None:

@@ -11,8 +11,8 @@ from phyradgs_cl.api import compare, reconstruct, simulate
 from phyradgs_cl.detector import tube_spectrum
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import (
+    PREPARED_KEY,
     STEPS,
-    TOLD,
     Model,
     find_dead,
     find_sparks,
@@ -95,7 +95,7 @@ def test_dead_pixels_and_lines_are_masked_and_filled_in(rt, planted) -> None:
     spoilt = replace(clean, projections=p)
     found = prepared(spoilt, Preprocessing(steps="dead"))
     assert (find_dead(p) == wanted).all() and (~found.valid.any(0) == wanted).all()
-    told = found.provenance[TOLD][0]
+    told = found.provenance[PREPARED_KEY][0]
     assert (told["step"], told["rows"], told["columns"]) == ("dead", 1, 1)
     assert np.abs(found.projections - clean.projections)[:, wanted].mean() < 0.1
     assert psnr_db(rt, spoilt, "dead") > psnr_db(rt, clean) - 1 > psnr_db(rt, spoilt) + 1
@@ -117,7 +117,7 @@ def test_air_takes_the_drift_of_the_light_out(rt, planted) -> None:
     corner = np.s_[:, :4, :4]
     assert np.abs(scan.projections[corner].mean((1, 2))).max() > 0.08
     assert np.abs(found.projections[corner].mean((1, 2))).max() < 0.005
-    low, high = found.provenance[TOLD][0]["light"]
+    low, high = found.provenance[PREPARED_KEY][0]["light"]
     assert low < 0.95 or high > 1.05
 
 
@@ -191,7 +191,7 @@ def test_bone_is_what_the_beam_says_and_not_the_densest_of_three_classes() -> No
 
 def test_frames_that_no_correction_explains_better_stay_as_they_are(rt, planted, caplog) -> None:
     found = prepared(planted(), preprocessing_of({"steps": "hardening", "hardening": {"kvp": 120.0}}), rt)
-    assert found.projections is planted().projections and found.provenance[TOLD][0]["left_alone"]
+    assert found.projections is planted().projections and found.provenance[PREPARED_KEY][0]["left_alone"]
     assert "stay as they are" in caplog.text
 
 
@@ -221,10 +221,10 @@ def test_all_effects_together(rt, planted) -> None:
 
 def test_steps_keep_their_order_and_are_told(rt, planted) -> None:
     result = reconstruct(planted(), "fdk", steps="rings, sparks", rings={"window": 5}, device=rt)
-    told = result.facts[TOLD]
+    told = result.facts[PREPARED_KEY]
     assert [line["step"] for line in told] == ["sparks", "rings"] and told[1]["options"]["window"] == 5
     again = prepared(prepared(planted(), Preprocessing(steps="sparks")), Preprocessing(steps="rings"))
-    assert [line["step"] for line in again.provenance[TOLD]] == ["sparks", "rings"]
+    assert [line["step"] for line in again.provenance[PREPARED_KEY]] == ["sparks", "rings"]
     facts = preprocessing_of({"steps": "rings", "rings": {"window": 5}}).facts()
     assert preprocessing_of(facts) == Preprocessing(steps="rings", rings=replace(Preprocessing().rings, window=5))
 

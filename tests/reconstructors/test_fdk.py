@@ -20,7 +20,7 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
-from phyradgs_cl.prepare.masked import fill_masked
+from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32

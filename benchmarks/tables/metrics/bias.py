@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.checks import at_least, shape
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.metrics.psnr import checked_pair
+from phyradgs_cl.metrics.quality import checked_pair
 
 
 def regional_bias(

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl.checks import shape
-from phyradgs_cl.metrics.psnr import checked_pair, psnr
-from phyradgs_cl.metrics.ssim import ssim_map
+from phyradgs_cl.metrics.quality import checked_pair, psnr, ssim_map
 
 
 def compare_projections(result: ArrayLike, reference: ArrayLike) -> dict[str, float]:

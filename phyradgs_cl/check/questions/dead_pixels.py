@@ -4,7 +4,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.prepare.dead import LEAST_FRAMES, axis_column, find_dead
+from phyradgs_cl.prepare.bad_pixels import LEAST_FRAMES, axis_column, find_dead
 
 _SHARE = 2e-4  # of the panel's pixels
 _QUESTION = "dead pixels"

@@ -15,7 +15,7 @@ from phyradgs_cl.acquisition.motion import LINE_POSES, check_motion, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
-from phyradgs_cl.prepare.masked import unmasked_frames
+from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.arc import view_arc
 from phyradgs_cl.reconstructors.fdk.beyond import reprojected, whole_object

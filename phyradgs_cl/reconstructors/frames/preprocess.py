@@ -14,8 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
-from phyradgs_cl.prepare.masked import unmasked_frames
-from phyradgs_cl.prepare.step import Facts
+from phyradgs_cl.prepare.step import Facts, unmasked_frames
 from phyradgs_cl.reconstructors.tune.wish import wish_of
 from phyradgs_cl.runtime import Runtime
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare.masked import with_masked
+from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress

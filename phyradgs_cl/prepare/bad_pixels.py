@@ -1,0 +1,205 @@
+"""Pixels to mask: sparks, which hit single pixels of single frames, and dead or hot pixels and lines.
+
+Sparks (zingers) come from X-rays, cosmic rays or noise. As with cosmic rays on astronomers' panels, a feature that is
+sharper than the optics allow in every direction is no object: van Dokkum, Publ. Astron. Soc. Pac. 113 (2001) 1420.
+Dead pixels never change, or differ from their neighbours in nearly every frame.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector.noise_level import NORMAL_MAD, robust_deviation
+from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames, with_masked
+
+_AROUND = np.ones((3, 3), bool)
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
+# Sparks
+_SHARPNESS = 0.3  # of a spark's height: how far both opposite pixels lie below it
+_NEAR, _FAR = 2, 3  # pixels away
+_MOVED = 5  # pixels within which the neighbouring frame shows a gap of the object again
+_SHOWN_AGAIN = 0.5  # of a spark's height
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+# Dead pixels
+LEAST_FRAMES = 5
+_DEVIATIONS = 10.0
+_MOST_TIMES = 0.7  # of the frames
+_MOST_FRAMES = 40
+_STILL_SIDES = 0.5  # of the outermost columns: if more never change, air has no noise
+_NEAR_AXIS = 1.5  # columns
+_SHARED = 0.1  # of a pixel's difference, in its four neighbours: an object is never as sharp as a dead pixel
+_LINE = 0.9  # of a line's pixels: from here the whole line is dead
+
+
+@dataclass(frozen=True)
+class SparkOptions:
+    """threshold: least height in local deviations (``find_sparks``). least: least height in line integrals, dimensionless.
+    pixels: largest number of touching pixels that are one spark."""
+
+    threshold: float = 5.0
+    least: float = 0.1
+    pixels: int = 6
+
+    def __post_init__(self) -> None:
+        checks.fields_within("sparks.", self, {"threshold": (1, 1e3), "least": (0, 10), "pixels": (1, 100)})
+
+
+@dataclass(frozen=True)
+class DeadOptions:
+    """deviations: least difference of a pixel from its neighbours, in robust deviations of all pixels of the panel."""
+
+    deviations: float = _DEVIATIONS
+
+    def __post_init__(self) -> None:
+        checks.within("dead.deviations", self.deviations, 1, 1e3)
+
+
+def mask_sparks(scan: Scan, options: SparkOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan with its sparks masked and interpolated."""
+    sparks = find_sparks(unmasked_frames(scan), **vars(options)) & scan.valid
+    count = int(sparks.sum())
+    return with_masked(scan, sparks), {"pixels": count, "share": count / sparks.size}
+
+
+def find_sparks(
+    frames: np.ndarray, *, threshold: float = 5.0, least: float = 0.1, pixels: int = 6
+) -> np.ndarray:
+    """Returns the pixels of line integrals (F, v, u) that are brighter than an object can make them, bool (F, v, u).
+
+    They lie below the median of 5 × 5 pixels by ``least`` and by ``threshold`` deviations (from the median of 9 × 9 absolute
+    differences), are sharp in every direction, and form groups of at most ``pixels``. A feature that both the previous and
+    the next frame show nearby, at least half as high, is a gap of the object that moves on, and stays.
+    """
+    sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
+    for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
+        height = _height(frames[f])
+        neighbours = (frames[f - 1 if f else 1], frames[f + 1 if f + 1 < len(frames) else f - 1])
+        shown = [scipy.ndimage.maximum_filter(_height(frame), size=_MOVED) for frame in neighbours]
+        sparks[f] &= np.minimum(*shown) < _SHOWN_AGAIN * height
+    return sparks
+
+
+def _sparks_of(frame: np.ndarray, threshold: float, least: float, pixels: int) -> np.ndarray:
+    height = _height(frame)
+    bright = height > least
+    if not bright.any():
+        return bright
+    usual = scipy.ndimage.median_filter(np.abs(height), size=9, mode="nearest")
+    bright &= height > threshold * NORMAL_MAD * usual
+    for sides in _opposite(frame):
+        bright &= sides - frame > _SHARPNESS * height
+    groups, count = scipy.ndimage.label(bright, _AROUND)
+    sizes = np.bincount(groups.ravel(), minlength=count + 1)
+    return bright & (sizes[groups] <= pixels)
+
+
+def _height(frame: np.ndarray) -> np.ndarray:
+    """Returns how much brighter than the median of 5 × 5 pixels a frame (v, u) is, in line integrals."""
+    return np.asarray(scipy.ndimage.median_filter(frame, size=5, mode="nearest") - frame)
+
+
+def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
+    """Yields for each direction the lower of the two opposite pixels (v, u), mirrored beyond the panel's edge.
+
+    They are two pixels away, or three where another spark is there.
+    """
+    wide = np.pad(frame, _FAR, mode="symmetric")
+    rows, columns = frame.shape
+
+    def moved(v: int, u: int) -> np.ndarray:
+        return wide[_FAR + v : _FAR + v + rows, _FAR + u : _FAR + u + columns]
+
+    for v, u in _DIRECTIONS:
+        pairs = (np.minimum(moved(k * v, k * u), moved(-k * v, -k * u)) for k in (_NEAR, _FAR))
+        yield np.maximum(*pairs)
+
+
+def mask_dead(scan: Scan, options: DeadOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan with its dead pixels and lines masked and interpolated."""
+    column = axis_column(scan)
+    dead = find_dead(scan.projections, deviations=options.deviations, axis_column=column) & scan.valid.any(0)
+    rows, columns = (int(np.count_nonzero(dead.all(axis=axis))) for axis in (1, 0))
+    return with_masked(scan, dead), {"pixels": int(dead.sum()), "rows": rows, "columns": columns}
+
+
+def axis_column(scan: Scan) -> float:
+    """Returns the column, in pixels, onto which the first frame projects the axis of rotation."""
+    time_s = scan.frame_start_s[:1] + scan.shutter.middle_s
+    source, corner, u, v = scan.trajectory.pose(0, time_s)[0].reshape(4, 3)
+    return float(np.linalg.lstsq(np.stack([u, v, source], axis=1), source - corner, rcond=None)[0][0])
+
+
+def find_dead(
+    frames: np.ndarray, *, deviations: float = _DEVIATIONS, axis_column: float | None = None
+) -> np.ndarray:
+    """Returns the dead pixels (v, u) bool of line integrals (F, v, u); none for fewer than five frames.
+
+    A pixel is dead if it never changes while its neighbours do. It is also dead if it exceeds all its neighbours in 70 % of
+    the frames and differs from the median of 3 × 3 pixels by more than ``deviations`` of the panel's pixels. Near
+    ``axis_column`` small parts of the object stand still on the panel: there a dead pixel has to be sharper than these. A
+    row or column that exceeds its two neighbours over nearly all its length is dead as a whole.
+    """
+    if len(frames) < LEAST_FRAMES:
+        return np.zeros(frames.shape[1:], bool)
+    numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
+    some = np.asarray(frames)[numbers]
+    still = np.zeros(frames.shape[2], bool)
+    if axis_column is not None:
+        still = np.abs(np.arange(frames.shape[2]) - axis_column) <= _NEAR_AXIS
+    pixels = _constant(some) | (_exceeding(some, deviations) & ~(_shared(some) & still))
+    return pixels | _lines(some, deviations)
+
+
+def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
+    """Returns whole rows and columns (v, u) bool that exceed both neighbours nearly everywhere, in the median over frames.
+
+    That includes air, and no object is so long and thin.
+    """
+    dead = np.zeros(frames.shape[1:], bool)
+    floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
+    for axis in (0, 1):
+        lines = np.moveaxis(frames, axis + 1, 0)
+        if len(lines) < 3:
+            continue
+        steps = np.diff(lines, axis=0)
+        usual = NORMAL_MAD * float(np.median(np.abs(np.median(steps, axis=1))))
+        before, after = steps[:-1], -steps[1:]
+        peak = np.where(before * after > 0, np.sign(before) * np.minimum(np.abs(before), np.abs(after)), 0)
+        exceeds = np.abs(np.median(peak, axis=1)) > deviations * max(usual, floor)
+        np.moveaxis(dead, axis, 0)[1 + np.flatnonzero(exceeds.mean(axis=1) > _LINE)] = True
+    return dead
+
+
+def _constant(frames: np.ndarray) -> np.ndarray:
+    """Returns the pixels that never change while their neighbours do, except for air without noise."""
+    swing = np.ptp(frames, axis=0)
+    constant = swing == 0
+    sides = np.zeros_like(constant)
+    sides[:, [0, -1]] = constant[:, [0, -1]]
+    if sides[:, [0, -1]].mean() > _STILL_SIDES:
+        level, pattern = float(np.median(frames[0][sides])), robust_deviation(frames[0][sides])
+        air = constant & (np.abs(frames[0] - level) <= _DEVIATIONS * pattern)
+        constant = constant & ~scipy.ndimage.binary_propagation(sides, _AROUND, mask=air)
+    return constant & (scipy.ndimage.median_filter(swing, size=3) > 0)
+
+
+def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
+    """Returns pixels far beyond all their neighbours in most frames: edges of the object move on, or have similar pixels."""
+    above = np.mean([f > scipy.ndimage.maximum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
+    below = np.mean([f < scipy.ndimage.minimum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
+    difference = np.median([f - scipy.ndimage.median_filter(f, size=3) for f in frames], axis=0)
+    floor = 1e-3 * float(np.percentile(frames, 99.9))
+    least = deviations * max(robust_deviation(difference), floor, 1e-12)
+    return (np.abs(difference - np.median(difference)) > least) & (np.maximum(above, below) > _MOST_TIMES)
+
+
+def _shared(frames: np.ndarray) -> np.ndarray:
+    """Returns pixels whose difference from the median of 5 × 5 their four neighbours share; one of these may be dead too."""
+    difference = np.median([f - scipy.ndimage.median_filter(f, size=5) for f in frames], axis=0)
+    wide = np.pad(difference, 1, mode="edge")
+    sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)
+    return sides * np.sign(difference) > _SHARED * np.abs(difference)

@@ -1,0 +1,172 @@
+"""Light that changes during a scan: its pattern from flats, its amount from air.
+
+Flats are interpolated in time or combined. time: linearly between the means of flats that were taken together, in the order
+of the stored frames. pca: each frame takes the combination of their principal components that leaves the least total
+variation, in logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975). The amount of light in each frame comes from
+the step ``air``: pixels beside the object, as in nabu and in algotom's ROI normalisation.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.detector.attenuation import DARK, FLAT, PROJECTION, TRANSMISSION_FLOOR, mean_dark, minus_log
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+
+WAYS = ("mean", "time", "pca")
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # components, and their least variance over the median one's
+_REWEIGHTINGS = 12
+_LEAST_PIXELS = 20
+_AROUND = np.ones((3, 3), bool)
+_MARGIN = 2  # pixels between air and the object's edge
+_PASSES = 3  # the threshold moves with the value of air
+Counts = np.ndarray
+ToAttenuation = Callable[[Counts, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
+
+
+def flat_correction(way: str) -> ToAttenuation:
+    """Returns the function by which ``read_scan`` converts counts, with flats as ``way`` says.
+
+    It takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels. It raises
+    InputError for other quantities and for too few flats.
+    """
+    checks.one_of("flats", way, WAYS)
+    if way == "mean":
+        return counts_to_attenuation
+
+    def convert(data: Counts, image_key: np.ndarray, quantity: str) -> tuple[np.ndarray, np.ndarray]:
+        flats = np.flatnonzero(image_key == FLAT)
+        needed = 2 if way == "time" else 3
+        if quantity != "counts" or len(flats) < needed:
+            found = f"{quantity} with {len(flats)} flats"
+            remedy = "take the mean of the flats (flats=mean)"
+            raise InputError(f"flats={way}", found, f"counts with at least {needed} flats", remedy)
+        dark = mean_dark(data[image_key == DARK], data.shape[1:])
+        signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
+        numbers = np.flatnonzero(image_key == PROJECTION)
+        light = _in_time(signal, flats, numbers) if way == "time" else _of_components(signal, data, dark, numbers)
+        result = np.empty((len(numbers), *data.shape[1:]), np.float32)
+        bad = np.empty(result.shape, bool)
+        for i, frame in enumerate(numbers):
+            result[i], bad[i] = minus_log(data[frame] - dark, light(i))
+        return result, bad
+
+    return convert
+
+
+def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Callable[[int], np.ndarray]:
+    """Returns the flat of each projection, between the means of groups of flats by their frame numbers."""
+    groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
+    time = np.array([flats[group].mean() for group in groups])
+    means = np.stack([signal[group].mean(axis=0) for group in groups])
+
+    def light(i: int) -> np.ndarray:
+        share = np.array([np.interp(numbers[i], time, unit) for unit in np.eye(len(time))])
+        return np.tensordot(share, means, axes=1)
+
+    return light
+
+
+def _of_components(
+    signal: np.ndarray, data: Counts, dark: np.ndarray, numbers: np.ndarray
+) -> Callable[[int], np.ndarray]:
+    """Returns the flat of each projection, from the principal components of the flats' logarithms."""
+    mean = signal.mean(axis=0)
+    live = mean > 0
+    ratio = np.divide(signal, mean, out=np.ones_like(signal), where=live)
+    logs = np.log(np.maximum(ratio, TRANSMISSION_FLOOR)).reshape(len(signal), -1)
+    _, size, components = np.linalg.svd(logs - logs.mean(axis=0), full_matrices=False)
+    size = size[: len(signal) - 1]  # the mean took one
+    clear = size**2 > _CLEAR * np.median(size**2) if len(size) > 2 else size > 0
+    used = components[: len(size)][clear][:_MOST_COMPONENTS].reshape(-1, *mean.shape)
+
+    def light(i: int) -> np.ndarray:
+        seen = np.divide(data[numbers[i]] - dark, mean, out=np.ones(mean.shape), where=live)
+        weights = _least_variation(np.log(np.maximum(seen, TRANSMISSION_FLOOR)), used)
+        return mean * np.exp(np.tensordot(weights, used, axes=1))
+
+    return light if len(used) else lambda i: mean
+
+
+def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
+    """Returns the weights (k,) of components (k, v, u) that minimise the total variation of frame (v, u) − components.
+
+    Solves it by iteratively reweighted least squares, each difference weighted by its inverse size.
+    """
+
+    def differences(image: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.diff(image, axis=axis).ravel() for axis in (-2, -1)])
+
+    wanted, basis = differences(frame), np.stack([differences(c) for c in components], axis=1)
+    weights = np.zeros(len(components))
+    for _ in range(_REWEIGHTINGS):
+        residual = np.abs(wanted - basis @ weights)
+        inverse = 1 / np.maximum(residual, 1e-3 * max(float(residual.mean()), 1e-12))
+        scaled = basis * inverse[:, None]
+        weights = np.linalg.lstsq(scaled.T @ basis, scaled.T @ wanted, rcond=None)[0]
+    return weights
+
+
+@dataclass(frozen=True)
+class AirOptions:
+    """below: share of the scan's largest line integral below which a pixel may be air, if it is connected with a side of the
+    panel. least: least share of air in every frame."""
+
+    below: float = 0.05
+    least: float = 0.01
+
+    def __post_init__(self) -> None:
+        checks.fields_within("air.", self, {"below": (1e-4, 0.5), "least": (0, 1)})
+
+
+def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan with the median of each frame's air shifted to 0."""
+    frames = unmasked_frames(scan)
+    air = enough_air(frames, options.below, options.least, "air", "leave the step out, or lower air.least")
+    clean, value = with_air_at_0(frames, air)
+    light = np.exp(-value)
+    facts = {"light": [float(light.min()), float(light.max())], "air_share": float(air.mean())}
+    return replace(scan, projections=clean), facts
+
+
+def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
+    """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
+
+    They are below the share ``below`` of the largest line integral, connected with the first or last column, and at least
+    two pixels away from all others.
+    """
+    limit = below * float(np.percentile(frames, 99.9))
+    air = np.empty(frames.shape, bool)
+    for f, frame in enumerate(frames):
+        low, value = frame < limit, 0.0
+        for _ in range(_PASSES):
+            sides = np.zeros_like(low)
+            sides[:, [0, -1]] = low[:, [0, -1]]
+            reached = scipy.ndimage.binary_propagation(sides, _AROUND, mask=low)
+            value = float(np.median(frame[reached])) if reached.any() else 0.0
+            low = frame < limit + value
+        air[f] = scipy.ndimage.binary_erosion(reached, _AROUND, iterations=_MARGIN, border_value=1)
+    return air
+
+
+def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy: str) -> np.ndarray:
+    """Returns ``find_air``. Raises InputError where a frame has too little."""
+    air = find_air(frames, below=below)
+    counts = air.sum(axis=(1, 2))
+    needed = max(_LEAST_PIXELS, int(np.ceil(least * frames[0].size)))
+    if counts.min() < needed:
+        worst = int(np.argmin(counts))
+        raise InputError(f"--steps {step}", f"{counts[worst]} pixels of air in frame {worst}", f"at least {needed}", remedy)
+    return air
+
+
+def with_air_at_0(frames: np.ndarray, air: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns line integrals (F, v, u) with each frame's median over ``air`` shifted to 0, and these medians (F,)."""
+    value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
+    return frames - value[:, None, None].astype(np.float32), value
