@@ -23,7 +23,7 @@ from scans import RAPID, append, chosen, files_of, lines_of, make_scan, read_lin
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Protocol, Scan, make_protocol
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, check
 from phyradgs_cl.runtime import Runtime
 

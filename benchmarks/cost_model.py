@@ -26,7 +26,8 @@ from measuring import Facts, finish, parser_of
 from splat_speed import cloud
 
 from phyradgs_cl.acquisition import ConeGeometry, Exact, Scan, make_protocol
-from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, segments_for, static_cells
+from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, segments_for, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, Trajectory
-from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
-from phyradgs_cl.acquisition.common_times import common_time_cells
+from phyradgs_cl.acquisition.cells import common_time_cells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.runtime import Runtime

@@ -21,13 +21,13 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, make_protocol
 from phyradgs_cl.acquisition.cells import (
-    TimeCells,
     exact_cells,
     micro_view_cells,
     per_line_cells,
     segments_for,
     static_cells,
 )
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.twins.splat import precision_matrices

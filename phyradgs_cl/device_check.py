@@ -11,8 +11,8 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
-from phyradgs_cl.acquisition.common_times import common_time_cells
+from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE

@@ -22,7 +22,7 @@ from quick import is_quick  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
 from phyradgs_cl.acquisition import ConeGeometry, make_protocol  # noqa: E402
-from phyradgs_cl.acquisition.cells import TimeCells  # noqa: E402
+from phyradgs_cl.acquisition.time_cells import TimeCells  # noqa: E402
 from phyradgs_cl.fields import Grid  # noqa: E402
 from phyradgs_cl.io import write_scan  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402

@@ -7,12 +7,12 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import (
-    TimeCells,
     exact_cells,
     micro_view_cells,
     per_line_cells,
     static_cells,
 )
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.runtime import Runtime

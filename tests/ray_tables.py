@@ -3,8 +3,8 @@
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
-from phyradgs_cl.acquisition.common_times import common_time_cells
+from phyradgs_cl.acquisition.cells import common_time_cells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 
 SHAPE = (13, 18)
 

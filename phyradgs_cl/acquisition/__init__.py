@@ -1,6 +1,5 @@
 """How the scan was taken: geometry, trajectory, shutter, time cells, and the scan that holds them."""
 
-from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import ConeGeometry, pixel_centres, transpose_pose
 from phyradgs_cl.acquisition.motion import (
     MOTIONS,
@@ -16,6 +15,7 @@ from phyradgs_cl.acquisition.motion import (
 from phyradgs_cl.acquisition.protocol import PROTOCOLS, Protocol, make_protocol
 from phyradgs_cl.acquisition.scan import Saturation, Scan
 from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import (
     CircularOrbit,
     ConstantSpeed,

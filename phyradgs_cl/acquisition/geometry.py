@@ -1,9 +1,10 @@
-"""Cone-beam geometry: where source and detector stand at a gantry angle.
+"""Cone-beam geometry: positions of source and detector at a gantry angle, and the field of view.
 
 A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
 and from row to row (v̂·dv). Operators take poses, never angles.
 """
 
+import math
 from dataclasses import dataclass, replace
 from numbers import Real
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
 
@@ -19,10 +21,10 @@ POSE_LENGTH = 12
 class ConeGeometry:
     """A circular cone-beam orbit about +z with a flat panel, in mm.
 
-    ``source_to_axis_mm`` and ``source_to_detector_mm`` are along the central ray, ``detector_shape`` counts (rows, columns),
-    ``pixel_size_mm`` is (dv, du), or one number for square pixels, kept as the pair. ``detector_offset_mm`` (v, u) in mm
-    shifts the panel's centre away from that ray.
-    Raises InputError for lengths and counts that are not above 0, and a panel nearer to the source than the axis.
+    ``source_to_axis_mm`` and ``source_to_detector_mm`` are measured along the central ray. ``detector_shape`` counts (rows,
+    columns). ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the
+    panel's centre from the central ray: v > 0 up, to higher rows; u > 0 to higher columns, right seen from the source.
+    Raises InputError for lengths and counts that are not above 0, and for a panel nearer to the source than the axis.
     """
 
     source_to_axis_mm: float
@@ -48,7 +50,7 @@ class ConeGeometry:
             object.__setattr__(self, name, tuple(checks.numbers(name, getattr(self, name), (2,)).tolist()))
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
-        """Poses (..., 12) float64 at gantry angles (...) (design: source at (DSO cos θ, DSO sin θ, 0))."""
+        """Returns poses (..., 12) float64 at gantry angles (...): the source is at (DSO cos θ, DSO sin θ, 0)."""
         angle = np.asarray(angle_rad, dtype=np.float64)
         cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
         radial = np.stack([cos, sin, zero], -1)
@@ -64,7 +66,7 @@ class ConeGeometry:
         return np.concatenate([self.source_to_axis_mm * radial, first_pixel, du * u_hat, dv * v_hat], -1)
 
     def scaled(self, factor: float) -> "ConeGeometry":
-        """The same geometry with every length multiplied by ``factor``."""
+        """Returns the geometry with every length multiplied by ``factor``."""
         dv, du = self.pixel_size_mm
         off_v, off_u = self.detector_offset_mm
         return replace(
@@ -76,7 +78,7 @@ class ConeGeometry:
         )
 
     def finer(self, factor: int) -> "ConeGeometry":
-        """The same panel with every pixel cut into ``factor`` by ``factor``."""
+        """Returns the geometry with every pixel cut into ``factor`` by ``factor``."""
         rows, columns = self.detector_shape
         dv, du = self.pixel_size_mm
         return replace(
@@ -85,19 +87,19 @@ class ConeGeometry:
 
     @property
     def magnification(self) -> float:
-        """Detector size over object size at the axis."""
+        """The size of an object's image on the detector over its size, at the axis."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
 def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
-    """InputError unless ``value`` is a positive length, or (v, u) of them."""
+    """Raises InputError unless ``value`` is a positive length, or a pair (v, u) of them."""
     if (checks.numbers(name, value, shape) <= 0).any():  # type: ignore[arg-type]
         expected = "two positive lengths in mm (v, u)" if shape else "a positive length in mm"
         raise InputError(name, checks.shown(value), expected)
 
 
 def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarray:
-    """World coordinates (..., nv, nu, 3) of all pixel centres of poses (..., 12)."""
+    """Returns the world coordinates (..., nv, nu, 3) of all pixel centres for poses (..., 12)."""
     nv, nu = detector_shape
     pose = np.asarray(pose, dtype=np.float64)[..., None, None, :]
     columns, rows = np.arange(nu)[None, :, None], np.arange(nv)[:, None, None]
@@ -105,7 +107,7 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
-    """The circular geometry nearest to poses (F, 12), by mean distances and offsets; sizes are taken from it.
+    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets.
 
     The detector's distance is that of its plane, its offset that of its middle from the source's foot on the plane.
     """
@@ -123,5 +125,74 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
 
 
 def transpose_pose(pose: np.ndarray) -> np.ndarray:
-    """The same poses (..., 12) for an image whose rows and columns are exchanged."""
+    """Returns the poses (..., 12) for an image with rows and columns exchanged."""
     return np.concatenate([pose[..., :6], pose[..., 9:12], pose[..., 6:9]], -1)
+
+
+def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
+    """Returns half the sides (z, y, x) of the box about the origin that the cones of a full turn fill.
+
+    The radius is DSO·sin(atan(half width/DSD)), with the far edge of a shifted panel; the height is the cone's, behind the
+    axis at that radius.
+    """
+    sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
+    half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
+    half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
+    radius_mm = geometry.source_to_axis_mm * math.sin(half_fan_rad)
+    behind_mm = geometry.source_to_axis_mm + radius_mm
+    return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
+
+
+def default_grid(geometry: ConeGeometry) -> Grid:
+    """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis.
+
+    It is lower where the panel has few rows.
+    """
+    half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
+    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
+    wide = max(1, math.ceil(2 * radius_mm / voxel_mm))
+    high = max(1, min(wide, round(2 * half_height_mm / voxel_mm)))
+    return Grid((high, wide, wide), (voxel_mm,) * 3)
+
+
+def misses(grid: Grid, geometry: ConeGeometry) -> bool:
+    """Returns whether no voxel of ``grid`` lies in the field of view."""
+    low_mm, high_mm = grid.box_mm.T
+    half_mm = np.array(field_of_view_mm(geometry))
+    return bool(np.any((low_mm >= half_mm) | (high_mm <= -half_mm)))
+
+
+def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str:
+    """Returns where a grid lies that no ray of a pose (12,) meets, "behind the panel" or "beside the rays"; else ""."""
+    source, first, step_u, step_v = pose.reshape(4, 3)
+    rows, columns = detector_shape
+    edges = [(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)]
+    rays = np.array([first + u * step_u + v * step_v - source for u, v in edges])
+    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3) - source
+    away = np.cross(step_u, step_v)
+    away = away * np.sign(away @ rays[0])
+    sides = np.cross(rays, np.roll(rays, -1, axis=0))
+    inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
+    if (corners @ away > rays[0] @ away).all():
+        return "behind the panel"
+    planes = np.concatenate([inward, away[None]])  # of the pyramid of rays, and the source's own
+    return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
+
+
+def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
+    """Returns how far behind the middle of ``grid`` the panel of a pose (12,) stands.
+
+    A panel less than half the grid's width behind stands inside it, and rays end there.
+    """
+    source, first, step_u, step_v = pose.reshape(4, 3)
+    away = np.cross(step_u, step_v)
+    away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)
+    return float((first - np.array(grid.offset_mm)[::-1]) @ away)
+
+
+def cuts(grid: Grid, whole: Grid, geometry: ConeGeometry) -> bool:
+    """Returns whether ``grid`` ends, by more than a voxel, inside the visible part of the box of ``whole``."""
+    half_mm = np.array(field_of_view_mm(geometry))
+    low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
+    begin_mm, end_mm = grid.box_mm.T
+    return bool(np.any((begin_mm - low_mm > grid.voxel_size_mm) | (high_mm - end_mm > grid.voxel_size_mm)))

@@ -12,11 +12,11 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import cells
-from phyradgs_cl.acquisition.cells import TimeCells
-from phyradgs_cl.acquisition.common_times import common_time_cells
+from phyradgs_cl.acquisition.cells import common_time_cells
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
 

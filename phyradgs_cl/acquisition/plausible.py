@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from phyradgs_cl.acquisition.field_of_view import field_of_view_mm
-from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.geometry import ConeGeometry, field_of_view_mm
 from phyradgs_cl.acquisition.readout import Named
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid

@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.field_of_view import (
+from phyradgs_cl.acquisition.geometry import (
+    POSE_LENGTH,
+    ConeGeometry,
     default_grid,
     field_of_view_mm,
     hidden,
     misses,
     panel_behind_mm,
+    plain_geometry,
 )
-from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, plain_geometry
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.readout import exposure_of, readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import check_not_counts, check_others

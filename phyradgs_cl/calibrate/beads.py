@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import OwnTimes, Scan
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.calibrate.level import MOST_FRAMES
 from phyradgs_cl.calibrate.moved import Change, Sway, Views, moved
 from phyradgs_cl.check.coarse import binned, fewer_frames

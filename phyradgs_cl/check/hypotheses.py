@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.check.coarse import coarse_grid
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
 from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped

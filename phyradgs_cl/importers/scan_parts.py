@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid

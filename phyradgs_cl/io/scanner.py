@@ -6,7 +6,7 @@ from pathlib import Path
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.acquisition.readout import readout_order
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES

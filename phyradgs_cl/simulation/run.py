@@ -7,7 +7,8 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
-from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import per_line_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import (
     add_scatter,
     add_sparks,

@@ -6,7 +6,7 @@ from typing import Protocol as Interface
 import numpy as np
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import average
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector

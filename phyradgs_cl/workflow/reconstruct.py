@@ -16,7 +16,7 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks, signals
 from phyradgs_cl.acquisition import MicroViews, Scan
-from phyradgs_cl.acquisition.field_of_view import cuts
+from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
     check_writable,

@@ -6,8 +6,8 @@ from ray_tables import noise
 from tolerances import COMMON_TIMES
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, EncoderTable, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, per_line_cells
-from phyradgs_cl.acquisition.common_times import common_time_cells
+from phyradgs_cl.acquisition.cells import common_time_cells, per_line_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.runtime import Runtime

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter, transpose_pose
-from phyradgs_cl.acquisition.field_of_view import cuts, field_of_view_mm, hidden, misses
+from phyradgs_cl.acquisition.geometry import cuts, field_of_view_mm, hidden, misses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
 from phyradgs_cl.check.questions import consistency
 from phyradgs_cl.check.questions.exposure import check_exposure

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, static_cells
+from phyradgs_cl.acquisition.cells import static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid

@@ -22,7 +22,7 @@ from phyradgs_cl.acquisition import (
     SpeedRamp,
     Static,
 )
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid

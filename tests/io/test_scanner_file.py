@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_scanner, with_detector_count

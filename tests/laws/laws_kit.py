@@ -7,7 +7,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 
 STRESSED = int(os.environ.get("STRESS", "1")) > 1

@@ -6,7 +6,7 @@ from kernel_kit import splat, splat_gradients
 from laws_kit import cloud, many, seeds, tables
 from tolerances import ADJOINT, GRADIENT, SPLAT_CLOUD
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields.gaussians import DENSITY
 from phyradgs_cl.operators.twins.splat import splat_frame
 from phyradgs_cl.runtime import Runtime

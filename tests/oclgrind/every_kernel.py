@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Protocol, Scan, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import (
     DensityOperator,

@@ -9,7 +9,7 @@ from kernel_kit import assert_near
 from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator, RayProjector
 from phyradgs_cl.operators.rays.cell_layers import layers

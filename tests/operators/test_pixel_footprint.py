@@ -10,7 +10,8 @@ from remembered import remembered
 from tolerances import FOOTPRINT_AREA, FOOTPRINT_MASS, GRADIENT, SPLAT_MOVING
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells, static_cells
+from phyradgs_cl.acquisition.cells import static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.operators.twins.splat_moving import moving_frame

@@ -9,7 +9,7 @@ from ray_tables import SHAPE, noise, tables
 from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import LinearOperator, RayOperator, RayProjector

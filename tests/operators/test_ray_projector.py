@@ -17,7 +17,7 @@ from tolerances import (
 )
 
 from phyradgs_cl.acquisition import pixel_centres
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayProjector, voxelise

@@ -11,7 +11,7 @@ from ray_tables import noise, tables
 from remembered import remembered
 from tolerances import RAYS, RAYS_BACK
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout

@@ -14,12 +14,12 @@ from tolerances import (
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import (
-    TimeCells,
     exact_cells,
     micro_view_cells,
     per_line_cells,
     static_cells,
 )
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_frame, splat_image
 from phyradgs_cl.runtime import Runtime

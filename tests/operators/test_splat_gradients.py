@@ -16,7 +16,7 @@ from kernel_kit import (
 from tolerances import CUTOFF_EDGE_SIGMA, FLOAT64, GRADIENT
 
 from phyradgs_cl.acquisition import Shutter
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields.gaussians import QUATERNION, SCALE
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.splats.layout import projection_matrices

@@ -10,7 +10,7 @@ from remembered import remembered
 from tolerances import GRADIENT, INTENSITY_FRAME, SPLAT_CLOUD
 
 from phyradgs_cl.acquisition import Shutter
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import average
 from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_frame

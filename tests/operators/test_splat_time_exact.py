@@ -19,12 +19,12 @@ from tolerances import (
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import (
-    TimeCells,
     exact_cells,
     micro_view_cells,
     per_line_cells,
     static_cells,
 )
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.twins.splat_moving import moving_frame
 

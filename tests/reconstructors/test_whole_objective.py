@@ -12,7 +12,7 @@ from kernel_kit import assert_classes
 from tolerances import FINITE_DIFFERENCE_STEP, WHOLE_GRADIENT, WHOLE_VALUE
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, MicroViews, Scan, Shutter
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import MEAN

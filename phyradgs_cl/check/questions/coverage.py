@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.field_of_view import field_of_view_mm
+from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 

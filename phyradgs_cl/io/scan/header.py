@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
-from phyradgs_cl.acquisition.field_of_view import default_grid
+from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import intensity_average
 
 

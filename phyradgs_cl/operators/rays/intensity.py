@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import layered

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, whole
 from phyradgs_cl.operators.splats.layout import projection_matrices

@@ -7,7 +7,7 @@ from typing import Protocol as Interface
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.cell_layers import averaged, layered

@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.layout import RayCells, matrix_table, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime

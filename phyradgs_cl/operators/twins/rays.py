@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import pixel_centres
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 
 

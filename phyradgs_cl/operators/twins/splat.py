@@ -8,8 +8,8 @@ which works in detector coordinates (docs/mathematics.md).
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import pixel_centres
+from phyradgs_cl.acquisition.time_cells import TimeCells
 
 
 def precision_matrices(rows: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.cells import TimeCells
 from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators.twins.splat import precision_matrices
 
 _PANELS, _NODES = 6, 12

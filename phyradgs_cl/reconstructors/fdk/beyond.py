@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from phyradgs_cl.acquisition import LineMiddles, Motion, PerRow, Scan
-from phyradgs_cl.acquisition.cells import TimeCells
+from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.reconstructors.fdk.views import widened

@@ -1,0 +1,150 @@
+"""Time cells: one table of (pose, lines, weight) for each frame, which drives every operator.
+
+A frame is a sum over cells: its pixel lines [line_start, line_stop) receive ``weight`` times the projection from the cell's
+pose. The weights of a line sum to 1. ``cells.py`` builds these tables.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class TimeCells:
+    """The time cells of one frame, sorted by line_start, so that the cells of a line are neighbours.
+
+    pose (C, 12) in mm refers to the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
+    line_start, line_stop (C,) count lines along the readout ``axis``, which has ``lines`` lines. weight (C,). ``line_share``
+    (C, lines) multiplies the weight of a still cell by the share of each line's window that lies in the cell; None: 1 for
+    every line of the cell.
+
+    Moving cells are segments of the frame. ``end_poses`` (C, 2, 12) are the poses at their ends. ``line_times`` (C, 3,
+    lines) holds for each line the middle and half the length of its window in the segment, in units of the segment's length
+    from its mid-time, and the share of the line's window that lies in the segment. Their ``weight`` is 1. Methods raise
+    InputError for a user's own cells that do not fit the scan.
+    """
+
+    pose: np.ndarray
+    time_s: np.ndarray
+    line_start: np.ndarray
+    line_stop: np.ndarray
+    weight: "NDArray[np.float64]"
+    lines: int
+    axis: str = "rows"
+    end_poses: np.ndarray | None = None
+    line_times: "NDArray[np.float64] | None" = None
+    line_share: "NDArray[np.float64] | None" = None
+
+    @property
+    def count(self) -> int:
+        """The number of cells C."""
+        return len(self.weight)
+
+    def line_weights(self) -> np.ndarray:
+        """Returns the sum of the weights (lines,) of each line; 1 for a complete table."""
+        total = np.zeros(self.lines)
+        for cell, lines in enumerate(self.ranges):
+            total[lines] += self.weights_of(cell)
+        return total
+
+    @property
+    def ranges(self) -> list[slice]:
+        """The lines of every cell."""
+        return [slice(int(a), int(b)) for a, b in zip(self.line_start, self.line_stop, strict=True)]
+
+    def weights_of(self, cell: int) -> np.ndarray:
+        """Returns the weight (line_stop − line_start,) of a cell for each of its lines."""
+        lines = slice(int(self.line_start[cell]), int(self.line_stop[cell]))
+        share = self.line_share[cell, lines] if self.line_share is not None else np.ones(lines.stop - lines.start)
+        if self.line_times is not None:
+            share = self.line_times[cell, 2, lines]
+        return np.asarray(self.weight[cell] * share)
+
+    @property
+    def readout(self) -> Readout:
+        """The readout axis, which puts frames and poses in the order lines, width."""
+        return Readout(self.axis)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether poses change within a cell. Only splats support that."""
+        return self.end_poses is not None
+
+    @property
+    def averages(self) -> bool:
+        """Whether a line has more than one cell."""
+        return bool(self.layer_numbers.any())
+
+    def scaled(self, factor: float) -> "TimeCells":
+        """Returns the cells with all lengths multiplied by ``factor``."""
+        ends = None if self.end_poses is None else self.end_poses * factor
+        return replace(self, pose=self.pose * factor, end_poses=ends)
+
+    def finer(self, factor: int) -> "TimeCells":
+        """Returns still cells for pixels cut into ``factor`` by ``factor``; the parts of a line share its times."""
+        pose = self.pose.copy()
+        pose[:, 6:] /= factor
+        pose[:, 3:6] -= (factor - 1) / 2 * (pose[:, 6:9] + pose[:, 9:12])
+        lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
+        share = None if self.line_share is None else self.line_share.repeat(factor, 1)
+        return replace(self, pose=pose, line_share=share, **lines)
+
+    def still(self) -> "TimeCells":
+        """Returns these cells, for operators without motion within a cell. Raises InputError for moving cells."""
+        if self.is_moving:
+            raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
+        return self
+
+    def line_poses(self) -> np.ndarray:
+        """Returns poses (lines, 12) of the cell nearest to each line's mid-exposure, (1, 12) for a single cell.
+
+        Raises InputError for a line without a cell.
+        """
+        if self.count == 1:
+            return self.pose
+        lengths = self.line_stop - self.line_start
+        cell = np.repeat(np.arange(self.count), lengths)
+        line = np.arange(cell.size) + np.repeat(self.line_start - (np.cumsum(lengths) - lengths), lengths)
+        order = np.lexsort((self.time_s[cell], line))
+        cell, line = cell[order], line[order]
+        weight = self.weight[cell] * (1 if self.line_share is None else self.line_share[cell, line])
+        total = np.bincount(line, weight, self.lines)
+        past = np.cumsum(weight) - weight / 2 - (np.cumsum(total) - total)[line]
+        nearest = np.lexsort((np.abs(past - total[line] / 2), line))
+        served, first = np.unique(line[nearest], return_index=True)
+        if served.size < self.lines:
+            raise InputError("--motion", "a line without a time cell", "weights of every line that sum to 1")
+        return self.pose[cell[nearest[first]]]
+
+    def line_cells(self) -> np.ndarray:
+        """Returns for each line a range (lines, 2), [first, stop), that holds all its cells, and maybe others."""
+        line = np.arange(self.lines)
+        first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
+        stop = np.searchsorted(self.line_start, line, side="right")
+        return np.stack([first, stop], -1)
+
+    @cached_property
+    def layer_numbers(self) -> np.ndarray:
+        """The layer (C,) of every cell: no line has two cells in one layer. Their number is the most cells of a line."""
+        numbers = np.zeros(self.count, np.int64)
+        free_from: list[int] = []
+        for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):
+            layer = next((k for k, line in enumerate(free_from) if line <= start), len(free_from))
+            if layer == len(free_from):
+                free_from.append(0)
+            numbers[cell] = layer
+            free_from[layer] = int(stop)
+        return numbers
+
+    @cached_property
+    def layer_weights(self) -> np.ndarray:
+        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``, 0 without a cell."""
+        weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
+        for cell, lines in enumerate(self.ranges):
+            weights[self.layer_numbers[cell], lines] = self.weights_of(cell)
+        return weights
