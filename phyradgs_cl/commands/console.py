@@ -35,12 +35,11 @@ def complain(text: str, status: int = 2) -> int:
 
 
 def scores(metrics: Mapping[str, float | None]) -> str:
-    """PSNR, SSIM and the error on held-out pixels where there are any, with a comma before each."""
-    psnr_db, ssim, held_out = (metrics.get(name) for name in ("psnr_db", "ssim", "holdout_rms"))
-    said = "" if psnr_db is None else f", PSNR {psnr_db:.2f} dB, SSIM {ssim:.4f}"
-    if held_out is not None:
-        said += f", held-out pixels {held_out:.4g} RMS of line integrals (noise {metrics['holdout_noise_rms']:.4g})"
-    return said
+    """Returns the metrics of a run, and its errors on held-out pixels, with a comma before each."""
+    from phyradgs_cl.metrics import HELD_OUT, printed
+
+    words = [*printed(metrics), *printed(metrics, HELD_OUT)]
+    return "".join(f", {title} {value}" for title, value in words)
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_argument, file_option, option
+from phyradgs_cl.metrics import printed
 from phyradgs_cl.settings import numbers
 from phyradgs_cl.workflow import run_evaluation
 
@@ -36,4 +37,5 @@ def evaluate_command(
         numbers = {key: None if value == math.inf else value for key, value in facts.items()}  # JSON has no infinity
         say(json.dumps(numbers))
     else:
-        say(f"PSNR {facts['psnr_db']:.2f} dB   SSIM {facts['ssim']:.4f}   {facts['compared']}   picture {facts['picture']}")
+        words = [f"{title} {value}" for title, value in printed(facts)]
+        say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))

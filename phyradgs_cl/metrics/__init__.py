@@ -9,10 +9,10 @@ from phyradgs_cl.metrics.align import (
     resampled,
     shared_slices,
 )
-from phyradgs_cl.metrics.quality import compare, psnr, ssim, ssim_map
+from phyradgs_cl.metrics.quality import HELD_OUT, METRICS, compare, printed, psnr, ssim, ssim_map
 from phyradgs_cl.metrics.slices import slices_png
 
 __all__ = [
-    "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "in_words", "psnr", "reference_on", "resampled", "shared_slices",
-    "slices_png", "ssim", "ssim_map",
+    "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "in_words", "printed", "psnr",
+    "reference_on", "resampled", "shared_slices", "slices_png", "ssim", "ssim_map",
 ]  # fmt: skip

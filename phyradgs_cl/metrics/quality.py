@@ -6,6 +6,8 @@ in the published tables of radiative Gaussian splatting.
 """
 
 import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -18,6 +20,38 @@ Array = NDArray[np.float64]
 WINDOW, SIGMA = 11, 1.5
 K1, K2 = 0.01, 0.03
 _VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size live at once: 80 MB
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The title, the unit and the number format of a metric."""
+
+    title: str
+    unit: str
+    form: str
+
+    def text(self, value: float) -> str:
+        """Returns a value with its unit."""
+        return f"{value:{self.form}} {self.unit}".rstrip()
+
+    @property
+    def heading(self) -> str:
+        """The title and the unit, for a column of a table."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
+
+
+METRICS = {"psnr_db": Metric("PSNR", "dB", ".2f"), "ssim": Metric("SSIM", "", ".4f")}
+"""The results of ``compare`` that are printed."""
+HELD_OUT = {"holdout_rms": Metric("held-out RMS", "", ".4g"), "holdout_noise_rms": Metric("noise RMS", "", ".4g")}
+"""The errors on pixels that the method did not see, in line integrals, where a run has held out some."""
+
+
+def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS) -> Iterator[tuple[str, str]]:
+    """Yields (title, value with unit) of the metrics that are there and are numbers."""
+    for name, metric in names.items():
+        value = metrics.get(name)
+        if isinstance(value, int | float):
+            yield metric.title, metric.text(value)
 
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:

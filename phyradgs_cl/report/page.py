@@ -10,6 +10,7 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.metrics import printed
 from phyradgs_cl.reconstructors.frames.pairs import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.facts import label, number
@@ -120,11 +121,7 @@ def _top(run: Run) -> list[Markup]:
 
 def _tiles(run: Run) -> list[tuple[str, str]]:
     tiles = [("method", str(run.stored.provenance.get("method", "unknown"))[:40])]
-    psnr, ssim = run.metrics.get("psnr_db"), run.metrics.get("ssim")
-    if isinstance(psnr, int | float):
-        tiles.append(("PSNR", f"{psnr:.2f} dB"))
-    if isinstance(ssim, int | float):
-        tiles.append(("SSIM", f"{ssim:.4f}"))
+    tiles += printed(run.metrics)
     if run.record and (names := [k for k in run.record[-1] if k in ("loss", "residual")]):
         tiles.append((f"last {label(names[0])}", number(run.record[-1][names[0]])))
     gaussians, seconds = (run.stored.provenance.get(key) for key in ("gaussians", "seconds"))

@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.io.hdf5.facts import NUMBER
-from phyradgs_cl.metrics import aligned, compare
+from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.tune.trials import TUNED
@@ -118,7 +118,7 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
         pair = None
     if pair is None:
         return Run(path, stored, scan, found, facts, None, metrics, tuple(notes))
-    if "psnr_db" not in metrics:
+    if not metrics.keys() >= METRICS.keys():
         metrics = {**compare(pair.volume, pair.reference), **metrics}
     reference = pair.reference if pair.grid is stored.grid else None
     if reference is None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.metrics import compare, psnr, ssim
+from phyradgs_cl.metrics import METRICS, compare, printed, psnr, ssim
 
 
 def _frames() -> np.ndarray:
@@ -20,3 +20,10 @@ def test_compare_uses_the_references_maximum_and_says_so() -> None:
     }
     with pytest.raises(InputError, match="reference: found a maximum of 0"):
         compare(truth, truth * 0)
+
+
+def test_every_metric_is_printed_with_its_unit() -> None:
+    truth = _frames()
+    assert compare(truth + 0.1, truth).keys() == {*METRICS, "data_range"}
+    assert list(printed({"psnr_db": 22.126, "ssim": 1.0})) == [("PSNR", "22.13 dB"), ("SSIM", "1.0000")]
+    assert list(printed({"psnr_db": "x", "ssim": None})) == []

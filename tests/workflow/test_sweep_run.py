@@ -99,7 +99,7 @@ def test_tables_have_held_out_errors_where_they_were_asked_for() -> None:
     held_out = {**line, "metrics": {"holdout_rms": 0.01234, "holdout_noise_rms": 0.0111}}
     assert "held-out" not in markdown([line], 1)
     title, _, row = markdown([held_out], 1).splitlines()[2:]
-    assert "| held-out RMS | of noise |" in title and "| 0.01234 | 0.0111 |" in row
+    assert "| held-out RMS | noise RMS |" in title and "| 0.01234 | 0.0111 |" in row
     assert "holdout_rms" in comma_separated([held_out]) and "0.01234" in comma_separated([held_out])
 
 

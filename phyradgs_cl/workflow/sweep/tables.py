@@ -11,13 +11,12 @@ import numpy as np
 from phyradgs_cl.io import written_beside
 from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.io.json_lines import Line
+from phyradgs_cl.metrics import HELD_OUT, METRICS
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.sweep.grid import flat
 
-_METRICS = {"psnr_db": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".4f")}
-_HELD_OUT = {"holdout_rms": ("held-out RMS", ".4g"), "holdout_noise_rms": ("of noise", ".4g")}  # where it was asked for
 _FACTS = ("run", "scan", "method", "preset", "seed")
-_RESULTS = ("psnr_db", "ssim", *_HELD_OUT, "seconds", "gaussians", "device", "host", "version", "volume", "error")
+_RESULTS = (*METRICS, *HELD_OUT, "seconds", "gaussians", "device", "host", "version", "volume", "error")
 
 
 def identity(line: Line) -> tuple[Any, ...]:
@@ -57,17 +56,17 @@ def markdown(lines: Sequence[Line], planned: int) -> str:
     """Returns means and standard deviations over the scans and seeds of every setting, and the failed runs below."""
     done = [line for line in lines if "error" not in line]
     measured = {name for line in done for name in line["metrics"]}
-    metrics = {**_METRICS, **{name: column for name, column in _HELD_OUT.items() if name in measured}}
+    metrics = {**METRICS, **{name: metric for name, metric in HELD_OUT.items() if name in measured}}
     rows = [
         f"{len(done)} of {planned} runs, {len(lines) - len(done)} failed; mean ± standard deviation over scans and seeds.",
         "",
-        "| setting | runs | " + " | ".join(title for title, _ in metrics.values()) + " | seconds |",
+        "| setting | runs | " + " | ".join(metric.heading for metric in metrics.values()) + " | seconds |",
         "| --- | ---: |" + " ---: |" * (len(metrics) + 1),
     ]
     for label in dict.fromkeys(line["label"] for line in done):
         same = [line for line in done if line["label"] == label]
         cells = [_cell(label), str(len(same))]
-        cells += [_mean([line["metrics"].get(name) for line in same], form) for name, (_, form) in metrics.items()]
+        cells += [_mean([line["metrics"].get(name) for line in same], metric.form) for name, metric in metrics.items()]
         cells.append(_mean([line["seconds"] for line in same], ".1f"))
         rows.append("| " + " | ".join(cells) + " |")
     rows += _failures([line for line in lines if "error" in line])
