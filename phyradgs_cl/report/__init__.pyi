@@ -1,8 +1,8 @@
 from .page import report_page as report_page
 from .page import write_report as write_report
-from .pictures.preview import Preview as Preview
-from .pictures.preview import check_preview as check_preview
-from .pictures.preview import write_preview as write_preview
-from .pictures.volume_viewer import view_volume as view_volume
+from .preview import Preview as Preview
+from .preview import check_preview as check_preview
+from .preview import view_volume as view_volume
+from .preview import write_preview as write_preview
 from .run import Run as Run
 from .run import load_run as load_run

@@ -1,4 +1,4 @@
-"""The charts of a page, drawn by matplotlib, as SVG inside the page: curves, geometry, shutter."""
+"""Charts of a page, drawn by matplotlib, as SVG inside the page; and those that are curves."""
 
 import hashlib
 import io
@@ -11,50 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    LineMiddles,
-    MicroViews,
-    Motion,
-    OwnTimes,
-    PerRow,
-    Scan,
-    StaticStart,
-)
-from phyradgs_cl.acquisition.plot import draw_windows
-from phyradgs_cl.drawing import (
-    ACCENT,
-    BOX,
-    COLOURS,
-    EDGE,
-    INK,
-    SAMPLE,
-    SOFT,
-    draw_curve,
-    round_length,
-    style_axes,
-)
+from phyradgs_cl.drawing import ACCENT, COLOURS, INK, SOFT, draw_curve, style_axes
 from phyradgs_cl.io.hdf5.facts import NUMBER
-from phyradgs_cl.report.facts import label, number, unit
-from phyradgs_cl.report.markup import Markup, element
+from phyradgs_cl.report.markup import Markup, element, label, number, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_CHARTS = 3  # of convergence
-_SIZE = 440, 320  # of the picture's own units, in which letters are 13 high
+SIZE = 440, 320  # of the picture's own units, in which letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
-_MOST_FRAMES = 180  # marks on the orbit
-_ARC_SAMPLES = 24
-_FIRST_FRAMES = 4
-_MOST_DOTS, _MOST_CELLS, _LINES_WITH_DOTS = 600, 100_000, 12
-_ROOM = 0.06  # next to the data, relative to them
 Chart = tuple[str, Markup]
 """A caption and a drawing."""
-Points = NDArray[np.float64]
 
 
-def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = _SIZE) -> Markup:
+def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
     """Returns an SVG element in the colours of the page; ``title`` and ``description`` are for screen readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -123,7 +94,7 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
     x, y = zip(*points, strict=True)
     draw_curve(axes, x, y, "iteration", words)
     axes.plot(x[-1], y[-1], "o", color=ACCENT)
-    _note(axes, number(y[-1]), (x[-1], y[-1]), (-4, 8), ha="right", weight="semibold")
+    note(axes, number(y[-1]), (x[-1], y[-1]), (-4, 8), ha="right", weight="semibold")
     if axes.get_yscale() == "linear" and 0 <= min(y) < 0.5 * max(y):
         axes.set_ylim(bottom=0)
 
@@ -143,7 +114,7 @@ def draw_tuning(axes: "Axes", tuned: Mapping[str, Any]) -> None:
     axes.plot(values, errors, "o-", color=ACCENT, ms=4)
     axes.plot([chosen, chosen], [min(errors), error], "--", color=ACCENT)
     axes.plot(chosen, error, "o", color=ACCENT, ms=9)
-    _note(axes, number(chosen), (chosen, error), (0, 10), weight="semibold")
+    note(axes, number(chosen), (chosen, error), (0, 10), weight="semibold")
     if is_log:
         axes.set_xscale("log")
     style_axes(axes, name, "held-out RMS")
@@ -176,208 +147,7 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
     return chart(draw, "Histogram of line integrals", "Pixels of all frames by line integral, before and after.")
 
 
-# --- geometry -----------------------------------------------------------------------------------------------
-
-
-def orbit_chart(scan: Scan) -> Markup:
-    """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume."""
-    middles, words = source_positions(scan), f"{scan.frames} source positions; the first frame's rays, panel and volume"
-    arc = _first_arc(scan)
-    first, last = (panel_corners(pose, scan.geometry.detector_shape)[:, :2] for pose in arc[[0, -1]])
-    panel, later = (np.array([c[[0, 1]].mean(0), c[[2, 3]].mean(0)]) for c in (first, last))
-    box = _box_corners(scan)[:4, :2]
-
-    def draw(axes: "Axes") -> None:
-        axes.fill(*box.T, facecolor=BOX, edgecolor=SOFT)
-        axes.plot(*middles[:: max(1, len(middles) // _MOST_FRAMES), :2].T, ".", color=SOFT, ms=4)
-        axes.plot(*np.array([panel[0], arc[0, :2], panel[1]]).T, color=ACCENT, alpha=0.55, lw=1)
-        axes.plot(*panel.T, color=INK, lw=4)
-        if scan.is_fly:
-            axes.plot(*later.T, color=INK, lw=4, alpha=0.3)
-            axes.plot(*arc[:, :2].T, color=EDGE, lw=6, alpha=0.75)
-        axes.plot(*arc[0, :2], "o", color=ACCENT, ms=9)
-        axes.plot(0, 0, "o", color=INK, ms=4)
-        way = arc[0, :2] - arc[-1, :2]
-        length = float(np.linalg.norm(way))
-        shift = (0, 10) if length == 0 else (20 * way[0] / length, 20 * way[1] / length)
-        _note(axes, "source", arc[0, :2], shift)
-        _note(axes, "panel", panel[panel[:, 1].argmax()], (0, 8))
-
-    return _plan(draw, (middles[:, :2], arc[:, :2], panel, later, box), "Geometry from above", words)
-
-
-def side_chart(scan: Scan) -> Markup:
-    """Returns the scanner from the side, in the plane of its axis and central ray: source, cone, panel and volume."""
-    pose = _first_arc(scan)[0]
-    corners = panel_corners(pose, scan.geometry.detector_shape)
-    across = (corners.mean(0) - pose[:3])[:2]
-    across = across / (np.linalg.norm(across) or 1.0)
-    plane = np.array([[*across, 0.0], [0.0, 0.0, 1.0]]).T
-    source, low, high = pose[:3] @ plane, corners[[0, 2]].mean(0) @ plane, corners[[1, 3]].mean(0) @ plane
-    (left, bottom), (right, top) = (f(_box_corners(scan) @ plane, axis=0) for f in (np.min, np.max))
-    box = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
-    axis = np.array([[0.0, bottom], [0.0, top]]) * 1.25
-
-    def draw(axes: "Axes") -> None:
-        axes.fill(*box.T, facecolor=BOX, edgecolor=SOFT)
-        axes.plot(*axis.T, "-.", color=SOFT, lw=1)
-        axes.plot(*np.array([low, source, high]).T, color=ACCENT, alpha=0.55, lw=1)
-        axes.plot(*np.array([low, high]).T, color=INK, lw=4)
-        axes.plot(*source, "o", color=ACCENT, ms=9)
-        _note(axes, "source", source, (0, 10))
-        _note(axes, "panel", high, (0, 8))
-        _note(axes, "axis", axis[1], (0, 3))
-
-    points = (source[None], low[None], high[None], box, axis)
-    return _plan(draw, points, "Geometry from the side", "source, axis, volume and panel")
-
-
-def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, words: str) -> Markup:
-    """Returns a drawing in mm to scale, with a scale bar and room for labels around ``points``, each (N, 2)."""
-    every = np.concatenate(points)
-    low, high = every.min(axis=0), every.max(axis=0)
-    room = 0.1 * float(np.max(high - low)) or 1.0
-    (left, bottom), (right, top) = low - room * np.array([1.0, 1.6]), high + room
-
-    def scaled(axes: "Axes") -> None:
-        draw(axes)
-        bar_mm = round_length(0.25 * (right - left))
-        ends, height = [left + 0.2 * room, left + 0.2 * room + bar_mm], bottom + 0.3 * room
-        axes.plot(ends, [height, height], "|-", color=SOFT, lw=1)
-        _note(axes, f"{number(bar_mm)} mm", (np.mean(ends), height), (0, 4), color=SOFT, size="small")
-        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-        axes.set_axis_off()
-
-    return chart(scaled, title, words, (_SIZE[0], _SIZE[0] * (top - bottom) / (right - left)))
-
-
-def source_positions(scan: Scan) -> Points:
-    """Returns the poses (F, 12) in the middle of every frame's exposure; a pose begins with the source in mm."""
-    times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
-    return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
-
-
-def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
-    """Returns the panel's corners (4, 3) mm at a pose (12,): (low, left), (high, left), (low, right), (high, right)."""
-    rows, columns = detector_shape
-    u, v = np.array([-0.5, columns - 0.5]), np.array([-0.5, rows - 0.5])
-    return np.array([pose[3:6] + a * pose[6:9] + b * pose[9:12] for a in u for b in v])
-
-
-def _first_arc(scan: Scan) -> Points:
-    """Returns poses (T, 12) of the first frame, from first light to last."""
-    first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
-    return scan.trajectory.pose(0, scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES))
-
-
-def _box_corners(scan: Scan) -> Points:
-    """Returns the corners (8, 3) x y z mm of the grid: the lower four in a circle, then the upper four."""
-    half, centre = np.array(scan.grid.size_mm[::-1]) / 2, np.array(scan.grid.offset_mm[::-1])
-    around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    return np.array([centre + half * (x, y, z) for z in (-1, 1) for x, y in around])
-
-
-# --- shutter ------------------------------------------------------------------------------------------------
-
-
-def shutter_chart(scan: Scan, motion: Motion | None) -> Markup:
-    """Returns one frame in time: the exposures of all lines (Fig. 3 of the paper), and the times of the run's poses."""
-    return chart(lambda axes: draw_shutter(axes, scan, motion), "Shutter of one frame", shutter_words(scan))
-
-
-def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
-    """Draws the windows, the poses' times, the lengths of exposure and readout, and the gantry's angle above."""
-    shutter, last = scan.shutter, max(scan.lines - 1, 1)
-    draw_windows(axes, shutter, scan.lines)
-    if motion is not None:
-        _draw_samples(axes, scan, motion)
-    ends = (0.0, float(last))[:: shutter.direction]
-    above, below = (5, -14) if ends[0] < ends[1] else (-14, 5)
-    _draw_span(axes, (0.0, shutter.exposure_s), ends[0], f"exposure {number(shutter.exposure_s)} s", below)
-    if shutter.readout_s > 0:
-        words = f"readout {number(shutter.readout_s)} s"
-        _draw_span(axes, (shutter.exposure_s, shutter.span_s), ends[1], words, above)
-    span_s = shutter.span_s or 1.0
-    axes.set_xlim(-_ROOM * span_s, (1 + _ROOM) * span_s)
-    axes.set_ylim(-2 * _ROOM * last, (1 + 2 * _ROOM) * last)
-    for time_s, words in _gantry_words(scan):
-        axes.text(time_s, 1.02, words, transform=axes.get_xaxis_transform(), ha="center", size="small", color=INK)
-
-
-def frames_chart(scan: Scan) -> Markup:
-    """Returns the first frames on one axis of time, so that their overlaps or pauses show."""
-    start_s = np.asarray(scan.frame_start_s[:_FIRST_FRAMES]) - float(scan.frame_start_s[0])
-    middle_s = (scan.shutter.delay_s(scan.lines).max() + scan.shutter.exposure_s) / 2
-
-    def draw(axes: "Axes") -> None:
-        for frame, first_s in enumerate(start_s):
-            draw_windows(axes, scan.shutter, scan.lines, float(first_s))
-            axes.text(first_s + middle_s, scan.lines / 2, str(frame), ha="center", weight="semibold", color=INK)
-        axes.set_xlabel("time (s)")
-
-    return chart(draw, f"Exposure windows of the first {len(start_s)} frames", shutter_words(scan))
-
-
-def shutter_words(scan: Scan) -> str:
-    """Returns a description of the shutter, without a full stop."""
-    shutter = scan.shutter
-    kind = "global shutter" if shutter.readout_s == 0 else f"rolling shutter along {shutter.axis}"
-    words = f"{kind}: exposure {number(shutter.exposure_s)} s, readout {number(shutter.readout_s)} s"
-    if shutter.direction < 0:
-        words += ", last line first"
-    if shutter.pulse_s is not None:
-        words += f", beam on from {number(shutter.pulse_s[0])} s for {number(shutter.pulse_s[1])} s"
-    return words
-
-
-def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
-    """Draws when the run took its poses: dots on lines, or vertical lines for poses that all lines share."""
-    if isinstance(motion, MicroViews | OwnTimes | LineMiddles) and scan.is_fly:
-        axes.plot(*sample_times(scan, motion).T, ".", color=SAMPLE, ms=5)
-        return
-    first_s, last_s = scan.shutter.lit_span_s
-    cells = motion.cells(scan, 0)
-    times_s: Sequence[float] | Points = [first_s if isinstance(motion, StaticStart) else scan.shutter.middle_s]
-    if isinstance(motion, PerRow) and scan.is_fly:
-        times_s = cells.time_s - float(scan.frame_start_s[0])
-    elif cells.is_moving:
-        times_s = np.linspace(first_s, last_s, cells.count + 1)
-    for time_s in times_s:
-        axes.axvline(time_s, color=ACCENT, ls="--", lw=1.2)
-
-
-def sample_times(scan: Scan, motion: Motion) -> Points:
-    """Returns (time after the frame's start, line) of the poses, (N, 2); of some lines where each line has its own."""
-    rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
-    if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
-        return np.empty((0, 2))
-    cells = motion.cells(scan, 0)
-    line = (cells.line_start + cells.line_stop - 1) / 2
-    shown = np.ones(cells.count, bool)
-    if not isinstance(motion, MicroViews):
-        shown = np.isin(line, np.unique(np.linspace(0, scan.lines - 1, _LINES_WITH_DOTS).round()))
-    return np.stack([cells.time_s - float(scan.frame_start_s[0]), line], -1)[shown][:_MOST_DOTS]
-
-
-def _draw_span(axes: "Axes", times_s: tuple[float, float], line: float, words: str, shift: float) -> None:
-    axes.plot(times_s, [line, line], color=EDGE, lw=3)
-    _note(axes, words, (sum(times_s) / 2, line), (0, shift), size="small")
-
-
-def _gantry_words(scan: Scan) -> list[tuple[float, str]]:
-    """Returns (time, text) of the gantry's angle at the start, the middle and the end of a frame on a circular orbit."""
-    if not isinstance(scan.trajectory, CircularOrbit):
-        return []
-    if not scan.is_fly:
-        return [(scan.shutter.middle_s, "gantry stands")]
-    times_s = np.unique([0.0, scan.shutter.span_s / 2, scan.shutter.span_s])
-    angles_deg = np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))
-    words = [f"{number(float(angle), 1e-4)}°" for angle in angles_deg]
-    words[0] = f"gantry {words[0]}"
-    return list(zip(times_s.tolist(), words, strict=True))
-
-
-def _note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
+def note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
     """Writes words next to a point; ``shift`` is in units of the picture, upwards positive."""
     style = {"ha": "center", "color": INK, **style}
     axes.annotate(words, point, xytext=shift, textcoords="offset points", **style)

@@ -8,26 +8,24 @@ from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnT
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
-from phyradgs_cl.report.charts import (
-    Chart,
-    convergence_charts,
-    frames_chart,
-    histogram,
-    orbit_chart,
-    shutter_chart,
-    shutter_words,
-    side_chart,
-    tuning_chart,
-    views_chart,
+from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
+from phyradgs_cl.report.comparisons import Change
+from phyradgs_cl.report.images import (
+    Plane,
+    bytes_of,
+    data_uri,
+    diverging,
+    grey_range,
+    planes_of,
+    png_bytes,
+    stills_of,
+    top_row_first,
+    windows_of,
 )
-from phyradgs_cl.report.facts import flattened, label, number, shown, unit
-from phyradgs_cl.report.markup import Markup, element, joined
-from phyradgs_cl.report.pictures.png import bytes_of, data_uri, diverging, png_bytes, top_row_first
-from phyradgs_cl.report.pictures.preview import grey_range
-from phyradgs_cl.report.pictures.slices import Plane, planes_of, stills_of, windows_of
-from phyradgs_cl.report.pictures.steps import Change
-from phyradgs_cl.report.pictures.viewer import stills, viewer
+from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
 from phyradgs_cl.report.run import Run
+from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
+from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import to_digits_of
 
 _MOST_ROWS = 400  # of provenance

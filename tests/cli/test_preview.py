@@ -56,7 +56,7 @@ def test_pictures_are_no_more_often_than_asked_and_cost_one_warning(tmp_path, mo
         for iteration in range(5):
             preview(Progress(iteration, 9, 0.5, 0, 1.0, volume=volume))
         assert len(made) == times and caplog.text == ""
-    monkeypatch.setattr("phyradgs_cl.report.pictures.preview.write_preview", full)
+    monkeypatch.setattr("phyradgs_cl.report.preview.write_preview", full)
     for iteration in range(3):
         preview(Progress(iteration, 9, 0.5, 0, 1.0, volume=volume))
     assert caplog.text.count("no preview") == 1

@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.drawing import SAMPLE
-from phyradgs_cl.report import charts
+from phyradgs_cl.report import charts, scan_charts
 
 
 def drawn(draw: Callable[..., None], *arguments: object) -> Axes:
@@ -45,15 +45,15 @@ def kinds(scan_maker, small_scan) -> dict[str, object]:
 
 def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds) -> None:
     for name, scan in kinds.items():
-        drawings = [charts.frames_chart(scan), charts.orbit_chart(scan), charts.side_chart(scan)]
+        drawings = [scan_charts.frames_chart(scan), scan_charts.orbit_chart(scan), scan_charts.side_chart(scan)]
         models = MODELS if name in ("fly", "still") else [MicroViews]
-        for drawing in (*drawings, *(charts.shutter_chart(scan, model()) for model in models)):
+        for drawing in (*drawings, *(scan_charts.shutter_chart(scan, model()) for model in models)):
             assert drawing.startswith("<svg") and "nan" not in drawing and "inf" not in drawing, name
 
 
 def test_a_chart_is_of_its_page(small_scan) -> None:
     """It names itself, loads nothing, has the page's colours, and shares no name with another chart."""
-    first, second = charts.orbit_chart(small_scan), charts.side_chart(small_scan)
+    first, second = scan_charts.orbit_chart(small_scan), scan_charts.side_chart(small_scan)
     assert 'aria-label="Geometry from above. 8 source positions' in first and 'role="img"' in first
     for svg in (first, second):
         assert not re.search(r"http|<style|url\(|#[0-9a-f]{6}\b", svg)
@@ -65,27 +65,27 @@ def test_a_chart_is_of_its_page(small_scan) -> None:
 
 
 def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(kinds, small_scan) -> None:
-    (outline,) = outlines(drawn(charts.draw_shutter, small_scan, None))
+    (outline,) = outlines(drawn(scan_charts.draw_shutter, small_scan, None))
     lowest, highest = outline[outline[:, 1] == 0], outline[outline[:, 1] == outline[:, 1].max()]
     shutter = small_scan.shutter
     assert np.ptp(lowest[:, 0]) == pytest.approx(shutter.exposure_s) == pytest.approx(np.ptp(highest[:, 0]))
     assert highest[:, 0].max() - lowest[:, 0].min() == pytest.approx(shutter.span_s)
-    opened, lit = outlines(drawn(charts.draw_shutter, kinds["pulsed"], None))
+    opened, lit = outlines(drawn(scan_charts.draw_shutter, kinds["pulsed"], None))
     assert np.ptp(lit[:, 0]) < 0.2 * np.ptp(opened[:, 0])
 
 
 def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
     motion = MicroViews(strips=4, sub_intervals=3)
-    lines = drawn(charts.draw_shutter, small_scan, motion).lines
+    lines = drawn(scan_charts.draw_shutter, small_scan, motion).lines
     (dots,) = [line.get_xydata() for line in lines if line.get_color() == SAMPLE]
     expected = motion.cells(small_scan, 0).time_s - small_scan.frame_start_s[0]
     assert len(dots) == 12 and np.allclose(dots[:, 0], expected)
 
 
 def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_its_pixels(small_scan) -> None:
-    positions = charts.source_positions(small_scan)[:, :3]
+    positions = scan_charts.source_positions(small_scan)[:, :3]
     assert np.allclose(np.linalg.norm(positions, axis=1), 5.0) and len(positions) == 8
-    corners = charts.panel_corners(small_scan.geometry.pose(0.0), small_scan.geometry.detector_shape)
+    corners = scan_charts.panel_corners(small_scan.geometry.pose(0.0), small_scan.geometry.detector_shape)
     assert np.allclose(corners.mean(axis=0), [-2, 0, 0])
     assert np.allclose(np.ptp(corners, axis=0), [0, 14 * 0.25, 16 * 0.25])
 

@@ -7,10 +7,19 @@ import pytest
 from skimage import io
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.report.facts import flattened, label, number, shown, unit
-from phyradgs_cl.report.markup import Markup, element, joined, json_block, raw_text
-from phyradgs_cl.report.pictures.png import bytes_of, diverging, png_bytes
-from phyradgs_cl.report.pictures.slices import BUDGET_PIXELS, planes_of, windows_of
+from phyradgs_cl.report.images import BUDGET_PIXELS, bytes_of, diverging, planes_of, png_bytes, windows_of
+from phyradgs_cl.report.markup import (
+    Markup,
+    element,
+    flattened,
+    joined,
+    json_block,
+    label,
+    number,
+    raw_text,
+    shown,
+    unit,
+)
 
 
 def test_text_is_escaped_and_elements_are_not() -> None:

@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
 from phyradgs_cl.report import write_preview
-from phyradgs_cl.report.pictures.preview import preview_image
+from phyradgs_cl.report.preview import preview_image
 
 GAP = 4
 

@@ -6,10 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from phyradgs_cl.drawing import round_length
-from phyradgs_cl.report.facts import number
-from phyradgs_cl.report.markup import Markup, element, joined, json_block
-from phyradgs_cl.report.pictures.png import base64_of, data_uri, diverging, png_bytes
-from phyradgs_cl.report.pictures.slices import Plane, Window
+from phyradgs_cl.report.images import Plane, Window, base64_of, data_uri, diverging, png_bytes
+from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
 _MOST_ZOOM = 8

@@ -5,6 +5,7 @@ import math
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,19 @@ from numpy.typing import NDArray
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import check_writable, partial_path, written_beside
+from phyradgs_cl.io import (
+    StoredVolume,
+    check_writable,
+    file_kind,
+    partial_path,
+    read_volume,
+    written_beside,
+)
 from phyradgs_cl.reconstructors import Progress, ProgressReport
-from phyradgs_cl.report.pictures.png import bytes_of, png_bytes, top_row_first
+from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
 _GAP = 4  # pixels between slices
 _SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
-_PERCENTILE = 99.9  # a few hot voxels would make the rest dark
 log = logging.getLogger(__name__)
 
 
@@ -100,10 +107,36 @@ def _shown_axes(grid: Grid) -> list[int]:
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
 
-def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """From 0 (or below, where there is no more than that) to a high percentile: what black and white stand for."""
-    high = float(np.percentile(volume, _PERCENTILE))
-    if high > 0:
-        return 0.0, high
-    low, high = float(volume.min()), float(volume.max())
-    return low, high if high > low else low + 1.0
+# --- a window --------------------------------------------------------------------------------------------
+
+
+_AXES = ("z", "y", "x")
+
+
+def view_volume(path: Path) -> None:
+    """Opens a window with a volume file and returns when it is closed. InputError: no napari, or no volume file of ours."""
+    napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
+    if (kind := file_kind(path)) != "volume":
+        raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
+    add_volume(napari.Viewer(title=f"{path.name} – phyradgs"), read_volume(path), path.stem)
+    napari.run()
+
+
+def add_volume(viewer: Any, stored: StoredVolume, name: str) -> None:
+    """Puts a volume into a viewer at its place in the world: lengths in mm, axes z, y, x, y up, grey from 0."""
+    viewer.add_image(
+        stored.volume,
+        name=f"{name} (1/mm)",
+        scale=stored.grid.voxel_size_mm,
+        translate=stored.grid.first_centre_mm,
+        units=("mm", "mm", "mm"),
+        axis_labels=_AXES,
+        contrast_limits=grey_range(stored.volume),
+        colormap="gray",
+    )
+    viewer.dims.axis_labels = _AXES
+    if hasattr(viewer.camera, "orientation2d"):  # since napari 0.6; before, y points down
+        viewer.camera.orientation2d = ("up", "right")
+    # napari 0.9 has moved its overlays
+    overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
+    overlays.scale_bar.visible = True

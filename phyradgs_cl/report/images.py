@@ -1,5 +1,7 @@
-"""The slices that a page can show: every one of a small volume, evenly chosen ones of a large one."""
+"""Pictures of a page: values as grey or coloured PNG, and the slices of a volume that a page can show."""
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,15 +9,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.report.pictures.png import base64_of, bytes_of, png_bytes, top_row_first
-from phyradgs_cl.report.pictures.preview import grey_range
 
 LONGEST_EDGE = 192  # pixels of a slice in the page
 BUDGET_PIXELS = 16_000_000  # of all slices together: some 20 MB of page at worst, of pure noise
 # Plane, axis of the array that is cut, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
 _ROOM = 0.25  # of the window, on either side of it
+_BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
+
+_PERCENTILE = 99.9  # a few hot voxels would make the rest dark
 Volume = NDArray[np.floating]
+
+
+def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
+    """A PNG of an image (rows, columns) uint8, row 0 at the top; colours (256, 3) uint8, None is grey."""
+    from PIL import Image  # a tenth of a second, which most commands need not wait for
+
+    picture = Image.fromarray(image)
+    if colours is not None:
+        picture.putpalette(colours.tobytes())
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", compress_level=9)
+    return stream.getvalue()
+
+
+def data_uri(png: bytes) -> str:
+    return f"data:image/png;base64,{base64_of(png)}"
+
+
+def base64_of(content: bytes) -> str:
+    """Bytes as text that a page holds."""
+    return base64.b64encode(content).decode("ascii")
+
+
+def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
+    """Values (any shape) as 0 to 255 from ``low`` to ``high``, clipped; what overflowed on its way here is 0."""
+    span = high - low if high > low else 1.0
+    share = np.nan_to_num((image.astype(np.float64) - low) / span)
+    return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
+
+
+def top_row_first(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image (rows, columns) whose row 0 is the lowest, as a picture, whose row 0 is the top."""
+    return np.ascontiguousarray(image[::-1])
+
+
+def diverging() -> NDArray[np.uint8]:
+    """Colours (256, 3) from blue over white, in the middle, to red: for differences."""
+    at = np.linspace(-1, 1, 256)[:, None]
+    ends = np.where(at < 0, np.array(_BLUE), np.array(_RED))
+    # The root makes small differences visible, as a white page swallows them.
+    mixed = np.array(_WHITE) + np.abs(at) ** 0.8 * (ends - np.array(_WHITE))
+    return np.rint(mixed).astype(np.uint8)
+
+
+def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
+    """From 0 (or below, where there is no more than that) to a high percentile: what black and white stand for."""
+    high = float(np.percentile(volume, _PERCENTILE))
+    if high > 0:
+        return 0.0, high
+    low, high = float(volume.min()), float(volume.max())
+    return low, high if high > low else low + 1.0
+
+
+# --- slices of a volume ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,4 @@
-"""What each step of ``prepare`` did: a frame, a sinogram and a slice before and after, and how often each line integral was
-there."""
+"""Frames of a run: measured ones next to those of the volume, and frames before and after each step of preparation."""
 
 from dataclasses import dataclass
 
@@ -9,12 +8,28 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.frames.preprocess import stages
+from phyradgs_cl.reconstructors.frames.pairs import FramePair, frame_pairs
+from phyradgs_cl.reconstructors.frames.preprocess import prepared, stages
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
 
 _BINS = 80
 Image = NDArray[np.float32]
+
+
+def chosen_frames(frames: int, count: int) -> list[int]:
+    """``count`` frames spread evenly over the scan, the first one among them."""
+    return sorted({(k * frames) // count for k in range(min(count, frames))})
+
+
+def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
+    """``count`` frames of the run's scan beside those of its volume, as the run's method saw them: lag undone and
+    filtered.
+    """
+    if run.scan is None or count < 1:
+        return []
+    scan = prepared(run.scan, run.before, rt)
+    return frame_pairs(rt, scan, run.stored.volume, run.stored.grid, chosen_frames(scan.frames, count))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,0 @@
-"""Slices and projections as PNG, and how the page looks through them."""
