@@ -50,7 +50,7 @@ from phyradgs_cl.calibrate.wobble import (
     without_sway_gauges,
 )
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import load_attenuation
+from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom, sphere_phantom
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from phyradgs_cl.io import StoredVolume, read_volume
+from phyradgs_cl.io import Volume, read_volume
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.workflow import load_reference
 
@@ -42,7 +42,7 @@ def main() -> None:
     scan = given.folder / "scan.h5"
     shape = ("--size", size, "--detector", str(2 * int(size)), "--seed", "0")
     total_s = run("simulate", *SCAN, *shape, "-o", str(scan))
-    rows: list[tuple[str, str, StoredVolume, float]] = []
+    rows: list[tuple[str, str, Volume, float]] = []
     for name, (method, motion, options) in RUNS.items():
         path = given.folder / f"{name}.h5"
         iterations = () if method == "fdk" else quick
@@ -55,8 +55,8 @@ def main() -> None:
         print(f"{method:8s}  {motion:7s}  {metrics['psnr_db']:9.2f}  {metrics['ssim']:6.4f}  {used_s:17.1f}")
     print(f"{'all, with the simulation':35s}  {total_s:17.1f}")
     picture = given.folder / "demo.png"
-    truth, _ = load_reference(scan)
-    ignored, known = (rows[list(RUNS).index(name)][2].volume for name in ("static", "moving"))
+    truth = load_reference(scan).values
+    ignored, known = (rows[list(RUNS).index(name)][2].values for name in ("static", "moving"))
     draw(truth, {"motion ignored": ignored, "motion known": known}, picture)
     print(f"picture: {picture}")
 

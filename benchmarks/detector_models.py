@@ -24,7 +24,7 @@ from scans import append, read_lines
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import load_attenuation
+from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime

@@ -10,7 +10,7 @@ from tables.volumes import find_volumes
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry, Protocol, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import load_attenuation
+from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import volume_scene
 

@@ -111,10 +111,10 @@ def read_settings(
 
 
 def _initial_volume(path: Path) -> InitialVolume:
-    values, grid = load_volume(path)
-    if grid is None:
+    volume = load_volume(path)
+    if volume.grid is None:
         raise InputError("--initial", f"{path}, values without voxel sizes", "a volume with its grid in mm")
-    return InitialVolume(values, grid, {"initial": str(path), "initial_sha256": sha256_of(path)})
+    return InitialVolume(volume.values, volume.grid, {"initial": str(path), "initial_sha256": sha256_of(path)})
 
 
 def _flag(key: str) -> str:

@@ -95,7 +95,7 @@ def test_the_nifti_of_ones_own_volume_lies_as_the_volume_does(folder) -> None:
     assert nibabel.aff2axcodes(image.affine) == ("L", "P", "S")
     np.testing.assert_allclose(image.header.get_zooms(), stored.grid.voxel_size_mm[::-1], rtol=1e-6)
     values = np.asarray(image.dataobj)
-    np.testing.assert_array_equal(values, stored.volume.transpose(2, 1, 0))
+    np.testing.assert_array_equal(values, stored.values.transpose(2, 1, 0))
     thick = np.array([4.0, 8.0, 8.0]), np.array([12.0, 8.0, 8.0])  # x index below and above the axis
     at_mm = [nibabel.affines.apply_affine(image.affine, index - 0.5)[0] for index in thick]
     assert at_mm[0] > 0 > at_mm[1]

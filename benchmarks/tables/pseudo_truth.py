@@ -48,7 +48,7 @@ class PseudoTruth:
             stored = read_volume(self.path)
         except InputError:
             return None
-        return stored.volume if stored.provenance.get("identity") == self._identity else None
+        return stored.values if stored.provenance.get("identity") == self._identity else None
 
     def _made(self) -> np.ndarray:
         size, protocol = self._job.bench_size, PROTOCOLS["rapid"]

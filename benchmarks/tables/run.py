@@ -14,7 +14,8 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
 from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import file_kind, load_attenuation, only_run
+from phyradgs_cl.importers import load_attenuation
+from phyradgs_cl.io import file_kind, only_run
 from phyradgs_cl.neural.requirement import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, RunPlan, reconstruct
 from phyradgs_cl.runtime import Runtime

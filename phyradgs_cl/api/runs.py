@@ -18,7 +18,7 @@ from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
 from phyradgs_cl.importers import load_volume as load_voxels
-from phyradgs_cl.io import StoredVolume, read_scan, read_state, read_volume, write_scan, write_volume
+from phyradgs_cl.io import Volume, read_scan, read_state, read_volume, write_scan, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
@@ -79,15 +79,15 @@ def load_volume(path: str | Path) -> Reconstruction:
     """
     file = _checked_path(path)
     if foreign_volume(file) is not None:
-        volume, grid = load_voxels(file)
-        if grid is None:
+        volume = load_voxels(file)
+        if volume.grid is None:
             raise InputError(str(file), "values without voxel sizes", "a volume with its grid in mm")
-        return Reconstruction(volume, grid)
+        return Reconstruction(volume.values, volume.grid)
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
     state = read_state(file)
-    return Reconstruction(stored.volume, stored.grid, stored.gaussians, record, facts, state, stored.disagreement)
+    return Reconstruction(stored.values, stored.required_grid, stored.gaussians, record, facts, state, stored.disagreement)
 
 
 @naming_arguments()
@@ -109,7 +109,7 @@ def save_volume(
         checks.finite("volume", result.volume)
         if metrics is not None:
             raise InputError("metrics", f"some for {file.name}", "a file that has a place for them, as volume.h5")
-        stored = StoredVolume(result.volume, result.grid, {}, result.gaussians)
+        stored = Volume(result.volume, result.grid, {}, result.gaussians)
         export_stored(stored, format_of(file, "path"), file, "result")
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}

@@ -1,35 +1,31 @@
-"""Volumes in other programs' formats, with spacing, origin and directions; `export_volume` is the door."""
+"""Volumes in other programs' formats, with spacing, origin and directions: `export_volume`."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
 from phyradgs_cl.exporters.gaussians import gaussians_of, write_npz, write_ply
-from phyradgs_cl.exporters.meta_image import write_meta_image
-from phyradgs_cl.exporters.nifti import write_nifti
-from phyradgs_cl.exporters.npy import write_npy
-from phyradgs_cl.exporters.nrrd import write_nrrd
-from phyradgs_cl.exporters.placed import Placed, hounsfield, placed
-from phyradgs_cl.exporters.tiff import write_tiff
-from phyradgs_cl.io import StoredVolume, read_volume
+from phyradgs_cl.exporters.voxels import hounsfield, write_image, write_npy, write_tiff
+from phyradgs_cl.io import Volume, read_volume
 
 __all__ = [
-    "CLOUDS", "EXPORTS", "DicomLabels", "Placed", "default_output", "export_stored", "export_volume", "foreign_suffix",
-    "format_of", "hounsfield", "placed",
+    "CLOUDS", "EXPORTS", "DicomLabels", "default_output", "export_stored", "export_volume", "foreign_suffix", "format_of",
 ]  # fmt: skip
 
-VOXELS: dict[str, Callable[[Path, Placed], None]] = {
-    "nii": write_nifti,
-    "mha": write_meta_image,
-    "nrrd": write_nrrd,
+VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
+    "nii": write_image,
+    "mha": write_image,
+    "nrrd": write_image,
     "tiff": write_tiff,
     "npy": write_npy,
-    "dicom": write_dicom,
 }
 CLOUDS = {"ply": write_ply, "npz": write_npz}
-EXPORTS = (*VOXELS, *CLOUDS)
+EXPORTS = (*VOXELS, "dicom", *CLOUDS)
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": ()}
 
 
@@ -37,12 +33,12 @@ def export_volume(
     path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
     labels: DicomLabels | None = None,
 ) -> Path:  # fmt: skip
-    """Write a volume file in another format, whole or not at all; returns what was written.
+    """Writes a volume file in another format, whole or not at all, and returns the path of the output.
 
-    ``to``: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: file, or folder for dicom;
-    None puts it beside ``path``. ``mu_water_per_mm``: water's attenuation; the values are then Hounsfield units. ``labels``:
-    patient, study and series, which dicom alone takes. InputError: no such format, a volume that is damaged or has no
-    Gaussians, a name that does not fit, labels with another format. OutputError: it cannot be written.
+    ``to``: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: a file, or a folder for
+    dicom; None puts it beside ``path``. ``mu_water_per_mm``: attenuation of water; the values are then Hounsfield units.
+    ``labels``: patient, study and series, for dicom alone. InputError: an unknown format, a damaged volume or one without
+    Gaussians, a suffix of another format, labels with another format. OutputError: the output cannot be written.
     """
     checks.one_of("--to", to, EXPORTS)
     path = Path(path)
@@ -57,38 +53,45 @@ def export_volume(
 
 
 def export_stored(
-    stored: StoredVolume, to: str, target: Path, subject: str, mu_water_per_mm: float | None = None,
+    volume: Volume, to: str, target: Path, subject: str, mu_water_per_mm: float | None = None,
     labels: DicomLabels | None = None,
 ) -> None:  # fmt: skip
-    """Write a volume as ``export_volume`` does; ``subject``: where it comes from."""
+    """Writes a volume as ``export_volume`` does; ``subject`` names it in messages."""
     if to in CLOUDS:
-        CLOUDS[to](target, gaussians_of(stored, subject))
-    elif to == "dicom":
-        write_dicom(target, placed(stored, mu_water_per_mm), labels)
+        CLOUDS[to](target, gaussians_of(volume, subject))
+        return
+    if volume.grid is None:
+        raise InputError(subject, "values without voxel sizes", "a volume with its grid", "see 'phyradgs info'")
+    values, unit = np.ascontiguousarray(volume.values, np.float32), "1/mm"
+    if mu_water_per_mm is not None:
+        values, unit = hounsfield(values, mu_water_per_mm), "HU"
+    volume = replace(volume, values=values)
+    if to == "dicom":
+        write_dicom(target, volume, unit, labels or DicomLabels())
     else:
-        VOXELS[to](target, placed(stored, mu_water_per_mm))
+        VOXELS[to](target, volume, unit)
 
 
 def foreign_suffix(output: str | Path) -> str | None:
-    """The suffix of another program's format that a name ends in: what is written under it must not be HDF5."""
-    known = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
-    return next((suffix for suffix in known if Path(output).name.lower().endswith(suffix)), None)
+    """Returns the suffix of another program's format, or None. A file with such a name must not hold HDF5."""
+    suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
+    return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
 
 def default_output(path: Path, to: str) -> Path:
-    """The volume's name with the format's suffix; for DICOM a folder."""
+    """Returns the volume's path with the suffix of the format; for DICOM a folder."""
     return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """The one of ``EXPORTS`` whose suffix an output's name has; InputError, which lists them, for any other."""
+    """Returns the one of ``EXPORTS`` that the suffix of an output means; InputError, with the suffixes, for any other."""
     for to in EXPORTS:
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to
-    known = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))
+    suffixes = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))
     found = "neither a format nor an output" if output is None else f"output {output}"
-    remedy = "name the output so, or say --to, for dicom always" if subject == "--to" else "or .h5, which holds everything"
-    raise InputError(subject, found, f"a suffix of {known}", remedy)
+    remedy = "use such a suffix, or give --to dicom" if subject == "--to" else "or .h5, which holds everything"
+    raise InputError(subject, found, f"a suffix of {suffixes}", remedy)
 
 
 def _suffixes(to: str) -> tuple[str, ...]:
@@ -96,7 +99,7 @@ def _suffixes(to: str) -> tuple[str, ...]:
 
 
 def _check_name(target: Path, to: str, source: Path) -> None:
-    """Other programs go by the suffix, so a wrong one is refused."""
+    """Refuses a suffix of another format, since programs go by the suffix, and the input itself."""
     suffixes = _suffixes(to)
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")

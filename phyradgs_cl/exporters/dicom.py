@@ -1,4 +1,4 @@
-"""A DICOM series, an image per slice: PS3.3's CT Image module (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
+"""A DICOM series with one image per slice: CT Image module of PS3.3 (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
 
 import datetime
 import hashlib
@@ -14,8 +14,9 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.exporters.placed import Placed
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.io.output import temporary_name
+from phyradgs_cl.io.volume import Volume
 
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
@@ -25,8 +26,8 @@ _LONGEST = 64  # characters, of the value representations PN and LO
 
 @dataclass(frozen=True)
 class DicomLabels:
-    """What viewers and archives list a series by, None where not stated. patient: its name, as Family^Given, and ID; title:
-    of the study; description: of the series; date: of the study, YYYY-MM-DD. InputError: a text that DICOM cannot hold."""
+    """Labels by which viewers and archives list a series; None where not stated. patient: name (Family^Given) and ID; title
+    and date (YYYY-MM-DD) of the study; description of the series. InputError: a text that DICOM cannot hold."""
 
     patient: str | None = None
     title: str | None = None
@@ -45,7 +46,7 @@ class DicomLabels:
 
     @property
     def given(self) -> dict[str, object]:
-        """The labels that are stated, by name."""
+        """The stated labels by name."""
         return {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
 
     @property
@@ -56,7 +57,7 @@ class DicomLabels:
             return None
 
     def write(self, image: Any) -> None:
-        """Puts them into a DICOM data set."""
+        """Writes the labels into a DICOM data set."""
         if self.patient is not None:
             image.PatientName = image.PatientID = self.patient
         if self.title is not None:
@@ -67,35 +68,35 @@ class DicomLabels:
             image.StudyDate = image.SeriesDate = self._day.strftime("%Y%m%d")
 
 
-def write_dicom(path: Path, volume: Placed, labels: DicomLabels | None = None) -> None:
-    """A new folder with 0001.dcm from the lowest slice up."""
-    labels = labels or DicomLabels()
+def write_dicom(path: Path, volume: Volume, unit: str, labels: DicomLabels) -> None:
+    """Writes a new folder with 0001.dcm from the lowest slice up; ``unit`` of the values: "1/mm" or "HU"."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
-    slope = rescale_slope(volume)
-    content = volume.values.tobytes() + repr((volume.spacing_mm, volume.origin_mm)).encode()
-    content += repr(labels.given).encode() if labels.given else b""  # another patient's is another study
+    slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
+    content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
+    content += repr(labels.given).encode() if labels.given else b""  # other labels make another study
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
-    uid = {n: generate(entropy_srcs=[seed, volume.unit, n]) for n in ("study", "series", "frame")}
+    uid = {n: generate(entropy_srcs=[seed, unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:
         for index, plane in enumerate(volume.values):
-            image = _common(pydicom, volume, slope, uid)
+            image = _common(pydicom, volume.values.shape, unit, slope, uid)
             labels.write(image)
-            instance = generate(entropy_srcs=[seed, volume.unit, str(index)])
+            instance = generate(entropy_srcs=[seed, unit, str(index)])
             image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = instance
-            _place(image, volume, index)
+            _place(image, grid, index)
             image.PixelData = np.rint(plane / float(slope)).astype("<i2").tobytes()
             image.save_as(folder / f"{index + 1:04d}.dcm", enforce_file_format=True)
 
 
-def rescale_slope(volume: Placed) -> str:
-    """Value of one stored step as DICOM's decimal string: 1 HU where 16 bits hold the range, else just enough."""
-    peak = float(np.abs(volume.values).max())
-    if volume.is_hu and peak <= _LARGEST:
+def _rescale_slope(values: np.ndarray, unit: str) -> str:
+    """Returns the value of one stored step as a decimal string: 1 HU where 16 bits hold the range, else just enough."""
+    peak = float(np.abs(values).max())
+    if unit == "HU" and peak <= _LARGEST:
         return "1"
-    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # not above 16 characters, not rounded below
+    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # at most 16 characters, never rounded below
 
 
-def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> Any:
+def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:
+    """Returns a data set with the values that all slices share."""
     image = pydicom.dataset.Dataset()
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE
@@ -109,19 +110,19 @@ def _common(pydicom: Any, volume: Placed, slope: str, uid: dict[str, str]) -> An
     for name in ("ReferringPhysicianName", "PositionReferenceIndicator", "KVP", "AcquisitionNumber"):
         setattr(image, name, None)
     image.Modality, image.Manufacturer, image.SeriesNumber = "CT", "phyradgs-cl", 1
-    image.SeriesDescription = image.ImageComments = f"values in {volume.unit}"
+    image.SeriesDescription = image.ImageComments = f"values in {unit}"
     image.ImageType, image.PatientPosition = ["DERIVED", "PRIMARY", "AXIAL"], "HFS"
-    image.Columns, image.Rows, _ = volume.shape_xyz
+    _, image.Rows, image.Columns = shape
     image.SamplesPerPixel, image.PhotometricInterpretation = 1, "MONOCHROME2"
     image.BitsAllocated, image.BitsStored, image.HighBit, image.PixelRepresentation = 16, 16, 15, 1
     image.RescaleSlope, image.RescaleIntercept = slope, "0"
-    image.RescaleType = "HU" if volume.is_hu else "US"
+    image.RescaleType = "HU" if unit == "HU" else "US"
     return image
 
 
-def _place(image: Any, volume: Placed, index: int) -> None:
-    """Where slice ``index`` lies. PixelSpacing runs from row to row first."""
-    (dx, dy, dz), (x, y, z) = volume.spacing_mm, volume.origin_mm
+def _place(image: Any, grid: Grid, index: int) -> None:
+    """Writes where slice ``index`` lies. PixelSpacing has the step from row to row first."""
+    (dz, dy, dx), (z, y, x) = grid.voxel_size_mm, grid.first_centre_mm
     image.InstanceNumber = index + 1
     image.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
     image.ImagePositionPatient = [_decimal(place) for place in (x, y, z + index * dz)]
@@ -131,17 +132,16 @@ def _place(image: Any, volume: Placed, index: int) -> None:
 
 
 def _decimal(number: float) -> str:
-    """At most 16 characters, as DICOM's decimal strings must be."""
+    """Returns a DICOM decimal string, which has at most 16 characters."""
     return f"{number:.10g}" if 1e-4 <= abs(number) < 1e9 or number == 0 else f"{number:.8e}"
 
 
 @contextmanager
 def folder_written_beside(path: Path) -> Iterator[Path]:
-    """Yield a new folder that becomes ``path`` on success, and of which nothing is left otherwise. A folder with
-    something in it is never replaced: it could hold anything."""
+    """Yields a new folder that becomes ``path`` on success and is removed otherwise. Never replaces a folder with files."""
     target = Path(os.path.abspath(path))
     if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
-        found = "something that is there already"
+        found = "an existing file or folder"
         raise OutputError(str(path), found, "a new or an empty folder", "choose another name")
     temporary = temporary_name(target)
     try:

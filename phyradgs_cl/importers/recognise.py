@@ -8,7 +8,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats import phyradgs_real, phyradgs_synthetic, r2_gaussian
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.folder import SafeFolder
-from phyradgs_cl.importers.reading.meta_image import SUFFIXES as STACKS
+from phyradgs_cl.importers.reading.images import STACKS
 from phyradgs_cl.io.hdf5.source import open_hdf5
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"

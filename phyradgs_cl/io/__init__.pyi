@@ -15,11 +15,8 @@ from .scanner import load_scanner as load_scanner
 from .scanner import with_detector_count as with_detector_count
 from .sha256 import hashing as hashing
 from .sha256 import sha256_of as sha256_of
-from .volume import LoadedVolume as LoadedVolume
-from .volume import StoredVolume as StoredVolume
+from .volume import Volume as Volume
 from .volume import file_kind as file_kind
-from .volume import load_attenuation as load_attenuation
-from .volume import load_volume as load_volume
 from .volume import read_state as read_state
 from .volume import read_volume as read_volume
 from .volume import volume_summary as volume_summary

@@ -20,7 +20,8 @@ from phyradgs_cl.errors import OutputError
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """What an operating system says where there is no room: the disk, the largest file, the user's share."""
 _LONGEST = 50  # characters of the target's name, of up to four bytes each: names end at 255
-_WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part$")
+_SPARE_BYTES = 1 << 16  # for headers beside the arrays
+_WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
 
 
 def check_writable(path: str | Path) -> None:
@@ -38,12 +39,19 @@ def make_folder(folder: Path, subject: Path) -> None:
 
 
 @contextmanager
-def written_beside(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the target's folder that replaces the target on success, in one step. The body only writes:
-    its system errors become OutputError about ``path``. Whatever goes wrong, an existing target keeps its content."""
+def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> Iterator[Path]:
+    """Yields a temporary path in the target's folder that replaces the target on success, in one step. After an error an
+    existing target has its old content, and system errors of the body become OutputError about ``path``.
+
+    ``size_bytes``: of the arrays to be written. Their room is reserved first, for libraries that crash on a full disk or do
+    not notice it. ``suffix``: the ending of the temporary name, for libraries that go by it.
+    """
     target = _target(path)
-    temporary = _create_beside(target)
+    temporary = _create_beside(target, suffix)
     try:
+        if size_bytes and hasattr(os, "posix_fallocate"):
+            with open(temporary, "r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, size_bytes + _SPARE_BYTES)
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
@@ -82,9 +90,9 @@ def _target(path: str | Path) -> Path:
     return target
 
 
-def _create_beside(target: Path) -> Path:
-    """A new empty file in the target's folder, with the permissions that the user's umask gives."""
-    temporary = temporary_name(target)
+def _create_beside(target: Path, suffix: str = "") -> Path:
+    """Creates an empty file in the target's folder, with the permissions of the user's umask."""
+    temporary = temporary_name(target, suffix)
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
@@ -94,14 +102,14 @@ def _create_beside(target: Path) -> Path:
     return temporary
 
 
-def temporary_name(target: Path) -> Path:
-    """A new name beside ``target`` that says who writes there; what dead writers of such targets left is removed."""
-    for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part"):
+def temporary_name(target: Path, suffix: str = "") -> Path:
+    """Returns a new name beside ``target`` that holds the number of this process; removes files that dead processes left."""
+    for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part*"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
             _discard(path)
     writer_now = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    return target.with_name(f".{target.name[:_LONGEST]}.{writer_now}.part")
+    return target.with_name(f".{target.name[:_LONGEST]}.{writer_now}.part{suffix}")
 
 
 @cache

@@ -1,12 +1,12 @@
-"""Volume files: a reconstruction with its grid, its history and its Gaussians, as an NXdata in HDF5; bare volumes too."""
+"""Volume files in HDF5: a reconstruction as an NXdata with its grid, provenance and Gaussians; also bare arrays /volume."""
 
 import json
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,57 +14,44 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, triple
-from phyradgs_cl.io.hdf5.datasets import (
-    ATTENUATION,
-    LENGTH,
-    in_unit,
-    new_group,
-    new_hdf5,
-    read_array,
-    read_grid,
-    read_values,
-    read_word,
-    write_grid,
-    write_number,
-)
+from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.facts import PROVENANCE, Schema, read_facts
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.sha256 import sha256_of
 from phyradgs_cl.text import plain_text
 
 _DATA = "/entry/reconstruction"
-_VOLUME, _BARE = f"{_DATA}/volume", "/volume"
-_DISAGREEMENT = f"{_DATA}/disagreement"
+_VOLUME, _BARE, _DISAGREEMENT = f"{_DATA}/volume", "/volume", f"{_DATA}/disagreement"
 _DISAGREEMENT_MEANS = (
-    "half the RMS of the difference of two estimates, over 3 x 3 x 3 voxels: where the result leans on its method; errors "
-    "that both share are not in it, and it is no confidence interval"
+    "half the RMS difference of two estimates over 3 x 3 x 3 voxels: where the result depends on the method; errors "
+    "common to both are not in it, and it is no confidence interval"
 )
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE = "/entry/gaussians", "/entry/state"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_AXIS_TOLERANCE = 1e-3  # of a voxel: what axes stored in float32 need
+_AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class StoredVolume:
-    """Volume (nz, ny, nx) float32 in 1/mm on ``grid``, and what its file has beside it: ``provenance`` of the kinds that
-    ``facts.PROVENANCE`` states, ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name, ``disagreement`` of two estimates
-    (nz, ny, nx) float32 in 1/mm; None where there are none."""
+class Volume:
+    """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
+    (types as in ``facts.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name and ``disagreement``: half
+    the RMS difference of two estimates (nz, ny, nx) float32 in 1/mm."""
 
-    volume: np.ndarray
-    grid: Grid
-    provenance: dict[str, object]
+    values: np.ndarray
+    grid: Grid | None
+    provenance: dict[str, object] = field(default_factory=dict)
     gaussians: Gaussians | None = None
     metrics: dict[str, object] | None = None
     disagreement: np.ndarray | None = None
 
-
-class LoadedVolume(NamedTuple):
-    """Volume (nz, ny, nx) float32, and its grid where the file has axes in mm."""
-
-    volume: np.ndarray
-    grid: Grid | None
+    @property
+    def required_grid(self) -> Grid:
+        """The grid of a volume that has one; InputError for a bare array."""
+        if self.grid is None:
+            raise InputError("volume", "values without voxel sizes", "a volume with its grid in mm")
+        return self.grid
 
 
 def write_volume(
@@ -77,45 +64,52 @@ def write_volume(
     state: Mapping[str, np.ndarray] | None = None,
     disagreement: np.ndarray | None = None,
 ) -> None:
-    """Write a volume (nz, ny, nx) in 1/mm with everything needed to make it again, whole or not at all: ``provenance`` and
-    ``metrics`` as JSON, plain values also as attributes; ``gaussians`` as float32; ``state``: how an interrupted run goes
-    on, arrays and texts; ``disagreement`` (nz, ny, nx) in 1/mm. InputError: a volume or a disagreement that is not finite
-    or does not fit the grid. OutputError: the file cannot be written."""
+    """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
+    values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
+    ``disagreement`` (nz, ny, nx) in 1/mm. InputError: an array that is not finite or does not fit the grid. OutputError:
+    the file cannot be written."""
     for name, values in (("volume", volume), ("disagreement", disagreement)):
         if values is not None:
             checks.shape(name, values, grid.shape)
             checks.finite(name, values)
     arrays = [volume, disagreement, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
-    with new_hdf5(path, sum(values.nbytes for values in arrays if values is not None)) as file:
-        entry = new_group(file, "entry", "NXentry")
+    with h5.new_hdf5(path, sum(values.nbytes for values in arrays if values is not None)) as file:
+        entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
         _write_data(entry, np.asarray(volume, np.float32), grid, disagreement)
-        write_grid(entry, grid)
+        h5.write_grid(entry, grid)
         _write_facts(entry, "provenance", provenance)
         if metrics is not None:
             _write_facts(entry, "metrics", metrics)
         if gaussians is not None:
-            group = new_group(entry, "gaussians", "NXcollection")
+            group = h5.new_group(entry, "gaussians", "NXcollection")
             for name in _CLOUD:
                 group.create_dataset(name, data=np.asarray(getattr(gaussians, name), np.float32))
         if state is not None:
-            group = new_group(entry, "state", "NXcollection")
+            group = h5.new_group(entry, "state", "NXcollection")
             for name, values in state.items():
                 group[name] = str(values) if values.dtype.kind == "U" else values
 
 
-def read_volume(path: str | Path) -> StoredVolume:
-    """Read a volume file; InputError names what is wrong by its HDF5 path. Damaged facts are left out, with a warning,
-    and a run that was interrupted is one too."""
+def read_volume(path: str | Path) -> Volume:
+    """Reads a volume file, or a bare array /volume (z, y, x), which has no grid and whose integers are divided by the
+    maximum of their type. InputError names the HDF5 path of the damage. Warns of damaged provenance, which is left out,
+    and of a run that was interrupted."""
     with open_hdf5(path) as source:
-        volume, grid = _read_voxels(source)
-        parts = read_provenance(source), _read_gaussians(source), _read_metrics(source)
-        return StoredVolume(volume, grid, *parts, _read_disagreement(source, grid.shape))
+        if isinstance(source.find(_BARE), h5py.Dataset):
+            return Volume(_read_bare(source), None)
+        if not isinstance(source.find(_DATA), h5py.Group):
+            found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
+            raise InputError(str(path), found, f"a 3D dataset {_BARE} or {_VOLUME}")
+        dataset, grid = _dataset_and_grid(source)
+        values = _read_attenuation(source, _VOLUME, dataset)
+        provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
+        return Volume(values, grid, provenance, gaussians, metrics, _read_disagreement(source, grid.shape))
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
-    """How the run goes on that was interrupted and left a volume file, if that says it; whoever goes on checks the arrays.
-    What is damaged is left out, with a warning: the volume is good without."""
+    """Reads the state from which an interrupted run resumes. None where there is none, and with a warning where it is
+    damaged. The caller checks the arrays."""
     with open_hdf5(path) as source:
         try:
             group = source.optional_group(_STATE)
@@ -125,50 +119,33 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
             return None
 
 
-def load_volume(path: str | Path) -> LoadedVolume:
-    """The voxels of a volume file, or of a bare 3D dataset `/volume` (z, y, x), without a grid, whose integers are divided
-    by their type's maximum. Negative values are allowed. InputError: no such file or dataset, NaN or infinity, larger than
-    the file can hold, kept in another file, axes that do not fit; names the file and the dataset."""
-    with open_hdf5(path) as source:
-        if isinstance(source.find(_BARE), h5py.Dataset):
-            return LoadedVolume(_read_bare(source), None)
-        if not isinstance(source.find(_VOLUME), h5py.Dataset):
-            found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
-            raise InputError(str(path), found, f"a 3D dataset {_BARE} or {_VOLUME}")
-        read_provenance(source)
-        return LoadedVolume(*_read_voxels(source))
-
-
-def load_attenuation(
-    path: str | Path, *, warn: bool = True, load: Callable[[str | Path], LoadedVolume] = load_volume
-) -> LoadedVolume:
-    """What ``load`` reads, for a volume that rays are to be sent through; a tenth as much below 0 as above is a warning.
-    InputError: as ``load_volume``; no voxel above 0, or less attenuation than its opposite, as in Hounsfield units."""
-    loaded = load(path)
-    volume = loaded.volume
-    positive = float(np.sum(volume, where=volume > 0, dtype=np.float64))
-    negative = float(-np.sum(volume, where=volume < 0, dtype=np.float64))
-    found = f"values from {volume.min():g} to {volume.max():g}"
+def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
+    """Returns ``volume`` if rays can be sent through it. InputError about ``subject`` where the negative values outweigh
+    the positive ones, as in Hounsfield units; a warning where they are more than a tenth."""
+    values = volume.values
+    positive = float(np.sum(values, where=values > 0, dtype=np.float64))
+    negative = float(-np.sum(values, where=values < 0, dtype=np.float64))
+    found = f"values from {values.min():g} to {values.max():g}"
     expected = "attenuation: 0 in air, above 0 in matter"
     remedy = "of Hounsfield units it is µ(water) (1 + HU / 1000)"
     if positive <= negative:
-        raise InputError(f"volume of {path}", found, expected, remedy)
+        raise InputError(subject, found, expected, remedy)
     if warn and negative > 0.1 * positive:
         share = f"{100 * negative / positive:.0f} % as much below 0 as above"
-        log.warning("volume of %s: %s, %s; expected %s; %s", path, found, share, expected, remedy)
-    return loaded
+        log.warning("%s: %s, %s; expected %s; %s", subject, found, share, expected, remedy)
+    return volume
 
 
 def volume_summary(path: str | Path) -> dict[str, Any]:
-    """Facts about a volume file, for people, without reading the voxels."""
+    """Returns facts about a volume file without reading the voxels."""
     with open_hdf5(path) as source:
-        _, grid = _checked(source)
+        _, grid = _dataset_and_grid(source)
         means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None
         return {
             "shape": grid.shape,
             "voxel_size_mm": grid.voxel_size_mm,
             "offset_mm": grid.offset_mm,
-            "provenance": read_provenance(source),
+            "provenance": _read_provenance(source),
             "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
             "disagreement": None if source.optional(_DISAGREEMENT) is None else _DISAGREEMENT,
@@ -177,7 +154,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def file_kind(path: str | Path) -> str:
-    """What an HDF5 file holds: "scan", "volume", or "plain-volume" (a bare dataset /volume); InputError if none of them."""
+    """Returns the kind of an HDF5 file: "scan", "volume" or "plain-volume" (a bare dataset /volume), else InputError."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"
@@ -190,31 +167,31 @@ def file_kind(path: str | Path) -> str:
     raise InputError(f"{path}:/", f"members: {members}", expected, "check the path")
 
 
-def read_provenance(source: Hdf5Source) -> dict[str, object]:
-    """How a volume came about; says once if its run was interrupted."""
+def _read_provenance(source: Hdf5Source) -> dict[str, object]:
+    """Reads how a volume was made; warns, once per file, if its run was interrupted."""
     provenance = _read_facts(source, "provenance", PROVENANCE) or {}
     if where := interruption(provenance):
         of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"
-        _say_once(source.path, f"interrupted at iteration {where['interrupted_at']}{of}")
+        _warn_once(source.path, f"interrupted at iteration {where['interrupted_at']}{of}")
     return provenance
 
 
 def interruption(provenance: Mapping[str, object]) -> dict[str, int | None]:
-    """``interrupted_at`` and ``iterations_asked`` of a run that was interrupted; nothing of one that was not."""
+    """Returns ``interrupted_at`` and ``iterations_asked`` of an interrupted run; an empty table for any other."""
     at, options = provenance.get("interrupted_at"), provenance.get("options")
-    if type(at) is not int:  # a truth is an int too
+    if type(at) is not int:  # a bool is an int too
         return {}
     asked = options.get("iterations") if isinstance(options, Mapping) else None
     return {"interrupted_at": at, "iterations_asked": asked if type(asked) is int else None}
 
 
 @cache
-def _say_once(path: Path, text: str) -> None:
+def _warn_once(path: Path, text: str) -> None:
     log.warning("%s: %s", path, text)
 
 
 def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid, disagreement: np.ndarray | None) -> None:
-    group = new_group(entry, "reconstruction", "NXdata")
+    group = h5.new_group(entry, "reconstruction", "NXdata")
     group.attrs["signal"], group.attrs["axes"] = "volume", list(_AXES)
     group["title"] = "attenuation (1/mm)"
     dataset = group.create_dataset("volume", data=volume)
@@ -224,11 +201,11 @@ def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid, disagreement:
         beside = group.create_dataset("disagreement", data=np.asarray(disagreement, np.float32))
         beside.attrs.update(units="1/mm", long_name="disagreement (1/mm)", description=_DISAGREEMENT_MEANS)
     for name, centres_mm in zip(_AXES, grid.axes_mm(), strict=True):
-        write_number(group, name, centres_mm, "mm", long_name=f"{name} (mm)")
+        h5.write_number(group, name, centres_mm, "mm", long_name=f"{name} (mm)")
 
 
 def _write_facts(entry: h5py.Group, name: str, facts: Mapping[str, object]) -> None:
-    group = new_group(entry, name, "NXcollection")
+    group = h5.new_group(entry, name, "NXcollection")
     group["json"] = json.dumps(dict(facts), default=_plain)
     for key, value in facts.items():
         value = value.item() if isinstance(value, np.generic) else value
@@ -241,22 +218,23 @@ def _plain(value: object) -> object:
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)
 
 
-def _checked(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
+def _dataset_and_grid(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
     dataset = source.dataset(_VOLUME)
     if dataset.ndim != 3 or min(dataset.shape) < 1:
         raise source.error(_VOLUME, f"shape {dataset.shape}", "three axes (z, y, x), none empty")
     stored = source.optional_group("/entry/grid")
-    grid = read_grid(source, "/entry/grid") if stored is not None else _grid_of_axes(source, dataset.shape)
+    grid = h5.read_grid(source, "/entry/grid") if stored is not None else _grid_of_axes(source, dataset.shape)
     if grid.shape != dataset.shape:
         raise source.error(_VOLUME, f"shape {dataset.shape}", f"the grid's {grid.shape}")
     return dataset, grid
 
 
 def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
+    """Derives the grid from the centres of the voxels along each axis."""
     steps_mm: list[float | None] = []
     centres_mm = []
     for name, count in zip(_AXES, shape, strict=True):
-        axis_mm = read_array(source, f"{_DATA}/{name}", (count,), LENGTH)
+        axis_mm = h5.read_array(source, f"{_DATA}/{name}", (count,), h5.LENGTH)
         step_mm = float((axis_mm[-1] - axis_mm[0]) / max(count - 1, 1))
         even_mm = axis_mm[0] + np.arange(count) * step_mm
         if count > 1 and (step_mm <= 0 or np.abs(axis_mm - even_mm).max() > _AXIS_TOLERANCE * step_mm):
@@ -264,14 +242,8 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
             raise source.error(f"{_DATA}/{name}", "values that do not rise evenly", expected)
         steps_mm.append(step_mm if count > 1 else None)
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
-    known = [step for step in steps_mm if step is not None]  # one voxel has no spacing of its own
-    usual = known[0] if known else 1.0
+    usual = next((step for step in steps_mm if step is not None), 1.0)  # an axis of one voxel has no spacing
     return Grid(triple(shape), triple(usual if s is None else s for s in steps_mm), triple(centres_mm))
-
-
-def _read_voxels(source: Hdf5Source) -> tuple[np.ndarray, Grid]:
-    dataset, grid = _checked(source)
-    return _read_attenuation(source, _VOLUME, dataset), grid
 
 
 def _read_disagreement(source: Hdf5Source, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -283,43 +255,49 @@ def _read_disagreement(source: Hdf5Source, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:
-    """Finite float32 in 1/mm."""
-    values = read_values(source, address, dataset)
+    """Reads finite float32 in 1/mm."""
+    values = h5.read_values(source, address, dataset)
     checks.finite(source.name(address), values)
-    return in_unit(source, address, values, ATTENUATION).astype(np.float32)
+    return h5.in_unit(source, address, values, h5.ATTENUATION).astype(np.float32)
 
 
 def _read_bare(source: Hdf5Source) -> np.ndarray:
     dataset, subject = source.dataset(_BARE), source.name(_BARE)
     if dataset.ndim != 3 or 0 in dataset.shape:
         raise InputError(subject, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
-    raw = read_values(source, _BARE, dataset)
-    if raw.dtype.kind in "iu":
-        return (raw / np.float32(np.iinfo(raw.dtype).max)).astype(np.float32)
-    with np.errstate(over="ignore"):
-        volume = raw.astype(np.float32)  # float64 beyond float32's range becomes infinite: caught below
+    return finite_float32(subject, shares_of_maximum(h5.read_values(source, _BARE, dataset)))
+
+
+def shares_of_maximum(values: np.ndarray) -> np.ndarray:
+    """Returns integers divided by the maximum of their type, in float32; other numbers as they are."""
+    return values / np.float32(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else values
+
+
+def finite_float32(subject: str, values: np.ndarray) -> np.ndarray:
+    """Returns ``values`` as contiguous float32; InputError about ``subject`` where one is not finite."""
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite
+        volume = np.ascontiguousarray(values, np.float32)
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))
     if bad:
-        found = f"{bad} voxels that are NaN, infinite or too large"
-        raise InputError(subject, found, "finite float32 values")
+        raise InputError(subject, f"{bad} voxels that are NaN, infinite or too large", "finite float32 values")
     return volume
 
 
 def _read_part(source: Hdf5Source, address: str) -> np.ndarray:
     dataset = source.dataset(address)
     is_text = h5py.check_string_dtype(dataset.dtype) is not None
-    return np.array(read_word(source, address)) if is_text else read_values(source, address, dataset)
+    return np.array(h5.read_word(source, address)) if is_text else h5.read_values(source, address, dataset)
 
 
 def _read_facts(source: Hdf5Source, name: str, schema: Schema) -> dict[str, object] | None:
     address = f"/entry/{name}/json"
     if source.optional_group(f"/entry/{name}") is None:
         return None
-    return read_facts(source.name(address), read_word(source, address), schema)
+    return read_facts(source.name(address), h5.read_word(source, address), schema)
 
 
 def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:
-    """Numbers by name: what is no number is left out."""
+    """Reads numbers by name; other values are left out with a warning."""
     metrics = _read_facts(source, "metrics", {})
     if metrics is None:
         return None
@@ -337,8 +315,8 @@ def _read_gaussians(source: Hdf5Source) -> Gaussians | None:
         address = f"{_GAUSSIANS}/{name}"
         dataset = source.dataset(address)
         checks.shape(source.name(address), dataset, (len(arrays.get("mean", ())) if arrays else None, *rest))
-        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite for everybody who reads on
-            arrays[name] = read_values(source, address, dataset).astype(np.float32)
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite, which is refused below
+            arrays[name] = h5.read_values(source, address, dataset).astype(np.float32)
         checks.finite(source.name(address), arrays[name])
     if (arrays["scale"] <= 0).any():
         raise source.error(f"{_GAUSSIANS}/scale", f"{arrays['scale'].min():g}", "lengths above 0")

@@ -29,7 +29,7 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     if run.scan is None or count < 1:
         return []
     scan = prepared(run.scan, run.before, rt)
-    return frame_pairs(rt, scan, run.stored.volume, run.stored.grid, chosen_frames(scan.frames, count))
+    return frame_pairs(rt, scan, run.stored.values, run.stored.required_grid, chosen_frames(scan.frames, count))
 
 
 @dataclass(frozen=True, eq=False)

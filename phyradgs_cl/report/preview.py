@@ -14,7 +14,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import (
-    StoredVolume,
+    Volume,
     check_writable,
     file_kind,
     partial_path,
@@ -122,16 +122,16 @@ def view_volume(path: Path) -> None:
     napari.run()
 
 
-def add_volume(viewer: Any, stored: StoredVolume, name: str) -> None:
+def add_volume(viewer: Any, stored: Volume, name: str) -> None:
     """Puts a volume into a viewer at its place in the world: lengths in mm, axes z, y, x, y up, grey from 0."""
     viewer.add_image(
-        stored.volume,
+        stored.values,
         name=f"{name} (1/mm)",
-        scale=stored.grid.voxel_size_mm,
-        translate=stored.grid.first_centre_mm,
+        scale=stored.required_grid.voxel_size_mm,
+        translate=stored.required_grid.first_centre_mm,
         units=("mm", "mm", "mm"),
         axis_labels=_AXES,
-        contrast_limits=grey_range(stored.volume),
+        contrast_limits=grey_range(stored.values),
         colormap="gray",
     )
     viewer.dims.axis_labels = _AXES

@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import StoredVolume, file_kind, read_scan, read_volume, scan_summary, sha256_of
+from phyradgs_cl.io import Volume, file_kind, read_scan, read_volume, scan_summary, sha256_of
 from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
@@ -31,7 +31,7 @@ class Run:
     how the metrics compare volume and truth; empty without a truth."""
 
     path: Path
-    stored: StoredVolume
+    stored: Volume
     scan: Scan | None = None
     scan_path: Path | None = None
     scan_facts: Mapping[str, object] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class Run:
         return found if is_told(found) else None
 
 
-def input_of(stored: StoredVolume) -> Preprocessing:
+def input_of(stored: Volume) -> Preprocessing:
     """What was done to the frames before a volume was made of them, as far as its provenance says."""
     table = stored.provenance.get("input")
     try:
@@ -95,7 +95,7 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
     return run
 
 
-def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list[str]) -> Run:
+def _found(path: Path, stored: Volume, scan_path: Path | None, notes: list[str]) -> Run:
     found = scan_path or _scan_of(path, stored.provenance, notes)
     if found is None:
         return Run(path, stored, metrics=stored.metrics or {}, notes=tuple(notes))
@@ -110,9 +110,9 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
         notes.append("What the method filled beyond the box is discarded: frames computed from the volume lack it.")
     whole = read_scan(found, flat_correction(before.flats))
     whole = replace(whole, provenance={**whole.provenance, "flats": before.flats})
-    scan = whole.on_grid(stored.grid)
+    scan = whole.on_grid(stored.required_grid)
     metrics: dict[str, object] = dict(stored.metrics or {})
-    pair = None if whole.reference is None else aligned(stored.volume, stored.grid, whole.reference, whole.grid)
+    pair = None if whole.reference is None else aligned(stored.values, stored.required_grid, whole.reference, whole.grid)
     if whole.reference is not None and (pair is None or not pair.reference.max() > 0):
         notes.append("Nothing of the scan's reference lies in the volume's box: there is no PSNR.")
         pair = None
@@ -120,7 +120,7 @@ def _found(path: Path, stored: StoredVolume, scan_path: Path | None, notes: list
         return Run(path, stored, scan, found, facts, None, metrics, tuple(notes))
     if not metrics.keys() >= METRICS.keys():
         metrics = {**compare(pair.volume, pair.reference), **metrics}
-    reference = pair.reference if pair.grid is stored.grid else None
+    reference = pair.reference if pair.grid is stored.required_grid else None
     if reference is None:
         notes.append("The scan's reference is on another grid than the volume: its slices are not shown.")
     return Run(path, stored, scan, found, facts, reference, metrics, tuple(notes), pair.how)

@@ -41,10 +41,10 @@ _DISAGREEMENT = (
 def slices_section(run: Run) -> Markup:
     """The volume, or the volume against the truth."""
     stored = run.stored
-    windows = windows_of(stored.volume, run.reference)
-    planes = planes_of(stored.volume, run.reference, stored.grid, windows)
-    size = " × ".join(number(side) for side in stored.grid.size_mm)
-    told = f"{' × '.join(map(str, stored.grid.shape))} voxels (z, y, x), {size} mm"
+    windows = windows_of(stored.values, run.reference)
+    planes = planes_of(stored.values, run.reference, stored.required_grid, windows)
+    size = " × ".join(number(side) for side in stored.required_grid.size_mm)
+    told = f"{' × '.join(map(str, stored.required_grid.shape))} voxels (z, y, x), {size} mm"
     left_out = any(len(plane.indices) < plane.count for plane in planes)
     told += "; the page has evenly chosen slices of them" if left_out else ""
     note = element("p", told + ".", class_="note")
@@ -66,7 +66,7 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
     """Numbers against the truth, and against the measurement where frames were computed."""
     facts: dict[str, object] = dict(run.metrics)
     if run.reference is not None:
-        error = run.stored.volume.astype(np.float64) - run.reference
+        error = run.stored.values.astype(np.float64) - run.reference
         facts["root_mean_square_error_per_mm"] = float(np.sqrt(np.mean(error**2)))
         facts["mean_error_per_mm"] = float(np.mean(error))
     if views:

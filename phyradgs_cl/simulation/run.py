@@ -21,7 +21,7 @@ from phyradgs_cl.detector import (
 )
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import LoadedVolume, Scanner
+from phyradgs_cl.io import Scanner, Volume
 from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.options import SimulationOptions
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 def simulated_scan(
     rt: Runtime,
-    of: str | LoadedVolume | EllipsoidPhantom,
+    of: str | Volume | EllipsoidPhantom,
     scanner: Scanner,
     options: SimulationOptions,
     *,
@@ -49,9 +49,9 @@ def simulated_scan(
     size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples:
     rays along each side of a pixel. Warns of an inverse crime."""
     if size is not None:
-        checks.within("--size", size, 1 if isinstance(of, LoadedVolume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
+        checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
-    if not isinstance(of, LoadedVolume):
+    if not isinstance(of, Volume):
         count = size or max(scanner.grid.shape)
         scene = phantom_scene(rt, of, *where, count, axis, options.seed, pixel_samples)
     else:

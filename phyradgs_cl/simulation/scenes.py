@@ -10,7 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import LoadedVolume
+from phyradgs_cl.io import Volume
 from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, FrameSource, PixelAreaSource, VolumeSource
@@ -73,7 +73,7 @@ def phantom_scene(
 
 def volume_scene(
     rt: Runtime,
-    loaded: LoadedVolume,
+    loaded: Volume,
     name: str,
     geometry: ConeGeometry,
     box: Grid,
@@ -83,7 +83,7 @@ def volume_scene(
 ) -> Scene:
     """A volume, called ``name``, projected at its own resolution by ``pixel_samples``² rays per pixel. A bare array is
     fitted into the scanner's box, its values attenuation per half of the longest side; one with a grid keeps it and 1/mm."""
-    volume, fine = loaded.volume, loaded.grid
+    volume, fine = loaded.values, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
         fine = Grid(volume.shape, (voxel_mm,) * 3, box.offset_mm)

@@ -27,8 +27,9 @@ def run_evaluation(
     if picture.suffix.lower() != ".png":
         raise InputError("--picture", str(picture), "a file name that ends in .png")
     check_writable(picture)
-    volume, grid, provenance = load_result(volume_path)
-    reference, stored_grid = load_reference(reference_path)
+    result, stored = load_result(volume_path), load_reference(reference_path)
+    volume, grid, provenance = result.values, result.grid, result.provenance
+    reference, stored_grid = stored.values, stored.grid
     how, share = f"{VOXEL_BY_VOXEL}, as {plain_text(volume_path.name)} has no scale", 1.0
     if grid is not None:
         truth = reference, _grid_of(reference_path, reference, stored_grid, reference_voxel_mm, volume_path)

@@ -5,14 +5,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import foreign_suffix
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import file_kind, read_scan, read_volume, scan_summary, volume_summary
+from phyradgs_cl.io import Volume, file_kind, read_scan, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.prepare import flat_correction
 
@@ -74,25 +71,21 @@ def refuse_foreign_suffix(output: Path, remedy: str = "write scan.h5") -> None:
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as NAME.h5", remedy)
 
 
-def load_result(path: Path) -> tuple[np.ndarray, Grid | None, dict[str, object]]:
-    """A volume file of any format: values (z, y, x), its grid if it has one, and our own files' provenance."""
+def load_result(path: Path) -> Volume:
+    """Reads a volume file of any format."""
     with expecting(path, "volume", "plain-volume"):
-        if importers.foreign_volume(path) is None and file_kind(path) == "volume":
-            stored = read_volume(path)
-            return stored.volume, stored.grid, stored.provenance
-        return *importers.load_volume(path), {}
+        return importers.load_volume(path)
 
 
-def load_reference(path: Path) -> tuple[np.ndarray, Grid | None]:
-    """The reference in a scan, or a volume file of any format; bare values have no grid."""
+def load_reference(path: Path) -> Volume:
+    """Reads the reference in a scan, or a volume file of any format."""
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
             expected = "a scan with a known truth"
             raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
-        return scan.reference, scan.grid
-    volume, grid, _ = load_result(path)
-    return volume, grid
+        return Volume(scan.reference, scan.grid)
+    return load_result(path)
 
 
 def summary(path: Path) -> dict[str, object]:
@@ -113,9 +106,10 @@ def summary(path: Path) -> dict[str, object]:
 
 
 def _voxel_facts(path: Path) -> dict[str, object]:
-    volume, grid = importers.load_volume(path)
+    volume = importers.load_volume(path)
+    values, grid = volume.values, volume.grid
     where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
-    return {"shape": volume.shape, **where, "minimum": float(volume.min()), "maximum": float(volume.max())}
+    return {"shape": values.shape, **where, "minimum": float(values.min()), "maximum": float(values.max())}
 
 
 def _asked_for(options: object) -> dict[str, object]:

@@ -10,7 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PROTOCOLS, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_attenuation, load_beads
-from phyradgs_cl.io import LoadedVolume, Scanner, check_writable, only_run, write_scan
+from phyradgs_cl.io import Scanner, Volume, check_writable, only_run, write_scan
 from phyradgs_cl.phantoms import PHANTOMS, EllipsoidPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt
@@ -76,7 +76,7 @@ def run_simulation(
     refuse_foreign_suffix(job.output)
     check_writable(job.output)
     with only_run(job.output):
-        of: str | LoadedVolume | EllipsoidPhantom = phantom_of(job.phantom or "foot")
+        of: str | Volume | EllipsoidPhantom = phantom_of(job.phantom or "foot")
         if job.volume is not None:
             with expecting(job.volume, "plain-volume", "volume"):
                 of = load_attenuation(job.volume)

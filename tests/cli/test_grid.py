@@ -38,13 +38,13 @@ def test_a_coarser_volume_is_compared_with_means_of_the_truth(cli, scan, tmp_pat
     output = tmp_path / "v.h5"
     assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "fdk", "--size", "4"]) == 0
     stored, truth = read_volume(output), load_scan(scan).reference.reshape(4, 2, 4, 2, 4, 2).mean((1, 3, 5))
-    assert stored.metrics["psnr_db"] == pytest.approx(compare(stored.volume, truth)["psnr_db"], abs=1e-4)
+    assert stored.metrics["psnr_db"] == pytest.approx(compare(stored.values, truth)["psnr_db"], abs=1e-4)
     assert f"PSNR {stored.metrics['psnr_db']:.2f} dB" in (line := capsys.readouterr().out)
     assert "with means of the reference over 2×2×2 voxels" in line
     run = load_run(output, scan)
     np.testing.assert_allclose(run.reference, truth, rtol=1e-5)
     assert run.compared == stored.provenance["compared"]
-    write_volume(output, stored.volume, stored.grid, stored.provenance)  # as written before there was a score
+    write_volume(output, stored.values, stored.grid, stored.provenance)  # as written before there was a score
     assert load_run(output, scan).metrics["psnr_db"] == pytest.approx(stored.metrics["psnr_db"])
 
 
@@ -61,8 +61,8 @@ def test_a_part_of_the_grid_has_the_same_voxels_and_a_score(cli, scan, tmp_path,
     assert cli.run([*command, "-o", str(whole)]) == 0
     assert cli.run([*command, "-o", str(part), "--roi-mm", INSIDE]) == 0
     assert caplog.records == []
-    found, same = read_volume(part), read_volume(whole).volume[2:6, 2:7, 1:6]
-    np.testing.assert_allclose(found.volume, same, atol=1e-5 * np.abs(same).max())
+    found, same = read_volume(part), read_volume(whole).values[2:6, 2:7, 1:6]
+    np.testing.assert_allclose(found.values, same, atol=1e-5 * np.abs(same).max())
     assert found.metrics["psnr_db"] > 0
     np.testing.assert_array_equal(load_run(part, scan).reference, load_scan(scan).reference[2:6, 2:7, 1:6])
 

@@ -70,7 +70,7 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name)
             kill_in_the_middle(run, killed, 0.0)
     resume = ["--resume"] if checkpoint_path(killed).exists() else []
     subprocess.run([*run, *resume], check=True, capture_output=True)
-    np.testing.assert_array_equal(read_volume(killed).volume, read_volume(whole).volume)
+    np.testing.assert_array_equal(read_volume(killed).values, read_volume(whole).values)
     told, expected = (
         [line["iteration"] for line in read_volume(path).provenance["record"]] for path in (killed, whole)
     )

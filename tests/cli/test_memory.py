@@ -40,7 +40,7 @@ def test_reconstruction_in_bricks(cli, scan, tmp_path, method, monkeypatch) -> N
     for more in ([], ["--memory", "100KiB"]):
         output = tmp_path / f"{len(more)}.h5"
         assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", *method.split(), *more]) == 0
-        volumes.append(read_volume(output).volume)
+        volumes.append(read_volume(output).values)
     assert ledgers[0].peak_bytes > ledgers[1].limit_bytes >= ledgers[1].peak_bytes
     np.testing.assert_allclose(volumes[1], volumes[0], rtol=0, atol=1e-5 * volumes[0].max())
     assert cli.run(["estimate", str(scan), "--method", *method.split(), "--memory", "100KiB"]) == 0

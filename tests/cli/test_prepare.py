@@ -31,7 +31,7 @@ def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys)
     assert cli.run(["reconstruct", str(source), "-o", str(volume), "--method", "fdk", *steps]) == 0
     direct = read_volume(volume)
     assert cli.run(["reconstruct", str(output), "-o", str(volume), "--method", "fdk"]) == 0
-    np.testing.assert_allclose(direct.volume, read_volume(volume).volume, atol=1e-6)
+    np.testing.assert_allclose(direct.values, read_volume(volume).values, atol=1e-6)
     assert [step["step"] for step in direct.provenance["prepared"]] == ["sparks", "dead", "rings"]
 
 

@@ -25,7 +25,7 @@ def test_a_run_with_pictures_is_the_same_run(cli, scan, tmp_path, words) -> None
     picture, seen, plain = tmp_path / "now.png", tmp_path / "seen.h5", tmp_path / "plain.h5"
     for output, more in ((seen, ["--preview", str(picture)]), (plain, [])):
         assert cli.run(["reconstruct", str(scan), "-o", str(output), *words.split(), *more]) == 0
-    np.testing.assert_array_equal(read_volume(seen).volume, read_volume(plain).volume)
+    np.testing.assert_array_equal(read_volume(seen).values, read_volume(plain).values)
     assert imread(picture).max() > 0 and not (tmp_path / "now.partial.png").exists()
 
 

@@ -59,7 +59,7 @@ def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None
         assert (tmp_path / output).exists(), line
     assert len(windows) == 1 and load_scan(tmp_path / "imported.h5").frames == 4
     for name in ("volume.h5", "out/imported.h5"):
-        assert read_volume(tmp_path / name).volume.any(), name
+        assert read_volume(tmp_path / name).values.any(), name
 
 
 def test_no_command_is_left_out(cli) -> None:

@@ -53,7 +53,7 @@ def check_all(folder: Path, tmp: Path) -> None:
     grid = read_grid(read_config(folder / "grid.toml"), folder / "grid.toml")
     run_sweep(SweepJob(grid, tmp / "alone"))
     for line in lines:
-        volumes = (read_volume(root / line["volume"]).volume for root in (folder / "out", tmp / "alone"))
+        volumes = (read_volume(root / line["volume"]).values for root in (folder / "out", tmp / "alone"))
         np.testing.assert_array_equal(*volumes)
     assert "40 of 40 runs, 0 failed" in (folder / "out" / "results.md").read_text()
 

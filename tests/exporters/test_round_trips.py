@@ -31,7 +31,7 @@ def test_simpleitk_sees_our_millimetres(volume_file, stored, to) -> None:
     image = sitk.ReadImage(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(path) if to == "dicom" else path)
     values = sitk.GetArrayFromImage(image)
     tolerance = 0.09 / 32767 if to == "dicom" else 0
-    np.testing.assert_allclose(values, stored.volume, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(values, stored.values, rtol=0, atol=tolerance)
     z, y, x = BRIGHT
     np.testing.assert_allclose(image.TransformIndexToPhysicalPoint((x, y, z)), world_mm(stored), atol=1e-5)
     np.testing.assert_allclose(image.GetSpacing(), stored.grid.voxel_size_mm[::-1], rtol=1e-6)
@@ -43,7 +43,7 @@ def test_nibabel(volume_file, stored, tmp_path, suffix) -> None:
     """RAS: x and y change their sign, z is superior; sform and qform say the same."""
     path = export_volume(volume_file, "nii", tmp_path / f"out{suffix}")
     image = nibabel.load(path)
-    np.testing.assert_array_equal(np.asarray(image.dataobj), stored.volume.transpose(2, 1, 0))
+    np.testing.assert_array_equal(np.asarray(image.dataobj), stored.values.transpose(2, 1, 0))
     z, y, x = BRIGHT
     wx, wy, wz = world_mm(stored)
     np.testing.assert_allclose((image.affine @ [x, y, z, 1])[:3], (-wx, -wy, wz), atol=1e-5)
@@ -63,7 +63,7 @@ def test_tifffile_as_imagej_reads_it(volume_file, stored) -> None:
     path = export_volume(volume_file, "tiff")
     assert path.suffix == ".tif"
     with tifffile.TiffFile(path) as tiff:
-        np.testing.assert_array_equal(tiff.asarray(), stored.volume)
+        np.testing.assert_array_equal(tiff.asarray(), stored.values)
         assert tiff.series[0].axes == "ZYX" and tiff.is_imagej
         facts = tiff.imagej_metadata
         dz, dy, dx = stored.grid.voxel_size_mm
@@ -78,7 +78,7 @@ def test_tifffile_as_imagej_reads_it(volume_file, stored) -> None:
 
 def test_npy(volume_file, stored) -> None:
     path = export_volume(volume_file, "npy")
-    np.testing.assert_array_equal(np.load(path), stored.volume)
+    np.testing.assert_array_equal(np.load(path), stored.values)
     facts = json.loads(path.with_suffix(".json").read_text())
     assert facts["values"] == "1/mm" and facts["axes"] == ["z", "y", "x"]
     place = np.array(facts["first_centre_mm"]) + np.array(BRIGHT) * facts["voxel_size_mm"]
@@ -89,7 +89,7 @@ def test_pydicom(volume_file, stored) -> None:
     path = export_volume(volume_file, "dicom", mu_water_per_mm=MU_WATER)
     slices = [pydicom.dcmread(file) for file in sorted(path.iterdir())]
     assert len(slices) == 5
-    hu = 1000 * (stored.volume.astype(float) / MU_WATER - 1)
+    hu = 1000 * (stored.values.astype(float) / MU_WATER - 1)
     for index, image in enumerate(slices):
         assert image.Modality == "CT" and image.RescaleType == "HU"
         values = image.pixel_array * float(image.RescaleSlope) + float(image.RescaleIntercept)
@@ -107,7 +107,7 @@ def test_pydicom(volume_file, stored) -> None:
 
 
 def test_hounsfield_units(volume_file, stored) -> None:
-    expected = 1000 * (stored.volume.astype(float) / MU_WATER - 1)
+    expected = 1000 * (stored.values.astype(float) / MU_WATER - 1)
     for to in ("nii", "mha", "nrrd", "tiff", "npy"):
         path = export_volume(volume_file, to, mu_water_per_mm=MU_WATER)
         read = {"tiff": tifffile.imread, "npy": np.load}.get(
@@ -160,7 +160,7 @@ def test_wrong_wishes_are_one_line(volume_file, tmp_path, stored) -> None:
             export_volume(volume_file, **wish)
         assert word in str(caught.value) and "\n" not in str(caught.value)
         assert sorted(tmp_path.iterdir()) == before
-    write_volume(volume_file, stored.volume, stored.grid, {})
+    write_volume(volume_file, stored.values, stored.grid, {})
     with pytest.raises(InputError, match="/entry/gaussians"):
         export_volume(volume_file, "ply")
 
@@ -195,7 +195,7 @@ def test_a_failure_leaves_nothing(volume_file, tmp_path, monkeypatch, to) -> Non
 
 
 def test_a_missing_package_is_named(volume_file, monkeypatch) -> None:
-    for to, package in (("tiff", "tifffile"), ("dicom", "pydicom")):
+    for to, package in (("nii", "SimpleITK"), ("tiff", "tifffile"), ("dicom", "pydicom")):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(InputError, match=f"{package}: .*formats"):
             export_volume(volume_file, to)

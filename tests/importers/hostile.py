@@ -305,18 +305,18 @@ RTK: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a stack that is a link": (symlinked(MHA), ("symbolic link",)),
     "a truncated stack": (truncated(MHA), ("bytes",)),
     "a stack declared huge": (in_text(MHA, "DimSize = 14 10 6", "DimSize = 140000 100000 6"), ("bytes",)),
-    "a stack declared negative": (in_text(MHA, "DimSize = 14 10 6", "DimSize = -14 -10 6"), ("shape",)),
-    "a size that is text": (in_text(MHA, "DimSize = 14", "DimSize = all"), ("DimSize",)),
-    "a size that is infinite": (in_text(MHA, "DimSize = 14", "DimSize = inf"), ("DimSize",)),
+    "a stack declared negative": (in_text(MHA, "DimSize = 14 10 6", "DimSize = -14 -10 6"), ("projections.mha",)),
+    "a size that is text": (in_text(MHA, "DimSize = 14", "DimSize = all"), ("projections.mha",)),
+    "a size that is infinite": (in_text(MHA, "DimSize = 14", "DimSize = inf"), ("projections.mha",)),
     "voxels outside": (in_text(MHA, "ElementDataFile = LOCAL", "ElementDataFile = ../secret.npy"), ("inside",)),
     "voxels anywhere": (in_text(MHA, "ElementDataFile = LOCAL", "ElementDataFile = /etc/passwd"), ("inside",)),
     "voxels in a list": (in_text(MHA, "ElementDataFile = LOCAL", "ElementDataFile = LIST"), ("LIST",)),
-    "four axes": (in_text(MHA, "NDims = 3", "NDims = 4"), ("NDims",)),
-    "no voxel type": (in_text(MHA, "MET_FLOAT", "MET_OBJECT"), ("ElementType",)),
-    "no spacing": (in_text(MHA, "ElementSpacing = 2.5", "ElementSpacing = 0"), ("ElementSpacing",)),
-    "a skew stack": (in_text(MHA, "TransformMatrix = 1 0 0", "TransformMatrix = 0 0 1"), ("TransformMatrix",)),
-    "no header": (filled(MHA, b"\0" * 100_000), ("ElementDataFile",)),
-    "deflated rubbish": (in_text(MHA, "CompressedData = False", "CompressedData = True"), ("compressed",)),
+    "four axes": (in_text(MHA, "NDims = 3", "NDims = 4"), ("projections.mha",)),
+    "no voxel type": (in_text(MHA, "MET_FLOAT", "MET_OBJECT"), ("projections.mha",)),
+    "no spacing": (in_text(MHA, "ElementSpacing = 2.5", "ElementSpacing = 0"), ("projections.mha",)),
+    "a skew stack": (in_text(MHA, "TransformMatrix = 1 0 0", "TransformMatrix = 0 0 1"), ("projections.mha",)),
+    "no header": (filled(MHA, b"\0" * 100_000), ("header",)),
+    "deflated rubbish": (in_text(MHA, "CompressedData = False", "CompressedData = True"), ("compressed data",)),
 }  # fmt: skip
 
 
@@ -328,7 +328,7 @@ def deflate_bomb(path: Path) -> None:
     (path / MHA).write_bytes(header + zlib.compress(b"\0" * 800))
 
 
-RTK["deflated too short"] = (deflate_bomb, ("after unpacking",))
+RTK["deflated too short"] = (deflate_bomb, ("800 bytes of data",))
 
 
 def linked(file: h5py.File, address: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
-from phyradgs_cl.io import load_attenuation, load_volume
+from phyradgs_cl.importers import load_attenuation, load_volume
 
 
 def _write(path: Path, data: object, name: str = "volume") -> Path:
@@ -33,16 +33,18 @@ def test_integers_are_divided_by_their_types_maximum(tmp_path: Path) -> None:
     for dtype, top in (("u1", 255), ("u2", 65535), ("i2", 32767)):
         data = np.zeros((2, 3, 4), dtype)
         data[1, 2, 3], data[0, 0, 0] = top, top // 2
-        volume, grid = load_volume(_write(tmp_path / "v.h5", data))
-        assert grid is None and volume.dtype == np.float32
+        loaded = load_volume(_write(tmp_path / "v.h5", data))
+        volume = loaded.values
+        assert loaded.grid is None and volume.dtype == np.float32
         assert volume[1, 2, 3] == 1 and volume[0, 0, 0] == pytest.approx((top // 2) / top, rel=1e-6), dtype
     data = np.random.default_rng(0).normal(size=(3, 4, 5))
-    assert np.array_equal(load_volume(_write(tmp_path / "v.h5", data)).volume, data.astype(np.float32))
+    assert np.array_equal(load_volume(_write(tmp_path / "v.h5", data)).values, data.astype(np.float32))
 
 
 def test_a_result_file_comes_with_its_grid(tmp_path: Path) -> None:
     grid = Grid((4, 5, 6), (0.5, 0.25, 0.2), (3.0, -1.0, 0.5))
-    volume, found = load_volume(_write_result(tmp_path / "r.h5", grid))
+    loaded = load_volume(_write_result(tmp_path / "r.h5", grid))
+    volume, found = loaded.values, loaded.grid
     assert volume.shape == (4, 5, 6) and volume.min() == -5
     assert found is not None and found.shape == grid.shape
     assert np.allclose(found.voxel_size_mm, grid.voxel_size_mm, rtol=1e-5)
@@ -95,7 +97,7 @@ def test_what_does_not_attenuate_cannot_be_scanned(tmp_path: Path) -> None:
         path = _write(tmp_path / "v.h5", np.full((2, 3, 4), level, np.float32))
         with pytest.raises(InputError, match=r"v.h5: found values from .*; expected attenuation: 0 in air"):
             load_attenuation(path)
-        assert load_volume(path).volume.min() == level
+        assert load_volume(path).values.min() == level
 
 
 def test_hounsfield_units_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -113,5 +115,5 @@ def test_hounsfield_units_are_refused_or_told(tmp_path: Path, caplog: pytest.Log
     caplog.clear()  # noise about nothing is no reason to warn
     volume = np.random.default_rng(0).normal(0, 0.03, (8, 8, 8))
     volume[2:6, 2:6, 2:6] += 1
-    assert load_attenuation(_write(tmp_path / "v.h5", volume)).volume.min() < 0
+    assert load_attenuation(_write(tmp_path / "v.h5", volume)).values.min() < 0
     assert not caplog.records

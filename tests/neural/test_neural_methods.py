@@ -186,7 +186,7 @@ def test_from_file_to_file(rt, scan, method, tmp_path, capsys) -> None:
     assert load_cli().run([*command, *settings, "--iterations", "2", "--motion", "per-row"]) == 0
     assert "PSNR" in capsys.readouterr().out
     stored = read_volume(tmp_path / "volume.h5")
-    assert stored.volume.shape == scan.grid.shape
+    assert stored.values.shape == scan.grid.shape
     assert stored.provenance["method"] == method
     assert not checkpoint_path(tmp_path / "volume.h5").exists()
     assert load_cli().run(["report", str(tmp_path / "volume.h5"), "-o", str(tmp_path / "page.html")]) == 0

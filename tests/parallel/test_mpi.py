@@ -136,7 +136,7 @@ def whole(scan_file: Path) -> np.ndarray:
     """The volume of a run that nobody disturbed."""
     output = scan_file.with_name("whole.h5")
     assert run(command(2, scan_file, output)).returncode == 0
-    return read_volume(output).volume
+    return read_volume(output).values
 
 
 @pytest.mark.parametrize(("killed", "size", "then"), [(1, 3, 2), (0, 2, 4), (1, 2, 1)])
@@ -152,7 +152,7 @@ def test_a_killed_rank_ends_all_and_the_checkpoint_goes_on(
     assert said(stderr) == []  # the launcher says which process was lost
     done = run(command(then, scan_file, output, "--resume"))
     assert done.returncode == 0, done.stderr
-    np.testing.assert_array_equal(read_volume(output).volume, whole)
+    np.testing.assert_array_equal(read_volume(output).values, whole)
     assert not list(tmp_path.glob("*.checkpoint*"))
 
 
@@ -165,7 +165,7 @@ def test_a_signal_to_mpiexec_keeps_what_there_is(scan_file, whole, tmp_path, num
     assert [line.split(" iteration")[0] for line in said(stderr)] == ["phyradgs: interrupted at"]
     assert partial_path(output).exists() and not output.exists()
     assert run(command(3, scan_file, output, "--resume")).returncode == 0
-    np.testing.assert_array_equal(read_volume(output).volume, whole)
+    np.testing.assert_array_equal(read_volume(output).values, whole)
 
 
 def test_one_rank_that_fails_ends_all_with_its_line(scan_file, tmp_path) -> None:

@@ -159,7 +159,7 @@ def test_layers_change_all_pictures(page) -> None:
 
 
 def test_the_value_under_the_pointer_is_that_of_the_file(page, files) -> None:
-    volume = read_volume(files[1]).volume
+    volume = read_volume(files[1]).values
     picture(page, "coronal")
     assert reading(page).startswith("Where the lines cross, x 0.08, y 0.08, z 0.08 mm: ")
     page.locator("#plane-coronal").scroll_into_view_if_needed()

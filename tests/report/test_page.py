@@ -14,7 +14,7 @@ from skimage import io
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.io import StoredVolume, read_volume, write_scan, write_volume
+from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report.comparisons import chosen_frames, computed_views
@@ -94,7 +94,7 @@ def test_a_short_run_of_gaussians_has_its_convergence(rt, files, tmp_path, parse
 def test_pictures_decode_to_the_volume_slices(page, files, small_scan) -> None:
     stored = read_volume(files[1])
     data = json.loads(page.texts["script"][0])
-    layers = {"result": stored.volume, "truth": small_scan.reference, "difference": stored.volume - small_scan.reference}
+    layers = {"result": stored.values, "truth": small_scan.reference, "difference": stored.values - small_scan.reference}
     assert list(data["windows"]) == list(layers)
     for name, axis in (("axial", 0), ("coronal", 1), ("sagittal", 2)):
         plane = data["planes"][name]
@@ -114,7 +114,7 @@ def test_without_a_script_the_middle_slices_have_the_stated_window(page, files) 
     high = float(re.search(r"white ([\d.]+) 1/mm", page.words)[1])
     stills = [image for image in page.all("img") if "slice of the volume" in image["alt"]]
     for axis, still in enumerate(stills):
-        expected = 255 * np.clip(read_volume(files[1]).volume.take(6, axis=axis)[::-1] / high, 0, 1)
+        expected = 255 * np.clip(read_volume(files[1]).values.take(6, axis=axis)[::-1] / high, 0, 1)
         assert np.abs(decoded(still["src"]) - expected).max() <= 1
     marks = [text for text in page.texts["b"] if text[0] in "+−"]
     assert marks == ["−x", "+x", "+y", "−y", "−x", "+x", "+z", "−z", "−y", "+y", "+z", "−z"]
@@ -140,7 +140,7 @@ def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> Non
 
 def test_frames_of_an_intensity_panel_are_compared_with_intensities(rt, scan_maker) -> None:
     scan = scan_maker(detector_model="intensity", peak=8.0)
-    truth = StoredVolume(scan.reference, scan.grid, {})
+    truth = Volume(scan.reference, scan.grid, {})
     as_it_is = computed_views(Run(Path("v.h5"), truth, scan), rt, 8)
     as_log = computed_views(Run(Path("v.h5"), truth, replace(scan, detector_model="log")), rt, 8)
     means = [np.mean([view.residual.mean() for view in views]) for views in (as_it_is, as_log)]
@@ -165,7 +165,7 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     options = {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]}
     facts = {"options": options, "input": {"median_filter": HOSTILE}, "record": record}
     facts |= {"method": HOSTILE, HOSTILE: HOSTILE, "scan": HOSTILE}
-    write_volume(volume_path, stored.volume, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
+    write_volume(volume_path, stored.values, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
     write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
     text = (tmp_path / "p.html").read_text(encoding="utf-8")
     page = parse(text)
@@ -178,7 +178,7 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
 def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
     volume, stored = tmp_path / "alone.h5", read_volume(files[1])
     facts = {**stored.provenance, "scan": "gone.h5"}
-    write_volume(volume, stored.volume, stored.grid, facts, None, stored.metrics)
+    write_volume(volume, stored.values, stored.grid, facts, None, stored.metrics)
     run = write_report(volume, tmp_path / "p.html", no_runtime)
     assert run.scan is None and "--scan" in run.notes[0] and "gone.h5" in caplog.text
     page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
@@ -201,7 +201,7 @@ def test_a_scan_that_stops_has_no_times(rt, files, small_scan, tmp_path, parse) 
 def test_a_scan_that_has_changed_is_not_taken_for_the_run_scan(files, small_scan, tmp_path, parse) -> None:
     volume, stored = tmp_path / "volume.h5", read_volume(files[1])
     facts = {**stored.provenance, "scan": str(tmp_path / "other.h5")}
-    write_volume(volume, stored.volume, stored.grid, facts)
+    write_volume(volume, stored.values, stored.grid, facts)
     write_scan(tmp_path / "other.h5", replace(small_scan, reference=None))
     assert load_run(volume).scan is None
     run = load_run(volume, tmp_path / "other.h5")

@@ -127,7 +127,7 @@ def test_a_scan_that_provenance_names_may_be_any_file(tmp_path, cli, files) -> N
     empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     for named in ("/proc/kmsg", "/proc/kcore", "/dev/zero", "/", "\0", "x" * 5000, "\ud800"):
         facts = {"method": "fdk", "scan": named, "scan_sha256": empty}
-        write_volume(tmp_path / "v.h5", stored.volume, stored.grid, {"method": "fdk"})
+        write_volume(tmp_path / "v.h5", stored.values, stored.grid, {"method": "fdk"})
         written(tmp_path / "v.h5", tmp_path / "w.h5", json.dumps(facts))
         assert cli.run(["report", str(tmp_path / "w.h5"), "-o", str(tmp_path / "page.html")]) == 0
-    assert np.all(read_volume(tmp_path / "w.h5").volume == stored.volume)
+    assert np.all(read_volume(tmp_path / "w.h5").values == stored.values)

@@ -2,19 +2,16 @@
 
 import json
 import math
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
-from phyradgs_cl.io.regular import open_regular, read_regular, regular_file
+from phyradgs_cl.io.regular import read_regular, regular_file
 from phyradgs_cl.io.tables import LARGEST
 
 MOST_TEXT_BYTES = 64 << 20
-_MOST_HEADER_BYTES = 1 << 16
-MOST_INFLATION = 1040  # deflate cannot do more than 1032
 
 
 def check_room(subject: str, needed_bytes: int) -> None:
@@ -29,12 +26,6 @@ def check_room(subject: str, needed_bytes: int) -> None:
 def read_bytes(path: Path) -> bytes:
     """A whole file, of a description's size at most."""
     return read_regular(path, str(path), MOST_TEXT_BYTES, "a description of a scan")
-
-
-def read_head(path: Path) -> bytes:
-    """As much of a file as a text header takes."""
-    with open_regular(path, str(path)) as (file, _):
-        return file.read(_MOST_HEADER_BYTES)
 
 
 def read_json(path: Path) -> dict[str, object]:
@@ -86,30 +77,6 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
         raise InputError(subject, f"a damaged .npy file ({error})", "a NumPy array") from error
     values = values.reshape(shape, order="F" if fortran else "C")
     return np.ascontiguousarray(values)
-
-
-def read_raw(path: Path, start: int, shape: tuple[int, ...], dtype: np.dtype, packed: bool) -> np.ndarray:
-    """The array (C order) at byte ``start`` to the end of a file, ``packed`` by zlib or gzip or not at all."""
-    available = path.stat().st_size - start
-    check_array(str(path), shape, dtype, available * (MOST_INFLATION if packed else 1), len(shape))
-    count = math.prod(shape)
-    with open(path, "rb") as file:
-        file.seek(start)
-        if not packed:
-            return np.fromfile(file, dtype, count).reshape(shape)
-        return np.frombuffer(_inflated(path, file.read(), count * dtype.itemsize), dtype).reshape(shape)
-
-
-def _inflated(path: Path, packed: bytes, size: int) -> bytes:
-    """Exactly ``size`` bytes; not one more is unpacked."""
-    machine = zlib.decompressobj(wbits=47)  # zlib or gzip
-    try:
-        data = machine.decompress(packed, size)
-    except zlib.error as error:
-        raise InputError(str(path), f"compressed data that are damaged ({error})", "zlib data") from error
-    if len(data) != size:
-        raise InputError(str(path), f"{len(data)} bytes after unpacking", f"{size} bytes")
-    return data
 
 
 def check_array(

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 import posixpath
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +20,6 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
 from phyradgs_cl.io.output import written_beside
 
-_SPARE_BYTES = 1 << 16  # what HDF5 writes beside the arrays
 _log = logging.getLogger(__name__)
 
 
@@ -215,15 +213,10 @@ def read_grid(source: Hdf5Source, address: str) -> Grid:
 
 @contextmanager
 def new_hdf5(path: str | Path, size_bytes: int) -> Iterator[h5py.File]:
-    """Creates an HDF5 file for arrays of ``size_bytes``, whole or not at all (``written_beside``). Reserves the room first,
-    since the HDF5 library can crash on a full disk; OutputError where there is none."""
-    with written_beside(path) as temporary:
-        if hasattr(os, "posix_fallocate"):
-            with open(temporary, "r+b") as reserved:
-                os.posix_fallocate(reserved.fileno(), 0, size_bytes + _SPARE_BYTES)
-        with h5py.File(temporary, "w") as file:
-            file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
-            yield file
+    """Creates an HDF5 file for arrays of ``size_bytes``, whole or not at all; see ``written_beside``."""
+    with written_beside(path, size_bytes) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
+        yield file
 
 
 def write_grid(parent: h5py.Group, grid: Grid) -> None:

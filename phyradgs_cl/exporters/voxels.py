@@ -1,0 +1,91 @@
+"""Voxels in other programs' formats: NIfTI, NRRD and MetaImage by SimpleITK, TIFF as ImageJ writes it, NumPy.
+
+The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
+viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.output import written_beside
+from phyradgs_cl.io.volume import Volume
+
+_WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
+_MOST_NIFTI_VOXELS = 32_767  # along one axis
+_MOST_IMAGEJ_BYTES = 4_000_000_000  # ImageJ's TIFF counts in 32 bits
+
+
+def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
+    """Returns 1000 (μ/μ_water − 1) as float32: 0 for water, −1000 for nothing."""
+    checks.within("--mu-water-per-mm", mu_water_per_mm, 1e-6, 1e3)
+    with np.errstate(over="ignore"):
+        hu = (1000.0 * (values.astype(np.float64) / mu_water_per_mm - 1.0)).astype(np.float32)
+    if not np.isfinite(hu).all():
+        raise InputError("--mu-water-per-mm", f"{mu_water_per_mm:g}", "water's attenuation in 1/mm, near 0.02")
+    return hu
+
+
+def write_image(path: Path, volume: Volume, unit: str) -> None:
+    """Writes NIfTI, NRRD or MetaImage, by the suffix; ``unit`` of the values: "1/mm" or "HU"."""
+    sitk = checks.package("SimpleITK", "the package that this export needs", "phyradgs-cl[formats]")
+    suffix = next(suffix for suffix in reversed(_WRITERS) if path.name.lower().endswith(suffix))
+    if suffix.startswith(".nii") and max(volume.values.shape) > _MOST_NIFTI_VOXELS:
+        raise InputError("--to nii", f"{max(volume.values.shape)} voxels", f"at most {_MOST_NIFTI_VOXELS}", "use --to nrrd")
+    image = sitk.GetImageFromArray(volume.values)
+    image.SetSpacing(volume.required_grid.voxel_size_mm[::-1])
+    image.SetOrigin(volume.required_grid.first_centre_mm[::-1])
+    image.SetMetaData("ITK_FileNotes", f"values in {unit}")
+    with written_beside(path, volume.values.nbytes, suffix) as temporary:
+        writer = sitk.ImageFileWriter()
+        writer.SetImageIO(_WRITERS[suffix])
+        writer.SetFileName(str(temporary))
+        writer.SetUseCompression(suffix == ".nii.gz")
+        writer.Execute(image)
+
+
+def write_tiff(path: Path, volume: Volume, unit: str) -> None:
+    """Writes a page per slice from the lowest up, row 0 at the smallest y, with sizes in mm and the origin in pixels. Files
+    beyond 4 GB are BigTIFF, which ImageJ opens through Bio-Formats."""
+    tifffile = checks.package("tifffile", "the package that this export needs", "phyradgs-cl[formats]")
+    dx, dy, dz = volume.required_grid.voxel_size_mm[::-1]
+    first_mm = volume.required_grid.first_centre_mm[::-1]
+    facts = {
+        "axes": "ZYX",
+        "spacing": dz,
+        "unit": "mm",
+        "min": float(volume.values.min()),
+        "max": float(volume.values.max()),
+        **{f"{axis}origin": -place / step for axis, place, step in zip("xyz", first_mm, (dx, dy, dz), strict=True)},
+        "Info": f"values in {unit}",
+    }
+    is_small = volume.values.nbytes < _MOST_IMAGEJ_BYTES
+    with written_beside(path) as temporary:
+        tifffile.imwrite(
+            temporary,
+            volume.values,
+            imagej=is_small,
+            bigtiff=not is_small,
+            resolution=(1 / dx, 1 / dy),
+            resolutionunit="NONE",
+            metadata=facts,
+            photometric="minisblack",
+        )
+
+
+def write_npy(path: Path, volume: Volume, unit: str) -> None:
+    """Writes the values (z, y, x) float32 to ``path``, and their grid to a .json file of the same name."""
+    facts = {
+        "axes": ["z", "y", "x"],
+        "shape": list(volume.values.shape),
+        "voxel_size_mm": list(volume.required_grid.voxel_size_mm),
+        "first_centre_mm": list(volume.required_grid.first_centre_mm),
+        "values": unit,
+    }
+    with written_beside(path.with_suffix(".json")) as temporary:
+        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, volume.values)  # given a name, it would add a suffix
