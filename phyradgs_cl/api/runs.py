@@ -1,10 +1,8 @@
 """Scans and volumes: read, written, simulated, reconstructed."""
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,26 +25,17 @@ from phyradgs_cl.reconstructors import (
     InitialVolume,
     ProgressReport,
     Reconstruction,
-    RunPlan,
     State,
     ignore_progress,
     interrupted,
-    method_of,
     plan_run,
     preprocessing_of,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
-from phyradgs_cl.reconstructors.result import option_facts
-from phyradgs_cl.reconstructors.tune.trials import TUNED
-from phyradgs_cl.reconstructors.tune.wish import is_told, with_chosen
 from phyradgs_cl.signals import keep_finished_work
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan
 from phyradgs_cl.text import near_miss
-
-_IDENTITY = "run"
-"""Where a state has what its run was of."""
 
 
 @naming_arguments()
@@ -224,20 +213,13 @@ def reconstruct(
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
     plan = plan_run(method, options, preset=preset, seed=seed)
-    on_its_grid = scan.with_grid(plan.preprocessing)
     if initial is not None:
-        plan = replace(plan, initial=_first_volume(initial, on_its_grid.grid))
-
-    def identity() -> dict[str, object]:  # made where it is needed: it reads all frames
-        return _identity(on_its_grid, plan)
-
-    state = None if resume is None else _state_of(resume, plan, on_its_grid.grid, identity)
+        plan = replace(plan, initial=_first_volume(initial, scan.with_grid(plan.preprocessing).grid))
+    state = None if resume is None else _state_of(resume)
     result: Reconstruction | None = None
     try:
         with _reporting(report) as (tell, end), keep_finished_work():
             result = run_method(scan, plan, runtime_of(device), report=tell, resume=state)
-            if result.state is not None:
-                result = replace(result, state={**result.state, _IDENTITY: np.array(json.dumps(identity(), default=repr))})
             if result.early_stop:
                 end(f"{plan.method_name}{result.early_stop}")
     except KeyboardInterrupt as error:
@@ -292,45 +274,9 @@ def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, 
             yield ticker.progress, ticker.end
 
 
-def _identity(scan: Scan, plan: RunPlan) -> dict[str, object]:
-    """What a run that goes on has in common with the one that was interrupted, besides its method: of arrays SHA-256."""
-    frames = _sha256(scan.projections, np.packbits(scan.valid))
-    start = None if plan.initial is None else _sha256(plan.initial.values.astype(np.float32))  # as files have it
-    preprocessing = asdict(plan.preprocessing)
-    return {"scan": frames, "seed": plan.seed, "input (steps, holdout, tune)": preprocessing, "initial": start}
-
-
-def _sha256(*arrays: np.ndarray) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
-
-
-def _state_of(partial: object, plan: RunPlan, grid: Grid, identity: Callable[[], dict[str, object]]) -> State:
-    """How to go on from a result that was interrupted, of the same scan, method and options."""
+def _state_of(partial: object) -> State:
+    """Returns the state of an interrupted result."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
         found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.shown(partial)
         raise InputError("resume", found, "the partial result of an interrupted run")
-    if not method_of(plan.method).is_resumable:
-        raise InputError("resume", f"method {plan.method_name}", "a method that can go on", "leave resume out")
-    options = plan.options
-    tuned: Any = partial.facts.get(TUNED)
-    if is_told(tuned) and hasattr(options, tuned["option"]):
-        options = with_chosen(options, tuned)
-    then, now = (
-        json.dumps(facts, sort_keys=True, default=repr) for facts in (partial.facts.get("options"), option_facts(options))
-    )
-    if partial.facts.get("method") != plan.method_name or then != now:  # as JSON: in files tuples are lists
-        raise InputError(
-            "resume", "another method, or other options", "those of the run that was interrupted"
-        )
-    if not partial.grid.is_close(grid):
-        raise InputError("resume", f"a volume on {partial.grid}", f"one on {grid}")
-    state = dict(partial.state)
-    was = parsed(state, _IDENTITY, dict)
-    del state[_IDENTITY]
-    for name, value in json.loads(json.dumps(identity(), default=repr)).items():
-        if was.get(name) != value:
-            raise InputError("resume", f"another {name}", "that of the run that was interrupted")
-    return state
+    return partial.state

@@ -16,7 +16,7 @@ from phyradgs_cl.commands.run_options import with_run_options
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors import ProgressReport
+from phyradgs_cl.reconstructors import ProgressReport, Report
 from phyradgs_cl.reconstructors.result import COMPARED
 from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
@@ -60,25 +60,27 @@ def reconstruct_command(
 
     with failing_together(ranks, last_words), ticker:
         ticker.stage(f"reading {scan}")
-        report: ProgressReport = ticker.progress
+        listeners: list[ProgressReport] = [ticker.progress]
+        picture = None
         if preview is not None:
             check_preview(preview, scan, output, partial_path(output))
-            report = Preview(preview, ticker.progress)
+            picture = Preview(preview)
+            listeners.append(picture)
         inputs = [path for path in (settings.config, initial) if path is not None]
         result, metrics = run_reconstruction(
             plan,
             scan,
             output,
             runtime,
-            report,
+            Report(*listeners),
             resume=resume,
             checkpoint_every_s=checkpoint_every,
             inputs=inputs,
             ranks=ranks,
         )
-        if isinstance(report, Preview) and result.state is None and ranks.rank == 0:
+        if picture is not None and result.state is None and ranks.rank == 0:
             with finish_despite_interrupt():
-                report.finish(result.volume, result.grid)
+                picture.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
     used_s = time.process_time()  # of the command so far, its start included: other programs do not change it
     how = f"{plan.method_name}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"

@@ -1,17 +1,14 @@
 """Checkpoints of interrupted runs: plain arrays in a NumPy archive, never a pickle."""
 
-import json
-from collections.abc import Iterator
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.output import beside, written_beside
 
-_FORMAT = 1
-_MOST_DIFFERENCES, _LONGEST_NAME = 3, 60
+_FORMAT = 2
 _RESTART = "start without --resume"
 
 
@@ -31,14 +28,14 @@ def partial_path(output: str | Path) -> Path:
     return beside(path.with_suffix(""), f".partial{path.suffix}")
 
 
-def write_checkpoint(path: str | Path, arrays: dict[str, np.ndarray], fingerprint: str) -> None:
-    """Writes arrays whole or not at all; ``fingerprint`` says as JSON which scan and options they are of."""
+def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
+    """Writes the state of a run, complete or not at all."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, format=np.array(_FORMAT), fingerprint=np.array(fingerprint), **arrays)  # type: ignore[arg-type]
+        np.savez(file, format=np.array(_FORMAT), **state)  # type: ignore[arg-type]
 
 
-def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]:
-    """The arrays of a checkpoint. Raises InputError if it is missing, damaged or of another scan or options."""
+def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
+    """Returns the state in a checkpoint. Raises InputError for a missing or damaged file, or another version's."""
     if not Path(path).is_file():
         raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
     try:
@@ -46,35 +43,9 @@ def read_checkpoint(path: str | Path, fingerprint: str) -> dict[str, np.ndarray]
             arrays = dict(archive)
         if not all(isinstance(values, np.ndarray) for values in arrays.values()):
             raise ValueError("no array")
-    except Exception as error:  # zipfile, zlib and NumPy's parser hand on whatever they stumble over
+    except Exception as error:  # zipfile, zlib and NumPy's parser pass on errors of every kind
         reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
-        raise InputError(str(path), f"a damaged checkpoint{reason}", "a whole one", _RESTART) from error
+        raise InputError(str(path), f"a damaged checkpoint{reason}", "a complete one", _RESTART) from error
     if not np.array_equal(arrays.pop("format", None), _FORMAT):
-        raise InputError(str(path), "another checkpoint format", str(_FORMAT), _RESTART)
-    found = str(arrays.pop("fingerprint", ""))
-    if found != fingerprint:
-        remedy = f"use the same scan and options, or {_RESTART}"
-        expected = "one of this run"
-        raise InputError(str(path), f"a checkpoint of {_other_run(found, fingerprint)}", expected, remedy)
+        raise InputError(str(path), "a checkpoint of another version", f"format {_FORMAT}", _RESTART)
     return arrays
-
-
-def _other_run(found: str, wanted: str) -> str:
-    unknown = "another scan or other options"
-    try:
-        then, now = json.loads(found), json.loads(wanted)
-    except (ValueError, RecursionError):  # of an earlier version, or damaged
-        return unknown
-    differences = list(_differences(then, now)) if isinstance(then, dict) else []
-    told = differences[:_MOST_DIFFERENCES]
-    more = "; and more" if len(differences) > len(told) else ""
-    return f"a run with other {'; '.join(told)}{more}" if told else unknown
-
-
-def _differences(found: object, wanted: object, name: str = "") -> Iterator[str]:
-    """NAME (then, now) of every value that is not the same in two trees of tables."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in sorted({*found, *wanted}):
-            yield from _differences(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
-    elif found != wanted:
-        yield f"{name[:_LONGEST_NAME]} ({checks.shown(found)}, now {checks.shown(wanted)})"

@@ -14,6 +14,7 @@ from .registry import usual_preset as usual_preset
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
 from .result import Reconstruction as Reconstruction
+from .result import Report as Report
 from .result import State as State
 from .result import ignore_progress as ignore_progress
 from .result import interrupted as interrupted

@@ -1,16 +1,45 @@
 """States from files: what a checkpoint may not do to a run that goes on from it."""
 
 import json
-from collections.abc import Mapping
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.result import State, state_arrays
 
+RUN = "run"
+"""The array of a state that holds the identity of its run, as JSON."""
 _REMEDY = "start without --resume"
+_MOST_DIFFERENCES, _LONGEST_NAME = 3, 60
 T = TypeVar("T")
+
+
+def with_identity(state: State, identity: Mapping[str, Any]) -> State:
+    """Returns a method's state with the identity of its run, as from ``RunPlan.identity``."""
+    return {**state, RUN: np.array(json.dumps(identity, default=repr))}
+
+
+def without_identity(state: State, identity: Mapping[str, Any]) -> State:
+    """Returns the method's own state; raises InputError for the state of another run."""
+    then, now = parsed(state, RUN, dict), json.loads(json.dumps(identity, default=repr))  # in JSON tuples are lists
+    differences = list(_differences(then, now))
+    if differences:
+        more = "; and more" if len(differences) > _MOST_DIFFERENCES else ""
+        found = f"a run with other {'; '.join(differences[:_MOST_DIFFERENCES])}{more}"
+        raise InputError("--resume", found, "the same run", f"use the same scan and options, or {_REMEDY}")
+    return {name: array for name, array in state.items() if name != RUN}
+
+
+def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
+    """Yields NAME (then, now) for every value that differs in two trees of tables."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        for key in sorted({*then, *now}):
+            yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)
+    elif then != now:
+        yield f"{name[:_LONGEST_NAME]} ({checks.shown(then)}, now {checks.shown(now)})"
 
 
 def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:

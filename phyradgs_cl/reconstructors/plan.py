@@ -1,19 +1,23 @@
 """A run as one value: its method, options, preprocessing, seed and first volume. The command line, configuration files, the
 API, sweeps and watched folders all make it with ``plan_run``."""
 
-from collections.abc import Callable, Collection, Mapping
+import hashlib
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.options import method_options, preprocessing_names, preprocessing_of
 from phyradgs_cl.reconstructors.registry import DEFAULT_METHOD, method_name
+from phyradgs_cl.reconstructors.result import option_facts
 
 LARGEST_SEED = 2**63
+_DECIMALS = 6  # of mm and s: a scan that went through a file is still the same scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +47,34 @@ class RunPlan:
     def method_name(self) -> str:
         """The method's name; of a function ``module:name``."""
         return method_name(self.method)
+
+    def identity(self, scan: Scan) -> dict[str, Any]:
+        """Returns everything that a run must share with the interrupted one that it continues. Reads all frames."""
+        grid = scan.grid
+        return {
+            "scan": _digest(scan.projections, np.packbits(scan.valid), *_geometry(scan)),
+            "grid": [grid.shape, *(np.round(three, _DECIMALS).tolist() for three in (grid.voxel_size_mm, grid.offset_mm))],
+            "method": self.method_name,
+            "seed": self.seed,
+            "input": self.preprocessing.facts(),
+            **option_facts(self.options),
+            "initial": None if self.initial is None else _digest(self.initial.values.astype(np.float32)),
+        }
+
+
+def _geometry(scan: Scan) -> Iterator[np.ndarray]:
+    """Yields when every frame is taken, and the poses at its start and its end."""
+    yield np.round(scan.frame_start_s, _DECIMALS)
+    span_s = np.array([0.0, scan.shutter.span_s])
+    for frame, start_s in enumerate(scan.frame_start_s):
+        yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # + 0.0 makes a 0 of a -0
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:16]
 
 
 def plan_run(

@@ -1,7 +1,8 @@
 """What every method returns, and how it reports on the way."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -124,7 +125,50 @@ class Progress:
     volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
 
 
+    def mapped(
+        self,
+        state: "Callable[[State], State] | None" = None,
+        volume: "Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]] | None" = None,
+        **changes: Any,
+    ) -> "Progress":
+        """Returns the report with other fields; ``state`` and ``volume`` change what the run gives, where it gives any."""
+        own_state, own_volume = self.state, self.volume
+        if state is not None and own_state is not None:
+            changes["state"] = lambda: state(own_state())
+        if volume is not None and own_volume is not None:
+            changes["volume"] = lambda: volume(*own_volume())
+        return replace(self, **changes)
+
+
 ProgressReport = Callable[[Progress], None]
+
+
+class Report:
+    """Passes a method's progress on to listeners, through the hooks of the stages that are under way."""
+
+    def __init__(self, *listeners: ProgressReport) -> None:
+        self.listeners = listeners
+        self._hooks: list[Callable[[Progress], Progress]] = []
+
+    @classmethod
+    def of(cls, report: ProgressReport) -> "Report":
+        """Returns ``report`` itself, or one that passes everything on to the function ``report``."""
+        return report if isinstance(report, Report) else cls(report)
+
+    def __call__(self, progress: Progress) -> None:
+        for hook in reversed(self._hooks):
+            progress = hook(progress)
+        for listener in self.listeners:
+            listener(progress)
+
+    @contextmanager
+    def through(self, hook: Callable[[Progress], Progress]) -> Iterator[None]:
+        """Sends progress through ``hook`` while the body runs, before the hooks that are there already."""
+        self._hooks.append(hook)
+        try:
+            yield
+        finally:
+            self._hooks.pop()
 
 
 def ignore_progress(progress: Progress) -> None:

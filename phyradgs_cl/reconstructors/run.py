@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
+from phyradgs_cl.reconstructors.checkpoint import with_identity, without_identity
 from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
@@ -25,6 +26,7 @@ from phyradgs_cl.reconstructors.result import (
     Progress,
     ProgressReport,
     Reconstruction,
+    Report,
     State,
     ignore_progress,
 )
@@ -45,36 +47,54 @@ def reconstruct(
 
     The plan's first volume is resampled onto the scan's grid.
     """
-    preprocessing, method, options = plan.preprocessing, method_of(plan.method), plan.options
+    preprocessing, options, report = plan.preprocessing, plan.options, Report.of(report)
     if rt.ranks.size > 1:
         _check_ranks(plan.method_name, rt)
     if preprocessing.margin_mm is not None:
         _check_margin(plan)
+    identity = cache(partial(plan.identity, scan))  # made where it is needed: it reads all frames
+    more: dict[str, Any] = {}
+    if resume is not None:
+        check_resumable(plan)
+        more["resume"] = without_identity(resume, identity())
     ready = prepared(scan, preprocessing, rt)
     ready.check_sight()
     check_own_motion(getattr(options, "motion", None), ready)
-    more: dict[str, Any] = {} if resume is None else {"resume": resume}
     if plan.initial is not None:
         more["initial"] = _initial(plan, plan.initial, ready.grid)
     hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
     visible = ready if hidden is None else with_masked(ready, hidden)
-    run = partial(method.run, rt=rt, seed=plan.seed)
-    if preprocessing.margin_mm is not None:
-        report = _showing(preprocessing.of(scan.grid), report)
+    run = partial(method_of(plan.method).run, rt=rt, seed=plan.seed)
+    box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
+
+    def hook(progress: Progress) -> Progress:
+        """Adds the run's identity to its states, and takes the margin from its volumes."""
+        progress = progress.mapped(state=lambda state: with_identity(state, identity()))
+        return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
+
     fitting = naming_size_that_fits(rt, ready, plan.method_name, options)
-    with _naming_margin(preprocessing, ready.grid), fitting, naming_host_memory():
+    with report.through(hook), _naming_margin(preprocessing, ready.grid), fitting, naming_host_memory():
         if preprocessing.tune:
             result = tuned(preprocessing.tune, run, visible, options, rt, report, **more)
         else:
             result = run(visible, options, report=report, **more)
+    if result.state is not None:
+        result = replace(result, state=with_identity(result.state, identity()))
     if hidden is not None and rt.ranks.rank == 0:
         result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result)
     if PREPARED_KEY in ready.provenance:
         result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
-    if preprocessing.margin_mm is None:
+    if box is None:
         return result
     result.facts[MARGIN_MM] = preprocessing.margin_mm
-    return result.within(preprocessing.of(scan.grid))
+    return result.within(box)
+
+
+def check_resumable(plan: RunPlan) -> None:
+    """Raises InputError for a method without checkpoints."""
+    if not method_of(plan.method).is_resumable:
+        names = ", ".join(name for name, method in METHODS.items() if method.is_resumable)
+        raise InputError("--resume", f"--method {plan.method_name}", f"a method with checkpoints: {names}", "leave it out")
 
 
 def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
@@ -97,16 +117,6 @@ def _check_margin(plan: RunPlan) -> None:
         found = f"--method {plan.method_name} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
         raise InputError("--margin-mm", found, "a method that explains frames by what is in the box", remedy)
-
-
-def _showing(box: Grid, report: ProgressReport) -> ProgressReport:
-    """A report whose volumes on the way are those of the box, as the result is."""
-
-    def told(progress: Progress) -> None:
-        volume = progress.volume
-        report(progress if volume is None else replace(progress, volume=lambda: _within(*volume(), box)))
-
-    return told
 
 
 def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid]:

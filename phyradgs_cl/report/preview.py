@@ -21,7 +21,7 @@ from phyradgs_cl.io import (
     read_volume,
     written_beside,
 )
-from phyradgs_cl.reconstructors import Progress, ProgressReport
+from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
 _GAP = 4  # pixels between slices
@@ -50,16 +50,15 @@ def check_preview(path: Path, *others: Path) -> None:
 
 
 class Preview:
-    """A report of a running method that keeps a picture of the present volume at ``io.partial_path`` of ``path``, at
+    """A listener to a running method that keeps a picture of the present volume at ``io.partial_path`` of ``path``, at
     most one every ``every_s`` seconds. One that cannot be written is a warning, once."""
 
-    def __init__(self, path: Path, report: ProgressReport, every_s: float = 5.0) -> None:
-        self.path, self.partial, self.report, self.every_s = path, partial_path(path), report, every_s
+    def __init__(self, path: Path, every_s: float = 5.0) -> None:
+        self.path, self.partial, self.every_s = path, partial_path(path), every_s
         self._last_s = -math.inf
         self._failed = False
 
     def __call__(self, progress: Progress) -> None:
-        self.report(progress)
         if progress.volume is None or time.monotonic() - self._last_s < self.every_s:
             return
         self._write(*progress.volume(), self.partial)

@@ -1,6 +1,5 @@
 """From a scan file to a volume file, with checkpoints on the way."""
 
-import json
 import logging
 import os
 import platform
@@ -32,17 +31,18 @@ from phyradgs_cl.io import (
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import (
-    METHODS,
     Progress,
     ProgressReport,
     Reconstruction,
+    Report,
     RunPlan,
     State,
     ignore_progress,
     method_of,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT, option_facts
+from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
+from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
@@ -64,42 +64,43 @@ class _Files:
     output: Path
 
 
-class _Keeper:
-    """A report that also keeps a checkpoint, at most one every so many seconds; 0: none before the end. It is replaced
-    in one step, so that a kill leaves the last whole one; where it cannot be written the run goes on."""
+class _Checkpoints:
+    """A listener that writes a checkpoint at most every ``every_s`` seconds; 0: none. A kill leaves the last complete one.
 
-    def __init__(self, path: Path, fingerprint: str, every_s: float, report: ProgressReport) -> None:
-        self.path, self.fingerprint, self.every_s, self.report = path, fingerprint, every_s, report
+    A checkpoint that cannot be written is a warning, once; the run goes on.
+    """
+
+    def __init__(self, path: Path, every_s: float) -> None:
+        self.path, self.every_s = path, every_s
         self.last_s = time.monotonic()
-        self.failed = False
-        self.kept: int | None = None
-        """The iteration of the checkpoint that is there, if this run has written one."""
+        self.has_failed = False
+        self.iteration: int | None = None
+        """The iteration of the checkpoint that this run has written."""
 
     def __call__(self, progress: Progress) -> None:
-        self.report(progress)
-        due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
-        if due and progress.state is not None and progress.iteration < progress.iterations:
-            self._keep(dict(progress.state()), progress.iteration)
+        is_due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
+        if is_due and progress.state is not None and progress.iteration < progress.iterations:
+            self.write(progress.state(), progress.iteration)
             self.last_s = time.monotonic()
 
-    def _keep(self, state: dict[str, np.ndarray], iteration: int) -> None:
+    def write(self, state: State, iteration: int) -> None:
         try:
-            write_checkpoint(self.path, state, self.fingerprint)
-            self.kept = iteration
+            write_checkpoint(self.path, state)
+            self.iteration = iteration
         except OutputError as error:
-            if not self.failed:
+            if not self.has_failed:
                 log.warning("no checkpoint: %s", error)
-            self.failed = True
+            self.has_failed = True
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
-        """Errors of the body say that there is a checkpoint to go on from, if there is one."""
+    def mentioned_in_errors(self) -> Iterator[None]:
+        """Adds the way to resume to the errors of the body, if there is a checkpoint."""
         try:
             with naming_host_memory():
                 yield
         except PhyradgsError as error:
-            if self.kept is not None:
-                way_on = f"--resume goes on from iteration {self.kept}"
+            if self.iteration is not None:
+                way_on = f"--resume goes on from iteration {self.iteration}"
                 error.remedy = "; ".join(part for part in (error.remedy, way_on) if part)
             raise
 
@@ -126,6 +127,8 @@ def run_reconstruction(
     """
     check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
+    if resume:
+        check_resumable(plan)
     if leads:
         export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         refuse_foreign_suffix(output, export)
@@ -149,18 +152,18 @@ def _reconstructed(
         scan_hash = scan_hash_of()
     _warn_of_doubts(plan, files.scan, scan)
     rt = make_runtime()
-    fingerprint = _fingerprint(scan_hash, plan)
     leads, state = rt.ranks.rank == 0, None
     if resume:
-        state = rt.ranks.bcast(_resumed(plan, files.output, fingerprint) if leads else None)
+        state = rt.ranks.bcast(read_checkpoint(checkpoint_path(files.output)) if leads else None)
     elif leads:
         _set_aside(files.output)
-    keeper = _Keeper(checkpoint_path(files.output), fingerprint, checkpoint_every_s, report)
+    checkpoints = _Checkpoints(checkpoint_path(files.output), checkpoint_every_s)
     result: Reconstruction | None = None
     metrics: dict[str, float] = {}
     try:
-        with keeper.telling(), keep_finished_work():
-            result = reconstruct(scan, plan, rt, report=keeper, resume=state)
+        with checkpoints.mentioned_in_errors(), keep_finished_work():
+            listeners = report.listeners if isinstance(report, Report) else (report,)
+            result = reconstruct(scan, plan, rt, report=Report(*listeners, checkpoints), resume=state)
             if not leads:
                 return result, metrics
             with finish_despite_interrupt():
@@ -169,7 +172,7 @@ def _reconstructed(
                 provenance = _provenance(result, scan_hash, plan, files.scan, rt)
                 parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
                 write_volume(path, *parts, disagreement=result.disagreement)
-                _keep_checkpoint(files.output, result, fingerprint)
+                _keep_checkpoint(files.output, result)
     except signals.InterruptedAfterwards:
         if result is None or result.state is None:  # else told already, in the result
             raise
@@ -250,21 +253,6 @@ def _provenance(
     }
 
 
-def _fingerprint(scan_hash: str, plan: RunPlan) -> str:
-    """What a run that goes on must have in common with the one that it continues, as JSON."""
-    run = {"method": plan.method_name, "seed": plan.seed, "input": plan.preprocessing.facts(), **option_facts(plan.options)}
-    initial = plan.initial.facts if plan.initial else {}
-    return json.dumps({"scan": scan_hash[:16], **run, **initial}, sort_keys=True, default=repr)
-
-
-def _resumed(plan: RunPlan, output: Path, fingerprint: str) -> State:
-    if not method_of(plan.method).is_resumable:
-        resumable = [name for name, method in METHODS.items() if method.is_resumable]
-        expected = f"a method with checkpoints: {', '.join(resumable)}"
-        raise InputError("--resume", f"--method {plan.method_name}", expected)
-    return read_checkpoint(checkpoint_path(output), fingerprint)
-
-
 def _set_aside(output: Path) -> None:
     """Whoever repeats a command without --resume may have meant it: the hours in a checkpoint are not thrown away."""
     checkpoint = checkpoint_path(output)
@@ -275,14 +263,14 @@ def _set_aside(output: Path) -> None:
         log.warning("%s is of an earlier run and is kept as %s: %s", checkpoint, kept.name, remedy)
 
 
-def _keep_checkpoint(output: Path, result: Reconstruction, fingerprint: str) -> None:
+def _keep_checkpoint(output: Path, result: Reconstruction) -> None:
     path = checkpoint_path(output)
     if result.state is None:
         for outdated in (path, partial_path(output)):
             with suppress(OSError):  # the volume is there, whatever lies in their place
                 outdated.unlink()
     else:
-        write_checkpoint(path, dict(result.state), fingerprint)
+        write_checkpoint(path, result.state)
 
 
 def resume_or_restart(

@@ -99,7 +99,7 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path,
         del file["entry/state/iteration"]
         file.create_group("entry/state/iteration")
     assert api.load_volume(tmp_path / "partial.h5").state is None  # the volume is good without
-    with pytest.raises(api.InputError, match="resume: found another method, or other options"):
+    with pytest.raises(api.InputError, match="resume: found a run with other iterations"):
         reconstruct(scan, method, iterations=9, device=rt, resume=partial)
 
 
@@ -110,14 +110,14 @@ def test_another_run_is_not_gone_on_with(rt, scan) -> None:
     mask = np.zeros(scan.projections.shape[1:], bool)
     mask[3] = True
     for given, changes, words in [
-        (replace(scan, projections=scan.projections[::-1]), {}, "another scan"),
-        (replace(scan, pixel_mask=mask), {}, "another scan"),
-        (scan, {"seed": 1}, "another seed"),
-        (scan, {"median_filter": 3}, "another input"),
-        (scan, {"initial": partial}, "another initial"),
-        (scan, {"grid": wider}, "a volume on Grid"),
+        (replace(scan, projections=scan.projections[::-1]), {}, "scan"),
+        (replace(scan, pixel_mask=mask), {}, "scan"),
+        (scan, {"seed": 1}, "seed"),
+        (scan, {"median_filter": 3}, "input.median_filter"),
+        (scan, {"initial": partial}, "initial"),
+        (scan, {"grid": wider}, "grid"),
     ]:
-        with pytest.raises(api.InputError, match=f"resume: found {words}"):
+        with pytest.raises(api.InputError, match=f"resume: found a run with other .*{words}"):
             reconstruct(given, **options, **changes, resume=partial)
     again = reconstruct(scan, **options, resume=partial, report=pressing_at(3), on_interrupt="return")
     assert again.facts["interrupted_at"] == 3 and again.state["run"] == partial.state["run"]

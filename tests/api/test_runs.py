@@ -99,7 +99,7 @@ def test_a_prior_may_be_a_function(rt, scan, tmp_path) -> None:
     part = api.load_volume(tmp_path / "part.h5")
     rest = api.reconstruct(scan, "fista", prior=softened, resume=part, **usual)
     assert np.array_equal(rest.volume, whole[0].volume)
-    with pytest.raises(InputError, match="^resume: found another method, or other options"):
+    with pytest.raises(InputError, match="^resume: found a run with other prior"):
         api.reconstruct(scan, "fista", prior=Softened(), resume=part, **usual)
 
 

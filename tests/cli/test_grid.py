@@ -90,13 +90,13 @@ def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, mo
     output, kept = tmp_path / "v.h5", tmp_path / "kept"
     command = ["reconstruct", str(scan), "-o", str(output), *SIRT]
 
-    def keep(keeper, progress) -> None:
+    def keep(checkpoints, progress) -> None:
         """Leaves the checkpoint of the first iteration."""
         if progress.iteration == 1:
-            keeper._keep(dict(progress.state()), 1)
-            os.replace(keeper.path, kept)
+            checkpoints.write(progress.state(), 1)
+            os.replace(checkpoints.path, kept)
 
-    monkeypatch.setattr("phyradgs_cl.workflow.reconstruct._Keeper.__call__", keep)
+    monkeypatch.setattr("phyradgs_cl.workflow.reconstruct._Checkpoints.__call__", keep)
     assert cli.run([*command, "--size", "6"]) == 0
     os.replace(kept, f"{output}.checkpoint.npz")
     refused([*command, "--size", "7", "--resume"], "a run with other input.size (6, now 7)")

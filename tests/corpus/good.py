@@ -9,11 +9,9 @@ from corpus.hdf5_damage import put
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.io import checkpoint_path, write_checkpoint
-from phyradgs_cl.io.sha256 import sha256_of
 from phyradgs_cl.reconstructors import Progress, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import read_settings
-from phyradgs_cl.workflow import reconstruct as workflow
 from phyradgs_cl.workflow.files import load_scan
 
 SCANNER = """title = "a small one"
@@ -131,5 +129,4 @@ def _write_checkpoint(folder: Path, method: str) -> None:
     plan = read_settings(None, {"method": method, **given}, assignments).plan()
     result = reconstruct(load_scan(scan), plan, Runtime(), report=_stop)
     assert result.state is not None
-    fingerprint = workflow._fingerprint(sha256_of(scan), plan)
-    write_checkpoint(checkpoint_path(folder / method), dict(result.state), fingerprint)
+    write_checkpoint(checkpoint_path(folder / method), result.state)

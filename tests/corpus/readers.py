@@ -5,10 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from phyradgs_cl.importers import ImportOptions, import_scan
-from phyradgs_cl.io import checkpoint_path, load_scanner, read_checkpoint
+from phyradgs_cl.io import load_scanner, read_checkpoint
 from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.sweep import read_grid
@@ -42,8 +40,7 @@ def _sweep(folder: Path) -> object:
 
 
 def _checkpoint(path: Path) -> object:
-    with np.load(checkpoint_path(path.parents[1] / "good" / "phyradgs")) as good:
-        return read_checkpoint(path, str(good["fingerprint"]))
+    return read_checkpoint(path)
 
 
 READERS: dict[str, Reader] = {

@@ -45,7 +45,7 @@ class FullAt:
 
 
 WRITERS: dict[str, Callable[[Path, int], None]] = {
-    "checkpoint": lambda path, n: write_checkpoint(path, {**ARRAYS, "n": np.array(n)}, "print"),
+    "checkpoint": lambda path, n: write_checkpoint(path, {**ARRAYS, "n": np.array(n)}),
     "volume": lambda path, n: write_volume(path, np.full((4, 4, 4), n, np.float32), GRID, {"n": n}),
 }
 
@@ -68,7 +68,7 @@ def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkey
         except OutputError as error:
             full.arm(None)
             assert "no room left" in str(error) or "No space left" in str(error)
-            assert target.read_bytes() == old and (kind != "checkpoint" or read_checkpoint(target, "print"))
+            assert target.read_bytes() == old and (kind != "checkpoint" or read_checkpoint(target))
         assert kit.names(tmp_path) == ["output"]
 
 

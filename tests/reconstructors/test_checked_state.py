@@ -13,6 +13,8 @@ from phyradgs_cl.reconstructors.checkpoint import (
     count_of,
     parsed,
     restore_generator,
+    with_identity,
+    without_identity,
 )
 
 RECORD = [{"iteration": 1, "loss": 0.5}, {"iteration": 2, "loss": 0.25}]
@@ -60,3 +62,19 @@ def test_what_no_run_has_written_is_refused_by_name() -> None:
     for call, words in cases:
         with pytest.raises(InputError, match=f"checkpoint, array {words}"):
             call()
+
+
+def test_a_state_of_another_run_is_refused_with_what_differs() -> None:
+    now = {"iterations": 40, "rates": {"position": 1.0}, "scan": "a", "seed": 0}
+    mine = with_identity(state(), now)
+    assert set(without_identity(mine, now)) == set(state())
+    with pytest.raises(InputError) as caught:
+        without_identity(mine, {**now, "iterations": 60, "rates": {"position": 2.0}})
+    assert (caught.value.subject, caught.value.found) == (
+        "--resume", "a run with other iterations (40, now 60); rates.position (1.0, now 2.0)"
+    )  # fmt: skip
+    with pytest.raises(InputError, match="; and more"):
+        without_identity(mine, {name: 7 for name in "abcdef"})
+    for damaged in ("0" * 64, "[" * 9999, '"text"', "[1, 2]"):
+        with pytest.raises(InputError, match="checkpoint, array run"):
+            without_identity({**mine, "run": np.array(damaged)}, now)

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.reconstructors.fdk.views import widened
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
@@ -26,11 +26,13 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
     """A volume (nz, ny, nx) in 1/mm on the scan's grid that explains its frames. Raises KeyboardInterrupt where it is
     stopped, as FDK has nothing to go on from."""
 
-    def told(progress: Progress) -> None:
-        report(replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None))
+    def hook(progress: Progress) -> Progress:
+        return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
 
     at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
-    result = fista_tv.METHOD.run(scan, FistaTvOptions(motion=at_times, iterations=_ITERATIONS), rt, report=told)
+    options, report = FistaTvOptions(motion=at_times, iterations=_ITERATIONS), Report.of(report)
+    with report.through(hook):
+        result = fista_tv.METHOD.run(scan, options, rt, report=report)
     if result.facts["interrupted_at"] is not None:
         raise KeyboardInterrupt
     return result.volume

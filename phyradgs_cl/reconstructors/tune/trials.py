@@ -19,7 +19,14 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import parsed
 from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Reconstruction, State, ignore_progress
+from phyradgs_cl.reconstructors.result import (
+    Progress,
+    ProgressReport,
+    Reconstruction,
+    Report,
+    State,
+    ignore_progress,
+)
 from phyradgs_cl.reconstructors.tune.wish import Wish, is_told, wish_of, with_chosen, with_value
 from phyradgs_cl.runtime import Runtime
 
@@ -43,7 +50,7 @@ def tuned(
     scan: Scan,
     options: Any,
     rt: Runtime,
-    report: ProgressReport,
+    report: Report,
     resume: State | None = None,
     **extra: Any,
 ) -> Reconstruction:
@@ -53,14 +60,10 @@ def tuned(
     wish = wish_of(text)
     found = _chosen(wish, run, scan, options, rt, report, extra) if resume is None else _kept(resume, wish.option)
     kept = {TUNED: np.array(json.dumps(found))}
-
-    def told(progress: Progress) -> None:
-        state = progress.state
-        report(progress if state is None else replace(progress, state=lambda: {**state(), **kept}))
-
     if resume is not None:
         extra["resume"] = {name: array for name, array in resume.items() if name != TUNED}
-    result = run(scan, with_chosen(options, found), report=told, **extra)
+    with report.through(lambda progress: progress.mapped(state=lambda state: {**state, **kept})):
+        result = run(scan, with_chosen(options, found), report=report, **extra)
     result.facts[TUNED] = found
     return result if result.state is None else replace(result, state={**result.state, **kept})
 
@@ -80,7 +83,7 @@ def _kept(state: State, option: str) -> dict[str, Any]:
 
 
 def _chosen(
-    wish: Wish, run: Run, scan: Scan, options: Any, rt: Runtime, report: ProgressReport, extra: Mapping[str, Any]
+    wish: Wish, run: Run, scan: Scan, options: Any, rt: Runtime, report: Report, extra: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What is chosen, as facts: the values tried and the error at each."""
     started = time.perf_counter()
@@ -105,7 +108,7 @@ class _Trials:
     """Runs of a method on a scan without some of its pixels; ``errors``: RMS on these by value."""
 
     def __init__(
-        self, option: str, run: Run, scan: Scan, rt: Runtime, report: ProgressReport, extra: Mapping[str, Any]
+        self, option: str, run: Run, scan: Scan, rt: Runtime, report: Report, extra: Mapping[str, Any]
     ) -> None:
         self.option, self.run, self.scan, self.rt, self.report, self.extra = option, run, scan, rt, report, extra
         self.held = held_out(scan, _PERCENT, _SEED, "--tune")
@@ -180,11 +183,12 @@ class _Trials:
         """A trial, which reports in the words of one, and leaves nothing to go on from."""
         words = f"{self.option} {getattr(options, self.option):.4g} on trial: "
 
-        def told(progress: Progress) -> None:
+        def hook(progress: Progress) -> Progress:
             look(progress)
-            self.report(replace(progress, quantity=words + progress.quantity, state=None, volume=None))
+            return replace(progress, quantity=words + progress.quantity, state=None, volume=None)
 
-        return self.run(self.seen, options, report=told, **self.extra)
+        with self.report.through(hook):
+            return self.run(self.seen, options, report=self.report, **self.extra)
 
     def _measure(self, value: float, result: Reconstruction) -> None:
         found = holdout_errors(self.rt, self.scan, self.held, result)

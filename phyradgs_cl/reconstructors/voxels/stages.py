@@ -1,7 +1,8 @@
 """A run of several stages, each a run of its own that starts from the volume of the one before."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from phyradgs_cl.reconstructors.result import (
     Progress,
     ProgressReport,
     Reconstruction,
+    Report,
     State,
     history_arrays,
     state_arrays,
@@ -71,11 +73,12 @@ def run_stages(
     The result is the last stage's; iterations, seconds and the record are of all, facts has ``stages``: those of each.
     """
     way, facts = _Way(initial), {}
-    own = None if resume is None else way.restore(resume, stages, grid)
+    own, report = None if resume is None else way.restore(resume, stages, grid), Report.of(report)
     total = sum(stage.iterations for stage in stages)
     while True:
         stage = stages[way.index]
-        result = stage.run(way.volume, _reporting(stage, way, total, grid, report), own)
+        with report.through(partial(_of_whole_run, stage, way, total, grid)):
+            result = stage.run(way.volume, report, own)
         done = result.facts.get("iterations", stage.iterations)
         facts[stage.name], own = {"iterations": done, "seconds": result.facts["seconds"]}, None
         volume = stage.shown(result.volume, way.volume)
@@ -98,25 +101,12 @@ def _later(
     return record + [{**line, "iteration": iterations + line["iteration"]} for line in own]
 
 
-def _reporting(stage: Stage, way: _Way, total: int, grid: Grid, report: ProgressReport) -> ProgressReport:
-    """Reports of one stage as of the whole run."""
-
-    def told(progress: Progress) -> None:
-        state, volume = progress.state, progress.volume
-
-        def present() -> tuple[np.ndarray, Grid]:
-            assert volume is not None
-            return stage.shown(volume()[0], way.volume), grid
-
-        report(
-            replace(
-                progress,
-                iteration=way.iterations + progress.iteration,
-                iterations=total,
-                seconds=way.seconds + progress.seconds,
-                state=None if state is None else lambda: way.state(state()),
-                volume=None if volume is None else present,
-            )
-        )
-
-    return told
+def _of_whole_run(stage: Stage, way: _Way, total: int, grid: Grid, progress: Progress) -> Progress:
+    """Returns the progress of one stage as that of the whole run."""
+    return progress.mapped(
+        state=way.state,
+        volume=lambda volume, _: (stage.shown(volume, way.volume), grid),
+        iteration=way.iterations + progress.iteration,
+        iterations=total,
+        seconds=way.seconds + progress.seconds,
+    )
