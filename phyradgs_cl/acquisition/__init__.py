@@ -1,4 +1,4 @@
-"""How the scan was taken: geometry, trajectory, shutter, time cells, and the scan that holds them."""
+"""The acquisition: geometry, trajectory, shutter, time cells, motion models, and the scan that holds them."""
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry, pixel_centres, transpose_pose
 from phyradgs_cl.acquisition.motion import (

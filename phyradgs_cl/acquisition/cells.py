@@ -65,7 +65,7 @@ def micro_view_cells(
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:
-    """Returns ``samples`` cells for every line, at times of its own exposure by the midpoint rule.
+    """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule.
 
     The error falls with samples⁻² for fields that are smooth along the motion of one step.
     """
@@ -84,8 +84,8 @@ def common_time_cells(
 ) -> TimeCells:
     """Returns cells of an exposure / ``samples`` from first light to last, on one grid of times for all lines of a frame.
 
-    A line takes from each cell the share of its own window that lies in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v), with t_k
-    the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. One pose then serves many lines, which operators
+    A line takes from each cell the fraction of its own window that lies in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v), with
+    t_k the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. One pose then serves many lines, which operators
     project together: the paper's strip concatenation with fractional strips.
 
     frame_start_s (F,): of all frames. Frames that begin on the grid of the first one, as in a scan without gaps between

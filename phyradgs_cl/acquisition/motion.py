@@ -1,6 +1,6 @@
 """Motion models: each turns a frame of a scan into time cells.
 
-A model is a frozen class with ``cells(scan, frame)``. A class of your own works in every method (docs/methods.md).
+A model is a frozen class with ``cells(scan, frame)``. A user-defined class works in every method (docs/methods.md).
 On a stop-and-shoot scan every model of this module gives one pose per frame.
 """
 
@@ -85,7 +85,7 @@ class MicroViews:
 class PerRow:
     """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure.
 
-    The weight of a line in a cell is the share of its window that lies there. Raises InputError for a count below 1.
+    The weight of a line in a cell is the fraction of its window that lies there. Raises InputError for a count below 1.
     """
 
     operators: ClassVar = (RAYS,)
@@ -105,7 +105,7 @@ class PerRow:
 
 @dataclass(frozen=True)
 class OwnTimes:
-    """Every line has ``sub_intervals`` poses of its own in its exposure, as in the simulator.
+    """Every line has ``sub_intervals`` poses in its exposure, as in the simulator.
 
     ``per-row`` is faster and equally exact. Raises InputError for a count below 1.
     """
@@ -126,7 +126,7 @@ class OwnTimes:
 
 @dataclass(frozen=True)
 class LineMiddles:
-    """Every line has one pose, at the middle of its own exposure: the ``per-row`` of filtered backprojection."""
+    """Every line has one pose, at the middle of its exposure: the ``per-row`` of filtered backprojection."""
 
     operators: ClassVar = (LINE_POSES,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -209,7 +209,7 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
 
 
 def check_own_motion(motion: Motion | None, scan: Scan) -> None:
-    """Raises InputError where the cells that a user's own model gives for the first frame do not fit the scan."""
+    """Raises InputError where the cells that a user-defined model gives for the first frame do not fit the scan."""
     if motion is None or isinstance(motion, MODELS):
         return
     subject, table = f"motion {type(motion).__name__}", motion.cells(scan, 0)

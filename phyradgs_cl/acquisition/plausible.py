@@ -2,17 +2,14 @@
 
 import logging
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry, field_of_view_mm
 from phyradgs_cl.acquisition.readout import Named
+from phyradgs_cl.acquisition.scan import FEW, OPAQUE, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-
-if TYPE_CHECKING:
-    from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
 _WIDEST_DEG = 120.0  # of a panel seen from the source; dental scanners reach 30, nano-CT 60
@@ -22,10 +19,9 @@ _SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves so far between fra
 _TIMES = 17  # of an exposure: between two of them no gantry turns by half a turn
 _SLACK = 1e-3  # relative: times and angles come rounded
 _MANY_FRAMES = 10  # fewer may lie within a few degrees on purpose
-_OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels that may be broken
 
 
-def summary(scan: "Scan") -> str:
+def summary(scan: Scan) -> str:
     """Returns a line of the timing and a line of the sizes. Marks values that the provenance lists as assumed."""
     return f"{_timing(scan)}\n{_sizes(scan)}"
 
@@ -39,12 +35,12 @@ def _cone_deg(geometry: ConeGeometry) -> tuple[float, float]:
     return cone, fan
 
 
-def _frame_time_s(scan: "Scan") -> float:
+def _frame_time_s(scan: Scan) -> float:
     """Returns the median time from frame to frame; NaN for a single frame."""
     return float(np.median(np.diff(scan.frame_start_s))) if scan.frames > 1 else math.nan
 
 
-def _source_angle_rad(scan: "Scan") -> np.ndarray:
+def _source_angle_rad(scan: Scan) -> np.ndarray:
     """Returns the source's angle (F, T) about the axis at T times of each frame's exposure, unwrapped within a frame."""
     delay_s = np.linspace(0.0, scan.shutter.exposure_s, _TIMES)
     source = np.stack([scan.trajectory.pose(f, t + delay_s)[:, :2] for f, t in enumerate(scan.frame_start_s)])
@@ -52,7 +48,7 @@ def _source_angle_rad(scan: "Scan") -> np.ndarray:
     return angle_rad
 
 
-def _timing(scan: "Scan") -> str:
+def _timing(scan: Scan) -> str:
     if not scan.is_fly:
         return "timing: every frame at rest"
     assumed = scan.provenance.get("assumed")
@@ -78,7 +74,7 @@ def _timing(scan: "Scan") -> str:
     return "timing: " + "; ".join([*parts, marked(f"averages {averaged}", "average")])
 
 
-def _sizes(scan: "Scan") -> str:
+def _sizes(scan: Scan) -> str:
     cone, fan = _cone_deg(scan.geometry)
     seen_mm = tuple(2 * half for half in field_of_view_mm(scan.geometry))
     voxel_mm = scan.grid.voxel_size_mm
@@ -88,7 +84,7 @@ def _sizes(scan: "Scan") -> str:
     )
 
 
-def _largest(scan: "Scan") -> float:
+def _largest(scan: Scan) -> float:
     return float(np.max(scan.projections, where=scan.valid, initial=-np.inf))
 
 
@@ -96,7 +92,7 @@ def _joined(values: tuple[float, ...]) -> str:
     return " × ".join(f"{value:.4g}" for value in values)
 
 
-def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> None:
+def check_plausible(scan: Scan, named: Named = str, is_timed: bool = True) -> None:
     """Raises InputError for pixels, voxels and times that no scanner has.
 
     Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that look like
@@ -112,10 +108,10 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
         _check_readout(scan, named("readout_s"))
         if is_timed:
             _warn_of_slow_frames(_frame_time_s(scan), angle_deg, named("frame_time_s"))
-    opaque = sum(np.count_nonzero(frame[valid] > _OPAQUE) for frame, valid in zip(scan.projections, scan.valid, strict=True))
-    if opaque > _FEW * scan.projections.size:
+    opaque = sum(np.count_nonzero(frame[valid] > OPAQUE) for frame, valid in zip(scan.projections, scan.valid, strict=True))
+    if opaque > FEW * scan.projections.size:
         text = "line integrals of up to %.3g: no panel sees through more than %g; are they counts? say %s"
-        log.warning(text, _largest(scan), _OPAQUE, named("quantity"))
+        log.warning(text, _largest(scan), OPAQUE, named("quantity"))
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
@@ -147,13 +143,13 @@ def _check_voxels(grid: Grid, geometry: ConeGeometry, subject: str) -> None:
         raise InputError(subject, found, expected, "correct the number of voxels, or the unit of a length")
 
 
-def _check_exposure(scan: "Scan", subject: str) -> None:
+def _check_exposure(scan: Scan, subject: str) -> None:
     exposure_s, frame_s = scan.shutter.exposure_s, _frame_time_s(scan)
     if exposure_s > (1 + _SLACK) * frame_s:
         raise _longer_than_a_frame(subject, f"exposure of {exposure_s:.4g} s", exposure_s, frame_s)
 
 
-def _check_readout(scan: "Scan", subject: str) -> None:
+def _check_readout(scan: Scan, subject: str) -> None:
     readout_s, frame_s = scan.shutter.readout_s, _frame_time_s(scan)
     refusal = _longer_than_a_frame(subject, f"readout of {readout_s:.4g} s", readout_s, frame_s)
     if readout_s > _WRONG_UNIT * frame_s:

@@ -1,4 +1,4 @@
-"""Scan protocols: how many frames, how long an arc each exposes, how the panel reads out."""
+"""Scan protocols: number of frames, arc of an exposure and readout, for simulations."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,9 +15,10 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True)
 class Protocol:
-    """``views`` frames of a turn at constant speed, each exposing ``exposure_deg`` in 1 s (paper, section 3.1);
-    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on (start, length) in shares of the exposure; None
-    always."""
+    """``views`` frames of a turn at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
+
+    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in exposures; None always.
+    """
 
     views: int = 25
     exposure_deg: float = 14.4
@@ -48,9 +49,10 @@ class Protocol:
         return 360.0 / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
-        """The same arcs at a panel's frames per second and readout in ms, which state the exposure and the readout ratio.
+        """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms.
 
-        Raises InputError for an arc of 0, and a readout that is longer than a frame."""
+        Raises InputError for an arc of 0, and for a readout longer than a frame.
+        """
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
@@ -68,7 +70,7 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Opening times (F,): the gantry needs step/arc exposures from frame to frame."""
+        """Returns opening times (F,) in s: from frame to frame the gantry needs step/arc exposures."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * self.step_deg / self.exposure_deg * self.exposure_s
@@ -80,8 +82,11 @@ class Protocol:
     def orbit(
         self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
-        """The trajectory; stop-and-shoot stands at the mid-window angles of the same fly-scan. Jitter is a smooth
-        wander of the gantry (standard deviation ``jitter_deg``, one knot per frame), recorded by the encoder."""
+        """Returns the trajectory. Stop-and-shoot rests at the mid-window angles of the same fly-scan.
+
+        Jitter is a smooth wander of the gantry, with standard deviation ``jitter_deg`` and one knot per frame, which the
+        encoder records.
+        """
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)
         if not self.is_fly:
@@ -114,7 +119,7 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """A named protocol with the options that are not None replaced."""
+    """Returns a named protocol with the options that are not None replaced."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

@@ -1,4 +1,4 @@
-"""Readout of a panel: lines before columns or rows, for operators; and a data sheet's words for order, rate and time."""
+"""Readout of a panel: the order of lines for operators, and the terms of data sheets for order, rate and time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,42 +9,47 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.errors import InputError
 
-# by the side of the panel that is read first, seen from the source: readout axis and direction
+# readout axis and direction, by the side of the panel that is read first, seen from the source
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
 SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]
-"""How a message calls a field: an argument of Python, an option of the command line or a key of a TOML file."""
+"""Translates the name of a field for messages: to an argument, an option of the command line or a key of a TOML file."""
 
 
 @dataclass(frozen=True)
 class Readout:
-    """Lines first: operators see a frame with the readout's lines as its rows. ``axis``: what a line is on the detector,
-    "rows" or "columns"."""
+    """Puts frames and poses in the order that operators use, with the readout's lines as rows.
+
+    ``axis``: what a line is on the detector, "rows" or "columns".
+    """
 
     axis: str
 
     def shape(self, detector_shape: tuple[int, int]) -> tuple[int, int]:
-        """(lines, width) of a (rows, columns) detector."""
+        """Returns (lines, width) of a (rows, columns) detector."""
         rows, columns = detector_shape
         return (rows, columns) if self.axis == "rows" else (columns, rows)
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
-        """Frames (..., rows, columns) as (..., lines, width), or back: a view."""
+        """Returns a view of frames (..., rows, columns) as (..., lines, width), or back."""
         return frames if self.axis == "rows" else frames.swapaxes(-1, -2)
 
     def poses(self, pose: np.ndarray) -> np.ndarray:
-        """Poses (..., 12) of frames with lines first, or back."""
+        """Returns poses (..., 12) of frames with lines first, or back."""
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:
-        """Values (..., lines) that broadcast with frames (..., rows, columns)."""
+        """Returns a view of values (..., lines) that broadcasts with frames (..., rows, columns)."""
         return by_line[..., :, None] if self.axis == "rows" else by_line[..., None, :]
 
 
 def readout_order(
     first: str | None, axis: str | None, direction: int | None, named: Named = str
 ) -> tuple[str | None, int | None]:
-    """Readout axis and direction; ``first``, a key of ``FIRST_LINES``, states both. InputError where they contradict."""
+    """Returns readout axis and direction; ``first``, a key of ``FIRST_LINES``, states both.
+
+    Raises InputError where they contradict.
+    """
     if first is None:
         return axis, direction
     checks.one_of(named("first"), first, FIRST_LINES)
@@ -56,7 +61,7 @@ def readout_order(
 
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
-    """Seconds from frame to frame, from frames per second or as given. InputError where the two differ."""
+    """Returns seconds from frame to frame, from frames per second or as given. InputError: the two differ."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -64,7 +69,7 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def readout_of(readout_ms: float | None, readout_s: float | None, named: Named = str) -> float | None:
-    """Readout time in s, from ms or as given. InputError where the two differ."""
+    """Returns the readout time in s, from ms or as given. InputError: the two differ."""
     if readout_ms is None:
         return readout_s
     checks.at_least(named("readout_ms"), readout_ms, 0)
@@ -74,8 +79,11 @@ def readout_of(readout_ms: float | None, readout_s: float | None, named: Named =
 def exposure_of(
     exposure_deg: float | None, exposure_s: float | None, fps: float | None, turned_deg: np.ndarray
 ) -> tuple[float, float]:
-    """Arc in degrees and time in s of an exposure. With ``fps`` one states the other, by the median step of ``turned_deg``
-    (F,); without it the time is 1 s unless given. InputError where neither or both are given with ``fps``."""
+    """Returns arc in degrees and time in s of an exposure.
+
+    With ``fps`` either follows from the other by the median step of ``turned_deg`` (F,); without it the time is 1 s unless
+    given. Raises InputError where neither or both are given with ``fps``.
+    """
     if exposure_s is not None:
         checks.positive("exposure_s", exposure_s)
     if exposure_deg is not None:
@@ -102,7 +110,7 @@ def exposure_of(
 def readout_ratio_of(
     readout_ms: float | None, readout_ratio: float | None, fps: float | None, exposure_s: float | None, named: Named = str
 ) -> float | None:
-    """``readout_ratio``, checked; InputError for a readout in ms with a ratio as well, or without a rate or an exposure."""
+    """Returns ``readout_ratio``; None with a readout in ms. InputError: both, or ms without a rate or an exposure."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

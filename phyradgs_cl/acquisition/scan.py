@@ -1,4 +1,4 @@
-"""A scan: what was measured, where the gantry was, and the grid that is asked for."""
+"""A scan: its line integrals, geometry, timing and trajectory, and the grid to reconstruct."""
 
 import logging
 from collections.abc import Iterable
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 DETECTOR_MODELS = ("log", "intensity")
 APPLIED = ("flats_applied", "darks_applied")
-"""Where a scan's provenance counts the flats and darks by which its counts became line integrals."""
+"""Keys of the provenance for the numbers of flats and darks that were applied to the counts."""
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
-_OPAQUE, _FEW = 50.0, 0.01  # no panel sees through more; the share of pixels that may be broken
-LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame says nothing of its own
+OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of pixels that may be broken
+LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame holds hardly any new information
 
 
 @dataclass(frozen=True)
 class Saturation:
-    """What raw counts said before they became line integrals: the largest of them, and the share of pixels clipped there."""
+    """The largest raw count, and the fraction of pixels clipped there, before counts became line integrals."""
 
     level: float
     share: float
@@ -50,16 +50,17 @@ class Saturation:
 class Scan:
     """One cone-beam scan in line integrals.
 
-    projections (F, nv, nu) float32, dimensionless −ln(I/I0); frame_start_s (F,) opening of the first-read line;
-    pixel_mask (nv, nu) or (F, nv, nu), non-zero = do not use; reference (nz, ny, nx) 1/mm on ``grid``. lag: share λ of
-    the recorded intensity that comes from the frames before (detector/effects.py), still in the projections. Lines that a
-    pulsed beam misses are added to the mask, so that no method has to look for them. ``saturation`` is None where nobody
-    looked at raw counts. ``is_fly`` is false for stop-and-shoot scans, whatever the exposure time says. ``geometry`` and
-    ``grid`` are in mm, ``shutter`` in s; ``trajectory``: anything with ``pose(frame, time_s)``, a class of your own too.
-    Row 0 is the lowest. detector_model: what an exposure averages, "log" (line integrals) or "intensity". title and
-    provenance go into files.
+    - projections (F, nv, nu) float32: −ln(I/I0), dimensionless. Row 0 is the lowest.
+    - geometry and grid in mm, shutter in s. trajectory: anything with ``pose(frame, time_s)``, a user-defined class too.
+    - frame_start_s (F,): when the first-read line opens, in s.
+    - is_fly: False for stop-and-shoot scans, whatever the exposure time.
+    - detector_model: quantity that the detector averages over an exposure, "log" (line integrals) or "intensity".
+    - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used; lines that a pulsed beam misses are added.
+    - reference (nz, ny, nx): the true volume in 1/mm on ``grid``.
+    - lag: share λ of the recorded intensity that stems from earlier frames (detector/effects.py), still in the projections.
+    - saturation: None where raw counts were not examined. title and provenance are stored in files.
 
-    Raises InputError for shapes that do not fit each other, and for line integrals that are no finite numbers.
+    Raises InputError for shapes that do not fit each other, and for line integrals that are not finite.
     """
 
     projections: np.ndarray
@@ -113,13 +114,13 @@ class Scan:
 
     @classmethod
     def from_poses(cls, frames: "ArrayLike", poses: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
-        """A stop-and-shoot scan with a pose of its own for every frame.
+        """Makes a stop-and-shoot scan with one pose for every frame.
 
         frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next
-        column, step to the next row, x y z each. grid: the cube that a full turn sees when None. others: fields of ``Scan``:
-        detector_model, pixel_mask, reference, title, lag, provenance.
+        column, step to the next row, x y z each. grid: None takes the field of view of a full turn. others: the fields
+        detector_model, pixel_mask, reference, title, lag and provenance of ``Scan``.
 
-        Raises InputError for shapes that do not fit, and poses from which no ray meets the grid.
+        Raises InputError for shapes that do not fit, and for poses from which no ray meets the grid.
         """
         values = _uncounted(frames, others.get("pixel_mask"))
         checks.shape("frames", values, (None, None, None))
@@ -137,11 +138,11 @@ class Scan:
 
     @classmethod
     def from_astra(cls, frames: "ArrayLike", vectors: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
-        """A stop-and-shoot scan with the vectors of an ASTRA geometry ``cone_vec``.
+        """Makes a stop-and-shoot scan from the vectors of an ASTRA geometry ``cone_vec``; ``astra_vectors`` inverts it.
 
-        frames (F, rows, columns): line integrals; ASTRA's own order is (rows, F, columns), so ``sinogram.swapaxes(0, 1)``.
-        vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. grid, others: as for
-        ``from_poses``. ``astra_vectors`` is the way back. Raises InputError for shapes that do not fit.
+        frames (F, rows, columns): line integrals. ASTRA's order is (rows, F, columns): give ``sinogram.swapaxes(0, 1)``.
+        vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. grid, others: as in
+        ``from_poses``. Raises InputError for shapes that do not fit.
         """
         values, table = _uncounted(frames, others.get("pixel_mask")), np.asarray(vectors)
         checks.shape("vectors", table, (None, POSE_LENGTH))
@@ -153,10 +154,10 @@ class Scan:
 
     @classmethod
     def from_tigre(cls, geo: Any, angles: "ArrayLike", frames: "ArrayLike", **others: Any) -> "Scan":
-        """A stop-and-shoot scan with a TIGRE geometry; TIGRE itself is not needed.
+        """Makes a stop-and-shoot scan from a TIGRE geometry, without TIGRE installed.
 
         geo: anything with TIGRE's attributes in mm: DSD, DSO, nDetector, dDetector (v, u), nVoxel, dVoxel (z, y, x), and
-        where there are any offDetector (v, u), offOrigin (z, y, x), COR, each for all frames or one for every frame.
+        optionally offDetector (v, u), offOrigin (z, y, x) and COR, each one value for all frames or one per frame.
         angles (F,) in radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
 
         Raises InputError for parallel beams, a turned panel, and attributes that are missing or do not fit.
@@ -167,24 +168,24 @@ class Scan:
         return cls.from_poses(frames, poses, grid, **others)
 
     def astra_vectors(self) -> np.ndarray:
-        """ASTRA's ``cone_vec`` (F, 12) in mm, each frame at the middle of its lit window; ``from_astra`` is the way back.
+        """Returns ASTRA's ``cone_vec`` (F, 12) in mm, each frame at the middle of its lit window; ``from_astra`` inverts it.
 
-        ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``; its volume is ours (z, y, x).
+        ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its volumes are (z, y, x) too.
         """
         times_s = self.frame_start_s + self.shutter.middle_s
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)
 
     def summary(self) -> str:
-        """Two lines: shutter, frame rate, exposure; field of view, fan and cone, voxels, largest line integral."""
+        """Returns a line of shutter, frame rate and exposure, and a line of field of view, voxels and line integrals."""
         from phyradgs_cl.acquisition.plausible import summary
 
         return summary(self)
 
     def plot(self, frame: int = 0) -> "Figure":
-        """A figure of one frame (rows, columns) and of when its lines open and close, in degrees of the gantry too.
+        """Returns a figure of one frame (rows, columns), and of the times and gantry angles at which its lines are open.
 
-        Raises InputError for a frame that there is not.
+        Raises InputError for a frame number out of range.
         """
         from phyradgs_cl.acquisition.plot import plot_frame
 
@@ -200,22 +201,22 @@ class Scan:
 
     @property
     def frames(self) -> int:
-        """How many frames F there are."""
+        """The number of frames F."""
         return len(self.projections)
 
     @property
     def valid(self) -> np.ndarray:
-        """Which pixels may be used, bool (F, nv, nu): a view."""
+        """Pixels that may be used, bool (F, nv, nu); a view."""
         unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
         return np.broadcast_to(unmasked, self.projections.shape)
 
     @property
     def lines(self) -> int:
-        """Lines along the readout axis."""
+        """The number of lines along the readout axis."""
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """The same scan with another grid; a reference stays where the grid is a part of its own, else it is left out."""
+        """Returns the scan with another grid. A reference stays where the old grid contains the new one."""
         if grid == self.grid:
             return self
         reference = self.reference
@@ -225,7 +226,7 @@ class Scan:
         return replace(self, grid=grid, reference=reference)
 
     def with_grid(self, choice: GridChoice) -> "Scan":
-        """The same scan with the grid that is chosen. Raises InputError for one that no ray of an orbit meets."""
+        """Returns the scan with the chosen grid. Raises InputError for one outside the field of view of an orbit."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):
             half_mm = ", ".join(f"±{half:.4g}" for half in field_of_view_mm(self.geometry))
@@ -234,17 +235,17 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Asks the trajectory for the ends of every frame's window, so that a short table is named early.
+        """Raises InputError for a trajectory that does not cover every frame's window, and for poses that are not numbers.
 
-        Raises InputError for that, for poses that are none, and for an exposure too short for the scan's times.
+        Raises it too for an exposure too short for the precision of the scan's times.
         """
         self.shutter.check_resolved(self.frame_start_s)
-        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # where a gantry stands
+        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a gantry at rest has one pose
         for frame, start_s in enumerate(self.frame_start_s):
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
-        """Says where the panel, as the first frame opens, stands in the grid: no ray sees what is behind it."""
+        """Warns where the panel stands inside the grid as the first frame opens: no ray sees the part behind it."""
         (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))
         behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2
         if 0 <= behind_mm < half_mm:
@@ -252,8 +253,10 @@ class Scan:
             log.warning(text, behind_mm, "Of a parallel beam state distances that clear the object")
 
     def check_sight(self) -> None:
-        """InputError for a grid that no ray meets in any frame, as each opens: its volume would be 0. A panel inside of it
-        is said."""
+        """Raises InputError for a grid that no ray meets as any frame opens: its volume would be 0.
+
+        Warns of a panel inside the grid.
+        """
         self.warn_of_near_panel()
         places = set()
         for frame, start_s in enumerate(self.frame_start_s):
@@ -265,47 +268,47 @@ class Scan:
         subject = getattr(self.trajectory, "subject", "trajectory")
         if places == {"behind the panel"}:
             remedy = "are the source's distances to axis and panel exchanged?"
-            raise InputError(subject, "the grid behind the panel in every frame", "it between source and panel", remedy)
+            expected = "the grid between source and panel"
+            raise InputError(subject, "the grid behind the panel in every frame", expected, remedy)
         box_mm = np.round(self.grid.box_mm, 3).tolist()
         found = f"a box in {box_mm} mm (z, y, x) that no ray meets in any frame"
         raise InputError("grid", found, "one that the panel sees", "correct its offset or unit, or the poses")
 
 
 def applied_facts(flats: int, darks: int) -> dict[str, object]:
-    """Provenance of line integrals that so many flats and darks were applied to."""
+    """Returns the provenance of line integrals for the numbers of flats and darks that were applied."""
     return {name: count for name, count in zip(APPLIED, (flats, darks), strict=True) if count}
 
 
 def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
-    """InputError for a keyword that is none of the fields of a scan that whoever has frames may add; ``arguments`` are
-    keywords that the caller knows besides."""
-    known = (*arguments, *_OTHERS)
+    """Raises InputError for a keyword that is no optional field of ``Scan``; the caller takes ``arguments`` besides."""
+    allowed = (*arguments, *_OTHERS)
     for name in others:
         if name not in _OTHERS:
-            raise InputError(name, "no such option", ", ".join(known), near_miss(name, known, "leave it out"))
+            raise InputError(name, "no such option", ", ".join(allowed), near_miss(name, allowed, "leave it out"))
 
 
 def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:
-    """InputError for frames that are whole numbers, or unmasked larger than line integrals are, and so raw counts."""
+    """Raises InputError for frames that look like raw counts: whole numbers, or many unmasked values above 50."""
     if frames.dtype.kind in "iu":
         raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
-    opaque = frames > _OPAQUE
+    opaque = frames > OPAQUE
     if mask is not None and np.shape(mask) in (frames.shape, frames.shape[1:]):
         opaque &= np.asarray(mask) == 0
-    if np.count_nonzero(opaque) > _FEW * opaque.size:
+    if np.count_nonzero(opaque) > FEW * opaque.size:
         found = f"values of up to {frames[opaque].max():g} without flats"
-        raise InputError("frames", found, f"line integrals, which are below {_OPAQUE:g}", remedy)
+        raise InputError("frames", found, f"line integrals, which are below {OPAQUE:g}", remedy)
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Frames of which nobody says what they hold as ``_line_integrals``; InputError for counts too."""
+    """Returns ``_line_integrals`` of frames with no stated quantity. Raises InputError for counts."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return _line_integrals(values, mask)
 
 
 def _line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Frames as float32, 0 for what is no finite number in a masked pixel; InputError for one elsewhere."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for others."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)

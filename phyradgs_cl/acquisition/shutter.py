@@ -1,4 +1,4 @@
-"""The shutter: when each detector line opens and closes."""
+"""The shutter: the times at which each detector line opens and closes."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # of float64 in an exposure: a moment in it is then known to a thousandth
-_DARK = 1e-9  # of the longest lit window: less is what rounding leaves of a line that the pulse misses
+_STEPS = 1000  # of float64 in an exposure: times within it are then exact to a thousandth
+_DARK = 1e-9  # of the longest lit window: shorter ones are rounding in a line that the pulse misses
 
 
 @dataclass(frozen=True)
 class Shutter:
-    """Exposure and readout of one frame (paper, section 2.1).
+    """Exposure and readout of one frame, in s (paper, section 2.1).
 
-    Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``; a readout of 0 is a
-    global shutter. ``axis``: what is read out at one time; ``direction`` +1 reads index 0 first, −1 last. ``pulse_s``
-    (start after the frame's start, length): when the beam is on, None always; lines see their window's part in it.
-    Times are in s. Raises InputError for times below 0, other words, and a pulse that meets no frame.
+    Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``. A readout of 0 is a
+    global shutter. ``axis``: what one line is, "rows" or "columns". ``direction``: +1 reads index 0 first, −1 last.
+    ``pulse_s`` (start after the frame's start, length): when the beam is on, None always. A line sees the part of its window
+    in the pulse. Raises InputError for times below 0, other words, and a pulse that meets no frame.
     """
 
     exposure_s: float
@@ -50,7 +50,7 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """InputError for an exposure that frames' opening times (F,) cannot tell from none: its angles would be noise."""
+        """Raises InputError for an exposure below the precision of opening times (F,): its angles would be noise."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
         shortest_s = _STEPS * float(np.spacing(latest_s))
         if 0 < self.exposure_s < shortest_s:
@@ -59,56 +59,60 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """How frames and poses turn to lines first."""
+        """The readout axis, which puts frames and poses in the order lines, width."""
         return Readout(self.axis)
 
     @property
     def first(self) -> str:
-        """The side of the panel that is read first: "top", "bottom", "left" or "right", seen from the source."""
+        """The side that is read first, "top", "bottom", "left" or "right", seen from the source."""
         return next(side for side, order in FIRST_LINES.items() if order == (self.axis, self.direction))
 
     @property
     def span_s(self) -> float:
-        """From the first line's opening to the last line's closing."""
+        """Time from the first line's opening to the last line's closing."""
         return self.exposure_s + self.readout_s
 
     @property
     def lit_span_s(self) -> tuple[float, float]:
-        """From the first light to the last, in seconds after the frame's start: the span without a pulse."""
+        """First and last light in seconds after the frame's start; without a pulse the whole span."""
         first_s, last_s = self.in_pulse(np.array([0.0, self.span_s]))
         return float(first_s), float(last_s)
 
     @property
     def middle_s(self) -> float:
-        """The middle of the lit span: when a single pose says most about a frame."""
+        """The middle of the lit span, the best time for a single pose."""
         first_s, last_s = self.lit_span_s
         return first_s + (last_s - first_s) / 2
 
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
-        """Times (...) after the frame's start, those without beam moved to the nearest moment with beam: the ends of a
-        window become those of its part in the pulse, and one moment where the pulse misses it."""
+        """Returns times (...) after the frame's start, moved to the nearest moment with beam.
+
+        The ends of a window become those of its part in the pulse, or equal times where the pulse misses it.
+        """
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
         return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
-        """How many lines a panel of (rows, columns) has along the readout axis."""
+        """Returns the number of lines along the readout axis of a panel (rows, columns)."""
         return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:
-        """Opening delay τ (lines,) of every line index, in seconds after the frame's start."""
+        """Returns the opening time τ (lines,) of every line index, in seconds after the frame's start."""
         order = np.arange(lines) if self.direction > 0 else np.arange(lines)[::-1]
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """(lines, 2): when light begins and ends on every line index, in seconds after the frame's start; from opening
-        to closing without a pulse, and equal times for a line that the pulse misses."""
+        """Returns first and last light (lines, 2) of every line index, in seconds after the frame's start.
+
+        Without a pulse they are opening and closing; a line that the pulse misses has equal times.
+        """
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
     def lit_share(self, lines: int) -> np.ndarray:
-        """Share (lines,) of the longest lit window that each line index sees: 1 everywhere without a pulse."""
+        """Returns each line's lit time (lines,) relative to the longest one; 1 everywhere without a pulse."""
         if self.pulse_s is None:
             return np.ones(lines)
         seen_s = np.diff(self.line_windows_s(lines))[:, 0]
@@ -119,7 +123,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """[start, stop) of the strips, as they are read; may be empty. Line r (in reading order) is in floor(r·M/H)."""
+        """Returns [start, stop) of strips in reading order, where line r is in strip floor(r·M/H); some may be empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

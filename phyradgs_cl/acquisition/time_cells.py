@@ -20,13 +20,13 @@ class TimeCells:
 
     pose (C, 12) in mm refers to the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
     line_start, line_stop (C,) count lines along the readout ``axis``, which has ``lines`` lines. weight (C,). ``line_share``
-    (C, lines) multiplies the weight of a still cell by the share of each line's window that lies in the cell; None: 1 for
+    (C, lines) multiplies the weight of a still cell by the fraction of each line's window that lies in the cell; None: 1 for
     every line of the cell.
 
     Moving cells are segments of the frame. ``end_poses`` (C, 2, 12) are the poses at their ends. ``line_times`` (C, 3,
     lines) holds for each line the middle and half the length of its window in the segment, in units of the segment's length
-    from its mid-time, and the share of the line's window that lies in the segment. Their ``weight`` is 1. Methods raise
-    InputError for a user's own cells that do not fit the scan.
+    from its mid-time, and the fraction of the line's window that lies in the segment. Their ``weight`` is 1. Methods raise
+    InputError for a user-defined cells that do not fit the scan.
     """
 
     pose: np.ndarray

@@ -1,8 +1,8 @@
-"""Geometries of ASTRA and TIGRE to poses, and back. Neither package is needed: both are numbers and names of attributes.
+"""Converts geometries of ASTRA and TIGRE to poses and back, without either package.
 
 ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, step from row to row, x y z each.
-TIGRE's cone is ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest; its pairs run (v, u),
-its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
+TIGRE's cone equals ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest. Its pairs run (v,
+u), its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
 """
 
 import logging
@@ -21,7 +21,7 @@ _MOST_RAD = 20 * np.pi  # ten turns
 
 
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
-    """Poses (F, 12) of ``cone_vec`` rows (F, 12) in mm, for a panel of (rows, columns)."""
+    """Returns poses (F, 12) for ``cone_vec`` rows (F, 12) in mm and a panel (rows, columns)."""
     table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
     pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)
@@ -29,36 +29,34 @@ def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
 
 
 def astra_of_poses(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-    """The inverse of ``poses_of_astra``."""
+    """Inverts ``poses_of_astra``."""
     vectors = np.array(pose, np.float64)
     vectors[:, 3:6] += _to_middle(vectors, panel)
     return vectors
 
 
 def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-    """From the centre of pixel (0, 0) to that of the panel (F, 3)."""
+    """Returns the vector (F, 3) from the centre of pixel (0, 0) to that of the panel."""
     rows, columns = panel
-    middle: np.ndarray = (columns - 1) / 2 * pose[:, 6:9] + (rows - 1) / 2 * pose[:, 9:12]
-    return middle
+    return np.asarray((columns - 1) / 2 * pose[:, 6:9] + (rows - 1) / 2 * pose[:, 9:12])
 
 
 def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
-    """Poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry and its angles (F,), or (F, 3) Euler angles.
+    """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
 
-    Raises InputError for what has no place in a scan: parallel beams, a turned panel, a second or third Euler angle, a
-    volume that moves from frame to frame, and attributes that are missing or no numbers.
+    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for geometries that a scan cannot hold: parallel beams, a
+    turned panel, a second or third Euler angle, a volume that moves; and for attributes that are missing or not numbers.
     """
     if getattr(geo, "mode", None) not in (None, "cone"):
-        raise InputError(
-            "geo.mode", checks.shown(geo.mode), "'cone'", "parallel beams have no source distance"
-        )
+        raise InputError("geo.mode", checks.shown(geo.mode), "'cone'", "parallel beams have no source distance")
     angles = np.asarray(angles_rad)
     angles = checks.numbers("angles", angles_rad, (None, 3) if angles.ndim == 2 else (None,))
     if angles.ndim == 2:
         _refuse("angles", angles[:, 1:], "turns about z only: (F,), or (F, 3) with zeros behind the first")
         angles = angles[:, 0]
-    if (span := float(np.ptp(angles)) if angles.size else 0.0) > _MOST_RAD:
-        log.warning("angles: %d frames over %.4g rad: are they degrees? np.deg2rad(angles)", len(angles), span)
+    if angles.size and np.ptp(angles) > _MOST_RAD:
+        text = "angles: %d frames over %.4g rad: are they degrees? np.deg2rad(angles)"
+        log.warning(text, len(angles), np.ptp(angles))
     frames = len(angles)
     _refuse("geo.rotDetector", _each(geo, "rotDetector", frames, 3, 0.0), "zeros: a panel that is not turned")
     offset_mm = _each(geo, "offOrigin", frames, 3, 0.0)
@@ -71,17 +69,14 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     offset_v, offset_u = _each(geo, "offDetector", frames, 2, 0.0).T
     poses = np.empty((frames, POSE_LENGTH))
     for i, angle in enumerate(angles):
-        offset = float(offset_v[i]), float(offset_u[i])
-        cone = ConeGeometry(
-            float(to_axis[i]), float(to_panel[i]), (rows, columns), (pitch_v, pitch_u), offset
-        )
-        poses[i] = cone.pose(angle)
+        lengths, offset = (float(to_axis[i]), float(to_panel[i])), (float(offset_v[i]), float(offset_u[i]))
+        poses[i] = ConeGeometry(*lengths, (rows, columns), (pitch_v, pitch_u), offset).pose(angle)
         poses[i, :6] += np.tile(shift[i] * poses[i, 6:9] / pitch_u, 2)
     return poses, (rows, columns), grid
 
 
 def _of(geo: Any, name: str) -> Any:
-    """An attribute of a TIGRE geometry, or InputError."""
+    """Returns an attribute of a TIGRE geometry. Raises InputError where it is missing."""
     if getattr(geo, name, None) is None:
         raise InputError(f"geo.{name}", "nothing", "TIGRE's attribute of this name", f"set geo.{name}")
     return getattr(geo, name)
@@ -90,14 +85,12 @@ def _of(geo: Any, name: str) -> Any:
 def _counts(geo: Any, name: str, length: int) -> np.ndarray:
     counts = checks.numbers(f"geo.{name}", _of(geo, name), (length,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
-        raise InputError(
-            f"geo.{name}", checks.shown(counts.tolist()), f"{length} whole numbers of at least 1"
-        )
+        raise InputError(f"geo.{name}", checks.shown(counts.tolist()), f"{length} whole numbers of at least 1")
     return counts
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """An attribute for every frame (F, length), from one for all or one each; ``absent`` where it may be missing and is."""
+    """Returns an attribute (F, length) for every frame, from one for all or one each; ``absent`` where it is missing."""
     needed = name in ("DSO", "DSD")
     value = _of(geo, name) if needed else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
@@ -105,9 +98,7 @@ def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.nd
     if table.shape in ((), (1,), (length,)):
         return np.broadcast_to(table, (frames, length))
     if table.shape not in (per_frame, (frames, length)):
-        raise InputError(
-            f"geo.{name}", f"shape {table.shape}", f"{length} for all frames, or shape {per_frame}"
-        )
+        raise InputError(f"geo.{name}", f"shape {table.shape}", f"{length} for all frames, or shape {per_frame}")
     return table.reshape(frames, length)
 
 

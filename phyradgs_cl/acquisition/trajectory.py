@@ -1,4 +1,4 @@
-"""Kinematics: the gantry angle θ(t), or whole poses, at any time of a frame."""
+"""Trajectories: the gantry angle θ(t), or whole poses, at any time of a frame."""
 
 from dataclasses import dataclass, field, fields
 from typing import Protocol
@@ -12,19 +12,19 @@ from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import short_repr
 
-_LEAST_SPAN_S = 1e-6  # of a frame that takes no time
+_LEAST_SPAN_S = 1e-6  # for frames of no duration
 _MOST_SAMPLES = 1024  # per frame
-_SAME_PLACE = 1e-9  # of the longest distance: what float64 leaves of an orbit
+_SAME_PLACE = 1e-9  # of the longest distance: rounding of an orbit in float64
 
 
 class Trajectory(Protocol):
-    """Anything that knows where the gantry is: poses (..., 12) in mm of a frame at times (...) in seconds.
+    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds.
 
-    A class of your own with this method works in every method; ``save_scan`` samples it into a table.
+    A user-defined class with this method works in every reconstruction method; ``save_scan`` samples it into a table.
     """
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Poses (..., 12) in mm of frame number ``frame`` at times (...) s.
+        """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s.
 
         A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each.
         """
@@ -32,16 +32,16 @@ class Trajectory(Protocol):
 
 
 class Kinematics(Protocol):
-    """Anything that knows the gantry's angles (...) of a frame at times (...) in seconds."""
+    """The interface of kinematics: gantry angles (...) of a frame at times (...) in seconds."""
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Angles (...) in rad of frame number ``frame`` at times (...) s, counterclockwise seen from above."""
+        """Returns angles (...) in rad of frame number ``frame`` at times (...) s, counterclockwise seen from above."""
         ...
 
 
 @dataclass(frozen=True)
 class ConstantSpeed:
-    """θ(t) = θ0 + ω t: ``angle_start_rad`` at time 0 and ``speed_rad_per_s``. Raises InputError for what is not finite."""
+    """θ(t) = θ0 + ω t: ``angle_start_rad`` at time 0 and ``speed_rad_per_s``. Raises InputError for inf or NaN."""
 
     angle_start_rad: float
     speed_rad_per_s: float
@@ -50,16 +50,15 @@ class ConstantSpeed:
         _check_finite(self)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Angles (...) in rad at times (...) s, the same in every frame."""
+        """Returns angles (...) in rad at times (...) s, the same in every frame."""
         return self.angle_start_rad + self.speed_rad_per_s * np.asarray(time_s, np.float64)
 
 
 @dataclass(frozen=True)
 class SpeedRamp:
-    """θ(t) = θ0 + ω t + ½ a t²: a gantry that is still speeding up or braking.
+    """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes.
 
-    ``angle_start_rad`` and ``speed_rad_per_s`` at time 0, ``acceleration_rad_per_s2`` always. Raises InputError for what
-    is not finite.
+    ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN.
     """
 
     angle_start_rad: float
@@ -70,16 +69,16 @@ class SpeedRamp:
         _check_finite(self)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Angles (...) in rad at times (...) s, the same in every frame."""
+        """Returns angles (...) in rad at times (...) s, the same in every frame."""
         t = np.asarray(time_s, np.float64)
         return self.angle_start_rad + self.speed_rad_per_s * t + 0.5 * self.acceleration_rad_per_s2 * t * t
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
-    """Measured θ(t): linear between samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, never beyond.
+    """Measured θ(t): linear between samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, not extrapolated.
 
-    Raises InputError for times that do not increase, and when it is asked for a time that it does not cover.
+    Raises InputError for times that do not increase, and for times beyond the table.
     """
 
     time_s: np.ndarray
@@ -95,7 +94,7 @@ class EncoderTable:
         object.__setattr__(self, "angle_rad_table", table)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Angles (...) in rad at times (...) s, the same in every frame. Raises InputError beyond the table."""
+        """Returns angles (...) in rad at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.subject, frame, t, self.time_s)
         return np.interp(t, self.time_s, self.angle_rad_table)
@@ -103,11 +102,11 @@ class EncoderTable:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameSweeps:
-    """Each frame's own constant speed, from its angle when the exposure starts to that when it ends.
+    """A constant speed for each frame, from its angle as the exposure starts to its angle as it ends.
 
-    Continued past the exposure through the readout; equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,)
-    in s, when the first line opens; ``exposure_s`` of a line; ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad.
-    Raises InputError for arrays of unequal length, and what is not finite.
+    The speed continues through the readout; equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,) in s: when
+    the first line opens. ``exposure_s``: of a line. ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad.
+    Raises InputError for arrays of unequal length, infinite values and NaN.
     """
 
     start_s: np.ndarray
@@ -124,7 +123,7 @@ class FrameSweeps:
             object.__setattr__(self, name, checks.numbers(name, getattr(self, name), (frames,)))
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Angles (...) in rad of frame number ``frame`` at times (...) s."""
+        """Returns angles (...) in rad of frame number ``frame`` at times (...) s."""
         t = np.asarray(time_s, np.float64)
         first, last = float(self.angle_start_rad[frame]), float(self.angle_end_rad[frame])
         if self.exposure_s <= 0:
@@ -134,9 +133,9 @@ class FrameSweeps:
 
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
-    """A circular ``geometry`` in mm whose gantry turns as its ``kinematics`` say: anything with angle_rad(frame, time_s).
+    """A circular ``geometry`` in mm, with ``kinematics`` that give its angle: anything with angle_rad(frame, time_s).
 
-    Raises InputError for what is neither.
+    Raises InputError for other objects.
     """
 
     geometry: ConeGeometry
@@ -149,21 +148,21 @@ class CircularOrbit:
             raise InputError("kinematics", checks.shown(self.kinematics), "anything with angle_rad(frame, time_s)")
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Poses (..., 12) in mm of frame number ``frame`` at times (...) s."""
+        """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s."""
         return self.geometry.pose(self.kinematics.angle_rad(frame, time_s))
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Angles (...) in rad of frame number ``frame`` at times (...) s."""
+        """Returns angles (...) in rad of frame number ``frame`` at times (...) s."""
         return self.kinematics.angle_rad(frame, time_s)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoseTable:
-    """An arbitrary trajectory: poses ``table`` (T, 12) in mm at ``time_s`` (T,) in s, a rigid body between them.
+    """An arbitrary trajectory: poses ``table`` (T, 12) in mm at ``time_s`` (T,) in s, interpolated as a rigid body.
 
     A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each.
-    Rotations go by slerp and everything else is linear in the body's own frame: interpolating the 12
-    numbers in the world would shrink an orbit (by 1 mm at 1 m over 5°).
+    Rotations are interpolated by slerp, and the other numbers linearly in the body's own frame: a linear interpolation in
+    world coordinates would shrink an orbit (by 1 mm at 1 m over 5°).
     Raises InputError for times that do not increase, steps that span no panel, and times beyond the table.
     """
 
@@ -185,11 +184,11 @@ class PoseTable:
         object.__setattr__(self, "_frames", _body_frames(table))
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
+        """Returns poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.subject, frame, t, self.time_s)
         in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
-        flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp knows no slack
+        flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp allows no slack
         body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
         turns = scipy.spatial.transform.Rotation.from_matrix(self._frames)
         turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
@@ -198,8 +197,9 @@ class PoseTable:
 
 
 def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses") -> PoseTable:
-    """A gantry that stops for every frame, as a table: poses (F, 12), each held for a span about its frame's middle (F,)
-    in s.
+    """Returns a table for a gantry that stops for every frame.
+
+    It holds each pose (F, 12) for ``span_s`` about its frame's middle (F,) in s.
     """
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
@@ -207,9 +207,7 @@ def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, subjec
 
 
 def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
-    """A gantry that stops for every frame: a circular orbit where its poses (F, 12) are those of ``geometry``, else a
-    table.
-    """
+    """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``, else a table."""
     angle_rad = np.arctan2(poses[:, 1], poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * geometry.source_to_detector_mm):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
@@ -220,31 +218,33 @@ _AS_TABLE = "give it as a PoseTable"
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """A trajectory of one's own as a table that stays within ``error_mm`` of it over every frame's span (F,) +
-    ``span_s``; InputError where a fine table does not, as where frames overlap in time and are elsewhere."""
-    apart = 2
+    """Samples a user-defined trajectory to a table within ``error_mm`` of it, over ``span_s`` from each frame's start (F,).
+
+    Raises InputError where a fine table is not close enough, as for frames that overlap in time with different poses.
+    """
+    samples = 2
     while True:
-        offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), apart)
+        offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
-        made = PoseTable(time_s, poses[at], "trajectory")
-        between = (time_s[:-1] + time_s[1:]) / 2  # of all samples: those of a frame that overlaps are in between too
+        table = PoseTable(time_s, poses[at], "trajectory")
+        between = (time_s[:-1] + time_s[1:]) / 2  # of all samples, those of overlapping frames included
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
-        gaps = (np.abs(made.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
-        worst_mm = max(gaps)
+        errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
+        worst_mm = max(errors)
         if worst_mm <= error_mm:
-            return made
-        if apart > _MOST_SAMPLES:
-            found = f"poses that {apart} samples per frame miss by {worst_mm:.3g} mm"
+            return table
+        if samples > _MOST_SAMPLES:
+            found = f"poses that {samples} samples per frame miss by {worst_mm:.3g} mm"
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        apart = 2 * apart - 1
+        samples = 2 * samples - 1
 
 
 def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
-    """Poses (T, 12) of a trajectory at times (T,) s; InputError for one of somebody's own that gives no such numbers."""
+    """Returns poses (T, 12) of a trajectory at times (T,) s. InputError: a user-defined one gives other shapes or NaN."""
     subject = f"trajectory {type(trajectory).__name__}"
     return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
@@ -257,7 +257,7 @@ def _check_finite(kinematics: ConstantSpeed | SpeedRamp) -> None:
 def _checked_table(
     subject: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rising times (T,) and finite rows (T, *row), float64."""
+    """Returns increasing times (T,) and finite rows (T, *row), float64. Raises InputError for others."""
     time_s, table = checks.numbers(f"{subject} times", times), checks.numbers(f"{subject} {what}", rows)
     if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
         raise InputError(subject, f"shapes {time_s.shape} and {table.shape}", expected)
@@ -267,7 +267,7 @@ def _checked_table(
 
 
 def _body_frames(table: np.ndarray) -> np.ndarray:
-    """Right-handed orthonormal frames (T, 3, 3), columns û, v̂ and normal, of poses (T, 12)."""
+    """Returns right-handed orthonormal frames (T, 3, 3), with columns û, v̂ and normal, of poses (T, 12)."""
     u_hat = table[:, 6:9] / np.linalg.norm(table[:, 6:9], axis=1, keepdims=True)
     normal = np.cross(u_hat, table[:, 9:12])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -275,7 +275,7 @@ def _body_frames(table: np.ndarray) -> np.ndarray:
 
 
 def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
-    """A measured table is never extrapolated; a nanosecond of slack absorbs rounding of stored times."""
+    """Raises InputError for times beyond a table; a nanosecond of slack absorbs rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"

@@ -112,7 +112,7 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
     """Averages line integrals p (S, ...) of S moments of an exposure to (...) float64.
 
     Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does,
-    −ln Σ w exp(−p), without overflow at any p. weight (S,): shares of the exposure, not negative, sum 1.
+    −ln Σ w exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, sum 1.
     Raises InputError for an unknown model, shapes or weights that do not fit, and NaN.
     """
     one_of("detector model", model, MODELS)

@@ -67,9 +67,9 @@ def tigre_noise(
     """Returns noisy line integrals −ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling; negatives become 0.
 
     line_integrals (F, v, u): all projections of the scan, m is their maximum. ``dose``: counts of an unattenuated pixel.
-    ``electronic_noise``: standard deviation in counts. The published scans have 1e4 and 10. ``light``: share of the dose for
-    each pixel, above 0, broadcast to (F, v, u), because a pulse may miss part of a line's window.
-    Raises InputError for a dose that is not positive, negative noise, and line integrals that are not finite.
+    ``electronic_noise``: standard deviation in counts. The published scans have 1e4 and 10. ``light``: fraction of the dose
+    for each pixel, above 0, broadcast to (F, v, u), because a pulse may miss part of a line's window. Raises InputError for
+    a dose that is not positive, negative noise, and line integrals that are not finite.
     """
     _check(line_integrals, dose, electronic_noise)
     expected, scale = tigre_counts(line_integrals, dose)

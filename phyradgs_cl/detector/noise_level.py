@@ -19,7 +19,7 @@ _FRAMES = 16  # from which noise is estimated
 
 LEAST_SHARE = 1e-3
 """Share of the pixels at one extreme from which saturation is suspected."""
-_TOUCHING = 0.5  # share of those with all four neighbours at the same extreme
+_TOUCHING = 0.5  # fraction of those with all four neighbours at the same extreme
 _SAME = 1e-3  # relative difference between a flat and the projections' ceiling that counts as none
 _MOST_FRAMES, _LONGEST_EDGE = 8, 1024  # of the frames that are searched for noise
 _ROUNDING, _RELATIVE = 0.5, 2e-5  # noise in counts, and relative to the ceiling, that counts as none
@@ -113,7 +113,7 @@ def transmission_weights(
 
 
 def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
-    """Returns the largest count of projections (P, v, u), and the share of their pixels clipped there.
+    """Returns the largest count of projections (P, v, u), and the fraction of their pixels clipped there.
 
     Only whole areas count as clipped. An area at the count of the mean ``flat`` (v, u) may be air without noise: it counts
     only where the rest of the frames shows noise.
@@ -126,7 +126,7 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
 
 
 def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
-    """Returns the share of pixels at an extreme, given frame by frame (v, u), if most have four such neighbours; else 0.
+    """Returns the fraction of pixels at an extreme, given frame by frame (v, u), if most have four such neighbours; else 0.
 
     Saturation puts whole areas at an extreme, clipped noise single pixels.
     """

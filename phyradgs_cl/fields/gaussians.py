@@ -20,9 +20,9 @@ _DENSITY_FLOOR = 1e-12
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; quaternion (G, 4) w x y z,
-    unit; density (G,) attenuation per that length. Raises InputError for other shapes, for what is no finite number, and
-    for scales that are not above 0.
+    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; unit quaternion (G, 4) w x y
+    z; density (G,) attenuation per that length. Raises InputError for other shapes, infinite values or NaN, and for scales
+    that are not above 0.
     """
 
     mean: np.ndarray
@@ -44,32 +44,30 @@ class Gaussians:
 
     @property
     def count(self) -> int:
-        """How many Gaussians G there are."""
+        """The number of Gaussians G."""
         return len(self.mean)
 
     def rows(self) -> np.ndarray:
-        """The parameters as (11, G) float64, the order that kernels use."""
-        q = (
-            self.quaternion / np.linalg.norm(self.quaternion, axis=1, keepdims=True)
-            if self.count
-            else self.quaternion
-        )
+        """Returns the parameters (11, G) float64 in the order of the kernels."""
+        q = self.quaternion
+        if self.count:
+            q = q / np.linalg.norm(q, axis=1, keepdims=True)
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> "Gaussians":
-        """From (11, G) rows; InputError for another shape."""
+        """Makes a cloud from rows (11, G). Raises InputError for another shape."""
         checks.shape("rows", rows, (11, None))
         return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
 
     def scaled(self, length: float, density: float) -> "Gaussians":
-        """The same cloud with lengths multiplied by ``length`` and densities by ``density``."""
+        """Returns the cloud with lengths multiplied by ``length`` and densities by ``density``."""
         return Gaussians(self.mean * length, self.scale * length, self.quaternion, self.density * density)
 
     def averaged(self, box: tuple[float, float, float]) -> "Gaussians":
-        """The cloud blurred by a box with sides x y z: its variance is added to every Gaussian's, mass kept.
+        """Returns the cloud blurred by a box with sides x y z, whose variance is added to every Gaussian; mass is kept.
 
-        Sampled at the centres of voxels of that size this is, to the Gaussians' second moments, the mean over a voxel.
+        Sampled at the centres of voxels of that size it is the mean over a voxel, to the Gaussians' second moments.
         """
         if self.count == 0:
             return self
@@ -85,13 +83,13 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Activation:
-    """Raw numbers to parameters: scale = min + (max − min)·sigmoid, density = softplus, quaternion normalised."""
+    """Maps raw numbers to parameters: scale = min + (max − min)·sigmoid, density = softplus, quaternion normalised."""
 
     scale_min: float
     scale_max: float
 
     def apply(self, raw: np.ndarray) -> np.ndarray:
-        """Raw (11, G) to parameter rows (11, G); the float64 twin of ``activate`` in cl/adam.cl."""
+        """Returns parameter rows (11, G) for raw ones (11, G); the float64 twin of ``activate`` in cl/adam.cl."""
         rows = np.array(raw, dtype=np.float64)
         rows[SCALE] = self.scale_min + (self.scale_max - self.scale_min) * scipy.special.expit(raw[SCALE])
         rows[QUATERNION] = raw[QUATERNION] / np.linalg.norm(raw[QUATERNION], axis=0)
@@ -99,7 +97,7 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Parameter rows (11, G) to raw ones; scales are kept a little inside their bounds."""
+        """Returns raw rows (11, G) for parameter rows; scales stay a little inside their bounds."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

@@ -1,4 +1,4 @@
-"""Which voxels a volume is made on, where a scan's own are not what is wanted."""
+"""The grid of a volume, where the user wants another than the scan's."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,20 +12,19 @@ from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
 _LARGEST_MM = 1e9
 _ROUNDING = 1e-6  # of a voxel: a box that ends at a voxel's face ends there, whatever its decimals
-_TYPED = 0.01  # likewise, of a box beside the scan's own voxels, whose sides are rarely round numbers
+_TYPED = 0.01  # the same for a typed box and the scan's voxels, whose sides are rarely round numbers
 
 
 @dataclass(frozen=True)
 class GridChoice:
-    """How a volume's grid is to differ from its scan's; None leaves it as it is there, or as the others imply.
+    """How a volume's grid differs from the scan's. None keeps the scan's value, or takes the one that the others imply.
 
-    size: voxels (z, y, x), or one count: along the longest side, the others in proportion. voxel_mm: sides of a voxel
-    (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame, or its sides (z, y, x), or one
-    length of all, about the middle of the scan's grid. margin_mm: how far beyond this box (z, y, x), or in all directions,
-    methods fill voxels that are not kept.
+    size: voxels (z, y, x), or one count along the longest side, with the others in proportion. voxel_mm: sides of a voxel
+    (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame, or its sides (z, y, x) or one side
+    of a cube, about the middle of the scan's grid. margin_mm: width (z, y, x), or on all sides, that methods reconstruct
+    beyond this box and discard.
 
-    Raises:
-        InputError: what is no such numbers or out of range, a box that ends before it begins, or all three of the first.
+    Raises InputError for other values, a box that ends before it begins, and all of size, voxel_mm and roi_mm.
     """
 
     size: int | tuple[int, ...] | None = None
@@ -38,8 +37,7 @@ class GridChoice:
             counts = _numbers("--size", self.size, (1, 3), "64 or 48,64,64")
             if any(n != int(n) or not 1 <= n <= MOST_VOXELS for n in counts):
                 raise InputError("--size", checks.shown(self.size), "whole numbers of voxels, at least 1")
-            whole = tuple(int(n) for n in counts)
-            object.__setattr__(self, "size", whole if len(whole) == 3 else whole[0])
+            object.__setattr__(self, "size", triple(map(int, counts)) if len(counts) == 3 else int(counts[0]))
         if self.voxel_mm is not None:
             object.__setattr__(self, "voxel_mm", voxel_sides_mm("--voxel-mm", self.voxel_mm))
         if self.roi_mm is not None:
@@ -61,13 +59,11 @@ class GridChoice:
             raise InputError("--size", "all three", expected, "leave one out")
 
     def of(self, grid: Grid) -> Grid:
-        """The grid that is chosen in place of ``grid``; ``grid`` itself where nothing is.
+        """Returns the chosen grid in place of ``grid``; ``grid`` itself where nothing is chosen.
 
-        A box alone takes the voxels of ``grid`` that it meets, by more than a hundredth, continued where it goes beyond, so
-        that the volume is a part of the one on ``grid``. A size alone keeps the box; so does a voxel, with its sides rounded
-        up to whole voxels.
-
-        Raises InputError for more voxels than anybody means.
+        A box alone takes the voxels of ``grid`` that it meets by more than a hundredth, continued beyond ``grid``: the
+        volume is then a part of the one on ``grid``. A size alone keeps the box. A voxel alone keeps it too, with its sides
+        rounded up to whole voxels. Raises InputError for too many voxels.
         """
         box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
@@ -87,7 +83,7 @@ class GridChoice:
         return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
 
     def with_margin(self, grid: Grid) -> Grid:
-        """``grid`` with as many of its voxels around it as make ``margin_mm``. Raises InputError for too many."""
+        """Returns ``grid`` enlarged by ``margin_mm`` in whole voxels. Raises InputError for too many voxels."""
         if self.margin_mm is None:
             return grid
         around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _TYPED)
@@ -95,7 +91,7 @@ class GridChoice:
         return grid.part(triple(int(-n) for n in around), shape)
 
     def _box_mm(self, grid: Grid) -> np.ndarray:
-        """Where the voxels are to begin and end (3, 2): the box that is asked for, else that of ``grid``."""
+        """Returns the ends (3, 2) of the chosen box, else those of ``grid``."""
         if self.roi_mm is None:
             return grid.box_mm
         if len(self.roi_mm) == 6:
@@ -108,7 +104,7 @@ class GridChoice:
         return np.maximum(np.round(float(self.size or 1) * proportion / proportion.max()), 1)
 
     def _cut(self, grid: Grid, box_mm: np.ndarray) -> Grid:
-        """The voxels of ``grid``, continued beyond it, that a box (3, 2) meets."""
+        """Returns the voxels of ``grid``, continued beyond it, that a box (3, 2) meets."""
         low, high = (box_mm.T - grid.box_mm[:, 0]) / grid.voxel_size_mm
         start = np.floor(low + _TYPED)
         shape = self._whole(np.maximum(np.ceil(high - _TYPED) - start, 1))
@@ -124,8 +120,7 @@ class GridChoice:
 
 
 def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
-    """Sides of a voxel (z, y, x) in mm from one length, or three. Raises InputError, which names ``option``, for any other
-    value."""
+    """Returns sides of a voxel (z, y, x) in mm from one length or three. Raises InputError about ``option`` for others."""
     sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
     for side_mm in sides_mm:
         checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
@@ -133,7 +128,7 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
-    """A number, or a sequence of numbers, as finite numbers of which there may be so many."""
+    """Returns a number, or a sequence of numbers, as finite floats; ``counts``: how many there may be."""
     value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # Grid.box_mm is (3, 2)
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]

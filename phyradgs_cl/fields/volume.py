@@ -11,13 +11,13 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
 MOST_VOXELS = 2**38
-"""A terabyte of float32: what asks for more is damage."""
-_SAME_PLACE = 1e-3  # of a voxel: what grids stored in float32 need
+"""A terabyte of float32: larger requests come from damaged files."""
+_SAME_PLACE = 1e-3  # of a voxel, for grids stored in float32
 T = TypeVar("T")
 
 
 def triple(values: Iterable[T]) -> tuple[T, T, T]:
-    """Three values (z, y, x) as a tuple of that length."""
+    """Returns three values (z, y, x) as a tuple of that length."""
     z, y, x = values
     return z, y, x
 
@@ -26,9 +26,8 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 class Grid:
     """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays.
 
-    shape: counts. voxel_size_mm: sides of a voxel in mm.
-
-    Raises InputError for counts below 1 and lengths that are not finite, or not above 0.
+    shape: counts. voxel_size_mm: sides of a voxel in mm. Raises InputError for counts below 1, for lengths that are not
+    finite, and for sides that are not above 0.
     """
 
     shape: tuple[int, int, int]
@@ -50,22 +49,19 @@ class Grid:
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> "Grid":
-        """A centred cube of ``count``³ voxels with a side of ``side_mm``. Raises InputError for numbers that are not
-        above 0.
-        """
+        """Returns a centred cube of ``count``³ voxels with a side of ``side_mm``. InputError: numbers not above 0."""
         checks.whole("count", count, 1, MOST_VOXELS)
         checks.positive("side_mm", side_mm)
         return cls((count,) * 3, (side_mm / count,) * 3)
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
-        """Side lengths (z, y, x)."""
-        z, y, x = (n * d for n, d in zip(self.shape, self.voxel_size_mm, strict=True))
-        return (z, y, x)
+        """The sides (z, y, x) of the box."""
+        return triple(n * d for n, d in zip(self.shape, self.voxel_size_mm, strict=True))
 
     @property
     def box_mm(self) -> np.ndarray:
-        """Where the voxels begin and end: (3, 2) float64, z, y and x."""
+        """The ends (3, 2) float64 of the box along z, y and x."""
         half_mm, centre_mm = np.array(self.size_mm) / 2, np.array(self.offset_mm)
         return np.stack([centre_mm - half_mm, centre_mm + half_mm], -1)
 
@@ -76,37 +72,28 @@ class Grid:
 
     @property
     def first_centre_mm(self) -> tuple[float, float, float]:
-        """Centre (z, y, x) of voxel (0, 0, 0)."""
-        z, y, x = (
-            o - (n - 1) / 2 * d
-            for n, d, o in zip(self.shape, self.voxel_size_mm, self.offset_mm, strict=True)
-        )
-        return (z, y, x)
+        """The centre (z, y, x) of voxel (0, 0, 0)."""
+        sides = zip(self.shape, self.voxel_size_mm, self.offset_mm, strict=True)
+        return triple(offset - (n - 1) / 2 * d for n, d, offset in sides)
 
     def axes_mm(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Voxel-centre coordinates: z (nz,), y (ny,), x (nx,), float64."""
-        z, y, x = (
-            first + np.arange(n) * d
-            for first, n, d in zip(self.first_centre_mm, self.shape, self.voxel_size_mm, strict=True)
-        )
-        return z, y, x
+        """Returns the coordinates of voxel centres, z (nz,), y (ny,), x (nx,), float64."""
+        sides = zip(self.first_centre_mm, self.shape, self.voxel_size_mm, strict=True)
+        return triple(first + np.arange(n) * d for first, n, d in sides)
 
     def is_close(self, other: "Grid") -> bool:
-        """Whether two grids are one but for what files round off."""
+        """Returns whether two grids are equal but for the rounding of files."""
         near_mm = 1e-5 * max(self.size_mm)
         same_voxels = np.allclose(self.voxel_size_mm, other.voxel_size_mm, rtol=1e-5)
         return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
 
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> "Grid":
-        """The voxels [start, start + shape) (z, y, x) as a grid of their own."""
-        z, y, x = (
-            first + (s + (n - 1) / 2) * d
-            for first, s, n, d in zip(self.first_centre_mm, start, shape, self.voxel_size_mm, strict=True)
-        )
-        return Grid(shape, self.voxel_size_mm, (z, y, x))
+        """Returns the grid of the voxels [start, start + shape) (z, y, x)."""
+        sides = zip(self.first_centre_mm, start, shape, self.voxel_size_mm, strict=True)
+        return Grid(shape, self.voxel_size_mm, triple(first + (s + (n - 1) / 2) * d for first, s, n, d in sides))
 
     def slices_in(self, whole: "Grid") -> tuple[slice, slice, slice] | None:
-        """Where (z, y, x) a grid is that is a part of ``whole``; None for one that is not."""
+        """Returns the place (z, y, x) of this grid in ``whole``; None where it is no part of it."""
         if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
             return None
         exact = np.subtract(self.first_centre_mm, whole.first_centre_mm) / whole.voxel_size_mm
@@ -116,7 +103,5 @@ class Grid:
         return triple(slice(int(s), int(s) + n) for s, n in zip(start, self.shape, strict=True))
 
     def scaled(self, factor: float) -> "Grid":
-        """The same voxels with every length multiplied by ``factor``."""
-        dz, dy, dx = (d * factor for d in self.voxel_size_mm)
-        oz, oy, ox = (o * factor for o in self.offset_mm)
-        return Grid(self.shape, (dz, dy, dx), (oz, oy, ox))
+        """Returns the grid with every length multiplied by ``factor``."""
+        return Grid(self.shape, triple(d * factor for d in self.voxel_size_mm), triple(o * factor for o in self.offset_mm))

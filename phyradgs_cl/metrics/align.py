@@ -101,7 +101,7 @@ def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
 def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
     """Samples a volume (nz, ny, nx) trilinearly at the voxel centres of another grid, 0 outside its box.
 
-    Between the outermost centres and the faces the value is that of the centres. The second result is the share of the
+    Between the outermost centres and the faces the value is that of the centres. The second result is the fraction of the
     voxels of ``onto`` that lie in the box.
     """
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)

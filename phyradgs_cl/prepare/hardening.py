@@ -39,7 +39,7 @@ BoneIn = Callable[[np.ndarray], np.ndarray]
 _LARGEST = 1e3
 _PASSES = 2  # bone from the volume, then the volume from corrected frames
 _BONE_VOXELS = 128  # along the longest side, at most: hardening by bone is smooth
-# Candidates (end of soft tissue, start of pure bone) as shares of the densest; above 1 where bone is thinner than a voxel.
+# Candidates (end of soft tissue, start of pure bone) as fractions of the densest; above 1 for bone thinner than a voxel.
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
 _AS_WELL = 0.1  # of the part that bone explains: less bone wins, because it does less harm where another effect remains
@@ -134,7 +134,7 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
 def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
-    """Returns straight line integrals (F, v, u) of soft tissue and bone, and bone's share of the volume's attenuation.
+    """Returns straight line integrals (F, v, u) of soft tissue and bone, and bone's fraction of the volume's attenuation.
 
     Without bone in the volume they are corrected for water. blur: of frames for the model, in pixels.
     """
@@ -154,7 +154,7 @@ def find_bone(
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
     """Finds the candidate with which line integrals (F, v, u) explain themselves best.
 
-    Returns the shares of the densest up to which all is soft and from which all is bone (infinite: water alone; None: no
+    Returns the fractions of the densest up to which all is soft and from which all is bone (infinite: water alone; None: no
     correction is best), and the unexplained rest of each alternative. Raises InputError where there is no object.
     """
 
@@ -239,7 +239,7 @@ def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
     """Returns the bone of voxels (z, y, x) that may mix both: none up to ``soft_to``, all from ``bone_from``.
 
-    Both are shares of the densest voxel, which the correction makes denser.
+    Both are fractions of the densest voxel, which the correction makes denser.
     """
     if soft_to >= bone_from:
         return np.zeros_like(volume)

@@ -115,8 +115,8 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AirOptions:
-    """below: share of the scan's largest line integral below which a pixel may be air, if it is connected with a side of the
-    panel. least: least share of air in every frame."""
+    """below: fraction of the scan's largest line integral below which a pixel may be air, if it is connected with a side of
+    the panel. least: least fraction of air in every frame."""
 
     below: float = 0.05
     least: float = 0.01

@@ -29,7 +29,7 @@ from phyradgs_cl.prepare.step import (
 )
 
 Kernel = Mapping[tuple[float, int], float]
-"""{(standard deviation as a share of the panel's longer side, power of the line integral): height}"""
+"""{(standard deviation as a fraction of the panel's longer side, power of the line integral): height}"""
 _POWERS = (1, 2)  # of a ray's line integral
 _REACHES = (0.12, 0.18, 0.27, 0.4)  # of the panel's longer side; narrower ones respond to the gains of columns
 _PASSES = 6  # alternating estimates of scatter and primary light

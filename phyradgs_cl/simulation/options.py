@@ -1,4 +1,4 @@
-"""How to simulate: the options and their ranges, and what a scanner says where they do not."""
+"""Options of a simulation and their ranges, with the scanner's values as defaults."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -13,7 +13,7 @@ from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
 from phyradgs_cl.resources import resource
 
 _NOISES = ("none", "tigre", "beer")
-# Far beyond any scanner, and far from where float32 or a sampler would overflow.
+# Far beyond any scanner, and far below an overflow of float32 or a sampler.
 _LARGEST_PEAK, _LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
 _LARGEST_DETECTOR = 32_000
@@ -23,9 +23,9 @@ _DATA_SHEET = ("first", "fps", "readout_ms")
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """How to simulate. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
+    """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    time_samples: midpoint samples per line in its own exposure; 0: the volume's edge moves at most half a voxel of ``grid``
+    time_samples: midpoint samples in the exposure of a line; with 0 the volume's edge moves at most half a voxel of ``grid``
     between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
     lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/spectrum.py, 0 for a beam of
     one energy.
@@ -65,7 +65,7 @@ class SimulationOptions:
 
 
 OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protocol"}).union(_TIMING, _DATA_SHEET)
-"""What ``scanner_options`` takes."""
+"""The names that ``scanner_options`` takes."""
 
 
 def scanner_for(
@@ -74,8 +74,11 @@ def scanner_for(
     detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0,
 ) -> Scanner:
-    """A scanner by name or TOML file, with another number of columns (rows in proportion) or offset (v, u) of the panel, and
-    without the share ``truncation`` of its columns, half of it at each side."""
+    """Returns a scanner by name or TOML file.
+
+    detector: another number of columns, with rows in proportion. detector_offset_mm: of the panel, (v, u). truncation:
+    fraction of the columns to cut off, half at each side.
+    """
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -86,36 +89,38 @@ def scanner_for(
         geometry = replace(geometry, detector_offset_mm=detector_offset_mm)
     checks.within("--truncation", truncation, 0, 0.95)
     rows, columns = geometry.detector_shape
-    kept = max(1, columns - 2 * round(truncation * columns / 2))
-    return replace(scanner, geometry=replace(geometry, detector_shape=(rows, kept)))
+    remaining = max(1, columns - 2 * round(truncation * columns / 2))
+    return replace(scanner, geometry=replace(geometry, detector_shape=(rows, remaining)))
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Fields of ``SimulationOptions`` and of the named protocol; what is None or missing is the scanner's, then the
-    default. InputError: no such option; a value out of range; words that contradict each other."""
+    """Returns options of a simulation with a named protocol; missing ones and None take the scanner's value or the default.
+
+    Raises InputError for unknown options, values out of range, and values that contradict each other.
+    """
     given = {key: value for key, value in given.items() if value is not None}
     order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
-    usual = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
-    own = {key: getattr(scanner, key) for key in usual}
-    if "readout_ratio" in given or "readout_ms" in given:  # either wins over what the scanner has
-        del own["readout_ratio"], own["readout_ms"]
-    chosen = {**own, **given}
-    chosen.update({key: value for key, value in zip(usual, order, strict=False) if value is not None})
+    keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
+    of_scanner = {key: getattr(scanner, key) for key in keys}
+    if "readout_ratio" in given or "readout_ms" in given:  # either wins over both of the scanner
+        del of_scanner["readout_ratio"], of_scanner["readout_ms"]
+    values = {**of_scanner, **given}
+    values.update({key: value for key, value in zip(keys, order, strict=False) if value is not None})
 
     def named(name: str) -> str:
-        is_scanner_s = name not in given and own.get(name) is not None
+        is_scanner_s = name not in given and of_scanner.get(name) is not None
         return f"{scanner.name} [readout] {name}" if is_scanner_s else _flag(name)
 
-    readout_ratio_of(chosen.get("readout_ms"), chosen.get("readout_ratio"), chosen.get("fps"), None, named)
-    if unknown := sorted(set(chosen) - OPTION_NAMES):
+    readout_ratio_of(values.get("readout_ms"), values.get("readout_ratio"), values.get("fps"), None, named)
+    if unknown := sorted(set(values) - OPTION_NAMES):
         expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
-    timing = {key: chosen.pop(key) for key in _TIMING if key in chosen}
-    sheet = {key: chosen.pop(key, None) for key in _DATA_SHEET}
-    made = make_protocol(protocol, **timing)
+    timing = {key: values.pop(key) for key in _TIMING if key in values}
+    sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
+    timed = make_protocol(protocol, **timing)
     if sheet["fps"] is not None:
-        made = made.at_rate(sheet["fps"], sheet["readout_ms"], named)
-    return SimulationOptions(protocol=made, **chosen)
+        timed = timed.at_rate(sheet["fps"], sheet["readout_ms"], named)
+    return SimulationOptions(protocol=timed, **values)
 
 
 def _flag(name: str) -> str:

@@ -1,4 +1,4 @@
-"""From a source of frames and an acquisition to a scan, each line over its own time window."""
+"""Simulates a scan from a source of frames and an acquisition; each line averages over its own time window."""
 
 import logging
 from collections.abc import Callable
@@ -25,11 +25,10 @@ from phyradgs_cl.io import Scanner, Volume
 from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.options import SimulationOptions
-from phyradgs_cl.simulation.scenes import phantom_scene, volume_scene
-from phyradgs_cl.simulation.sources import FrameSource
+from phyradgs_cl.simulation.scenes import FrameSource, phantom_scene, volume_scene
 
 _LARGEST_GRID = 4096
-_SMALLEST_PHANTOM = 2  # procedural phantoms are drawn on twice as many voxels, of which they need 4
+_SMALLEST_PHANTOM = 2  # procedural phantoms need 4 voxels and are drawn on twice as many
 log = logging.getLogger(__name__)
 
 
@@ -44,10 +43,11 @@ def simulated_scan(
     name: str = "volume",
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
-    """What a scanner records of a phantom, by its name or of one's own, or of a volume, called ``name``; the truth is its
-    reference.
-    size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's. pixel_samples:
-    rays along each side of a pixel. Warns of an inverse crime."""
+    """Returns a scanner's scan of a phantom, given by name or as an object, or of a volume; the truth is its reference.
+
+    name: of the volume. size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's.
+    pixel_samples: rays along each side of a pixel. Warns of an inverse crime.
+    """
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -64,9 +64,9 @@ def simulated_scan(
         bone=scene.bone() if options.kvp and scene.bone is not None else None,
     )  # fmt: skip
     effects = [name for name in ("rings", "sparks", "drift", "scatter", "kvp") if getattr(options, name)]
-    asked = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *effects)}
-    told = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
-    scan.provenance.update(told | asked)
+    stated = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *effects)}
+    facts = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
+    scan.provenance.update(facts | stated)
     return scan
 
 
@@ -81,8 +81,10 @@ def simulate(
     report: Callable[[int, int], None] = lambda done, total: None,
     bone: FrameSource | None = None,
 ) -> Scan:
-    """A scan of whatever ``source`` projects, noise included, with its reference (nz, ny, nx), scaled along by ``peak``.
-    bone: the part of it that is bone, which a beam of many energies (``kvp``) asks for."""
+    """Returns a scan of the object that ``source`` projects, noise included.
+
+    reference (nz, ny, nx): the truth, which ``peak`` scales too. bone: the source of its bone, for a beam of many energies.
+    """
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -137,15 +139,13 @@ def simulate(
 
 
 def default_time_samples(protocol: Protocol, grid: Grid) -> int:
-    """Enough that the edge of the volume moves at most half a voxel from sample to sample (at least 8)."""
+    """Returns samples per line so that the volume's edge moves at most half a voxel from one to the next; at least 8."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))
 
 
-def _recorded(
-    frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """Frames (F, v, u) with scatter, the light of each frame, noise, gains and sparks, as far as they are asked for."""
+def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Adds scatter, drifting light, noise, gains and sparks to frames (F, v, u), as the options say."""
     if options.scatter > 0:
         frames = add_scatter(frames, options.scatter).astype(np.float32)
     if options.drift > 0:
@@ -158,10 +158,8 @@ def _recorded(
     return frames
 
 
-def _with_noise(
-    frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """What the panel shows of frames (F, v, u): TIGRE's counts are no real intensities, so there the lag comes first."""
+def _with_noise(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities, so there the lag comes first."""
     if options.noise == "beer":
         return beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:

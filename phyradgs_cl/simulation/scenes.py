@@ -1,29 +1,93 @@
-"""Scenes: a phantom or a volume on its grid, as a source of frames with the truth beside it."""
+"""Scenes: an object as a source of frames, its grid and the truth. Sources project volumes and phantoms in closed form."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition import ConeGeometry, TimeCells, pixel_centres
+from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume
+from phyradgs_cl.operators import RayProjector
 from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation.sources import AnalyticSource, FrameSource, PixelAreaSource, VolumeSource
 
-_DENSE = 0.5  # of the largest attenuation: from here on a voxel may be bone, in a beam of many energies
-_RARE = 0.2  # of the most common attenuation's voxels: more are one material, which no threshold may divide
+_DENSE = 0.5  # of the largest attenuation: denser voxels may be bone in a beam of many energies
+_RARE = 0.2  # of the most common attenuation's voxels: a more common one is a material that no threshold may divide
 log = logging.getLogger(__name__)
+
+
+class FrameSource(Protocol):
+    """The interface of objects that can be projected to the frame of a cell table, attenuation multiplied by ``factor``."""
+
+    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray: ...
+
+
+class VolumeSource:
+    """Frames of a voxel volume (z, y, x) in 1/mm by the ray-driven projector."""
+
+    def __init__(self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str) -> None:
+        self._projector = RayProjector(rt, grid, geometry.detector_shape, axis)
+        self._volume = volume
+        self._factor: float | None = None
+
+    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
+        if factor != self._factor:
+            self._on_device = self._projector.upload_volume(self._volume * np.float32(factor))
+            self._factor = factor
+        return self._projector.forward(self._on_device, cells, model)
+
+
+class AnalyticSource:
+    """Frames of a phantom with closed-form line integrals, in float64."""
+
+    def __init__(self, phantom: EllipsoidPhantom, geometry: ConeGeometry) -> None:
+        self._phantom, self._geometry = phantom, geometry
+
+    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
+        frame = np.empty(self._geometry.detector_shape)
+        by_row = cells.axis == "rows"
+        for start, stop, members in line_groups(cells):
+            pixels = pixel_centres(cells.pose[members], self._geometry.detector_shape)
+            target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
+            p = factor * self._phantom.line_integrals(cells.pose[members][:, None, None, :3], target)
+            mean = average(p, cells.weight[members], model)
+            frame[(slice(start, stop),) if by_row else (slice(None), slice(start, stop))] = mean
+        return frame.astype(np.float32)
+
+
+class PixelAreaSource:
+    """Frames whose pixels average over their area, from ``samples`` by ``samples`` rays of a finer panel."""
+
+    def __init__(self, finer: FrameSource, samples: int) -> None:
+        self._finer, self._samples = finer, samples
+
+    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
+        n = self._samples
+        fine = self._finer.frame(cells.finer(n), model, factor)
+        rows, columns = fine.shape[0] // n, fine.shape[1] // n
+        rays = fine.reshape(rows, n, columns, n).transpose(1, 3, 0, 2).reshape(n * n, rows, columns)
+        return average(rays, np.full(n * n, 1 / n**2), model).astype(np.float32)
+
+
+def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Yields (first line, line after the last, cells) for every run of lines with the same cells."""
+    ranges = np.stack([cells.line_start, cells.line_stop], -1)
+    for start, stop in np.unique(ranges, axis=0):
+        yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is to be scanned: a source of frames, the grid asked for, and the truth on it (nz, ny, nx). source_shape:
-    voxels (z, y, x) that are projected, where the source is a volume from outside. bone: the dense part of the source."""
+    """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it.
+
+    source_shape: voxels (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part.
+    """
 
     source: FrameSource
     grid: Grid
@@ -33,13 +97,13 @@ class Scene:
     bone: Callable[[], FrameSource] | None = None
 
     def warn_of_inverse_crime(self) -> None:
-        """Says so where the projected voxels are no finer than the grid: reconstructions there look better than they are."""
+        """Warns where the projected voxels are no finer than the grid, which makes reconstructions look too good."""
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
         text = "%s: %s voxels are projected and a grid of %s is to be reconstructed: discretisation errors will not show "
-        told = text + "(inverse crime); take a smaller --size or a finer volume"
-        log.warning(told, self.title, *("×".join(map(str, counts)) for counts in (shape, self.grid.shape)))
+        text += "(inverse crime); take a smaller --size or a finer volume"
+        log.warning(text, self.title, *("×".join(map(str, counts)) for counts in (shape, self.grid.shape)))
 
 
 def phantom_scene(
@@ -52,9 +116,11 @@ def phantom_scene(
     seed: int,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A phantom, one's own or by its name, in the scanner's box, with ``size`` voxels per side. Closed forms are integrated
-    exactly; procedural phantoms are projected at twice ``size``, and the truth is their block mean. Pixels see
-    ``pixel_samples``² rays over their area."""
+    """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
+
+    Closed forms are integrated exactly. Procedural phantoms are projected at twice ``size``, and the truth is their block
+    mean. Pixels average ``pixel_samples``² rays over their area.
+    """
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, EllipsoidPhantom):
@@ -81,8 +147,11 @@ def volume_scene(
     axis: str,
     pixel_samples: int = 1,
 ) -> Scene:
-    """A volume, called ``name``, projected at its own resolution by ``pixel_samples``² rays per pixel. A bare array is
-    fitted into the scanner's box, its values attenuation per half of the longest side; one with a grid keeps it and 1/mm."""
+    """Returns the scene of a volume, called ``name``, at its own resolution with ``pixel_samples``² rays per pixel.
+
+    A volume with a grid keeps it and its unit 1/mm. A bare array is fitted into the scanner's box; its values are
+    attenuation per half of the longest side.
+    """
     volume, fine = loaded.values, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
@@ -96,7 +165,7 @@ def volume_scene(
 def _voxel_sources(
     rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str, pixel_samples: int
 ) -> tuple[FrameSource, Callable[[], FrameSource]]:
-    """Frames of a volume, and, made when they are asked for, of what is bone in it."""
+    """Returns the source of a volume's frames, and a function that makes the source of its bone."""
 
     def of(values: np.ndarray) -> FrameSource:
         return _on_panel(geometry, pixel_samples, lambda panel: VolumeSource(rt, values, grid, panel, axis))
@@ -105,8 +174,10 @@ def _voxel_sources(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """The attenuation from which voxels (z, y, x) are bone: half the largest, or where the material ends that half would
-    divide."""
+    """Returns the attenuation from which voxels (z, y, x) are bone.
+
+    It is half the largest, or the end of the material that this value would divide.
+    """
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
@@ -114,10 +185,10 @@ def bone_from(volume: np.ndarray) -> float:
 
 
 def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Means of a volume (z, y, x) over the voxels of a coarser (or equal) grid of the same box, float32."""
+    """Returns means float32 of a volume (z, y, x) over the voxels of a coarser or equal grid of the same box."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
-    from skimage.transform import resize_local_mean  # slow to import
+    from skimage.transform import resize_local_mean  # imported here because it is slow to import
 
     mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
     return mean.astype(np.float32)
@@ -131,10 +202,8 @@ def _resized(grid: Grid, count: int) -> Grid:
     return Grid((shape[0], shape[1], shape[2]), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
-def _on_panel(
-    geometry: ConeGeometry, pixel_samples: int, make: Callable[[ConeGeometry], FrameSource]
-) -> FrameSource:
-    """What ``make`` gives for the panel, or for a finer one behind the area of its pixels."""
+def _on_panel(geometry: ConeGeometry, pixel_samples: int, make: Callable[[ConeGeometry], FrameSource]) -> FrameSource:
+    """Makes a source for the panel; with several samples per pixel for a finer panel, averaged over its pixels."""
     checks.within("--pixel-samples", pixel_samples, 1, 32)
     if pixel_samples == 1:
         return make(geometry)
