@@ -108,7 +108,7 @@ def may_import(path: Path, name: str) -> bool:
     """Whether ``path`` may import pyopencl or PyTorch, ``name``."""
     if name == "pyopencl":
         return room_of(path) == "runtime"
-    return room_of(path) == "neural" or path == PACKAGE / "api" / "bridges.py"  # operators for PyTorch's users
+    return room_of(path) == "neural"
 
 
 def test_a_module_imports_only_lower_floors() -> None:

@@ -27,10 +27,8 @@ from phyradgs_cl.acquisition import (
     TimeCells,
     Trajectory,
 )
-from phyradgs_cl.api.bridges import as_torch
-from phyradgs_cl.api.calibration import calibrate
-from phyradgs_cl.api.operators import LinearOperator, Operator
-from phyradgs_cl.api.poses import move_views, pose_gradient
+from phyradgs_cl.api.calibration import calibrate, move_views, pose_gradient
+from phyradgs_cl.api.operators import LinearOperator, Operator, as_torch
 from phyradgs_cl.api.projectors import (
     initial_gaussians,
     ray_operator,

@@ -1,16 +1,24 @@
-"""A scan's true geometry and timing, from the scan itself."""
+"""The geometry and timing of a scan, from its frames: calibration, moved views, and the gradient with respect to them."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api.devices import Device, runtime_of
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.api.arrays import Device, runtime_of
+from phyradgs_cl.api.projectors import ray_operator, splat_operator
 from phyradgs_cl.api.runs import check_scan
-from phyradgs_cl.calibrate import Calibration
+from phyradgs_cl.calibrate import Calibration, wobble
 from phyradgs_cl.calibrate import calibrate as run_calibration
+from phyradgs_cl.calibrate.moved import Change, moved
 from phyradgs_cl.errors import InputError, naming_arguments
+from phyradgs_cl.fields import Gaussians
+from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
+
+_STEP_PX = 0.25  # at the image's edge: a smaller step is lost in voxels, a larger one bends at edges
 
 
 @naming_arguments()
@@ -23,21 +31,22 @@ def calibrate(
     splines: int = 0,
     device: Device = None,
 ) -> Calibration:
-    """Geometry and timing as the frames tell them (docs/calibrate.md); what they cannot tell stays as stated.
+    """Estimates geometry and timing from the frames (docs/calibrate.md). Values that frames cannot show stay as stated.
 
-    what: names with commas, ``offset,roll,tilt`` and of a fly-scan ``readout,exposure`` when None; also ``distance``,
-    ``start``, ``direction``, ``lag``, ``drift``, ``motion`` and ``wobble`` (views one by one). others: more scans of the
-    same object, lying as it did, with the same panel: what is wrong in ``scan`` is taken to be wrong in them. phantom: what
-    was scanned, wherever it lies, where that is known: a TOML file of beads and wires (docs/formats.md). splines: of time,
-    at least 4, that a ``wobble`` goes by; 0 for every view by itself. device: what ``--device`` takes, or a Runtime.
+    what: names with commas. None is ``offset,roll,tilt``, and ``readout,exposure`` too of a fly-scan. More names are
+    ``distance``, ``start``, ``direction``, ``lag``, ``drift``, ``motion`` and ``wobble`` (each view separately).
+    others: more scans of the same object in the same place, with the same panel; they share the errors of ``scan``.
+    phantom: a TOML file of beads and wires (docs/formats.md) that describes the scanned object, at any place.
+    splines: number of splines over time, at least 4, that describe a ``wobble``; 0 estimates every view separately.
+    device: what ``--device`` takes, or a Runtime.
 
-    The result has ``scan``, corrected; ``parameters``, each with stated, found and deviation in its unit (mm, deg, s, %),
-    and a verdict: corrected, agrees, cannot tell; ``alike``, combinations that leave no trace; ``residual_rms`` of line
-    integrals before and after; ``before`` and ``after``, those residuals (F, rows, columns) of the coarsened frames;
-    ``per_view()``, what was corrected of every view by name and unit (F,); and ``plot()``, a figure of all that.
+    The result has ``scan``, corrected; ``parameters``, each stated and found with its deviation in its unit (mm, deg, s,
+    %) and a verdict (corrected, agrees, cannot tell); ``alike``, combinations that leave no trace; ``residual_rms`` of
+    line integrals before and after; ``before`` and ``after``, the residuals (F, rows, columns) of the coarsened frames;
+    ``per_view()``, the corrections of every view by name and unit (F,); and ``plot()``, a figure of all that.
 
-    Raises InputError for names that there are not, timing of a gantry that stands still, fewer than 8 frames or 12 columns,
-    others that do not fit the first, and a phantom that the frames do not show.
+    Raises InputError for unknown names, the timing of a gantry that stops, and fewer than 8 frames or 12 columns; also for
+    other scans that do not fit the first, and a phantom that the frames do not show.
     """
     check_scan(scan)
     scan.check_timing()
@@ -49,3 +58,57 @@ def calibrate(
         check_scan(other, "others")
     shape = None if phantom is None else load_beads(Path(phantom))
     return run_calibration(scan, runtime_of(device), what, others, phantom=shape, splines=splines)
+
+
+@naming_arguments()
+def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -> Scan:
+    """Returns the scan with other poses of its views and the same frames.
+
+    views: (F, 3), for each view the gantry's turn about the axis in rad, counterclockwise seen from above, and the panel's
+    shifts along its columns and its rows in mm; they hold for all times of a view. without_gauges: leave out the part of
+    ``views`` that a turned or shifted object explains as well (docs/calibrate.md). A file has one pose at a time: where
+    frames overlap in time, ``save_scan`` refuses the result.
+
+    Raises InputError for anything but a Scan, and for other shapes.
+    """
+    check_scan(scan)
+    checks.numbers("views", views, (scan.frames, 3))
+    numbers = np.asarray(views, np.float64)
+    return moved(scan, Change(), wobble.views_of(wobble.without_gauges(scan, numbers) if without_gauges else numbers))
+
+
+@naming_arguments()
+def pose_gradient(
+    scan: Scan,
+    x: Gaussians | np.ndarray,
+    by_frames: np.ndarray,
+    motion: str | Motion | None = None,
+    *,
+    device: Device = None,
+) -> np.ndarray:
+    """Returns dL/dviews (F, 3) float64 for ``move_views``, per rad and mm, from dL/dframes (F, rows, columns).
+
+    x: the object. ``Gaussians`` use the chain rule through the poses of every line; a volume (nz, ny, nx) in 1/mm on the
+    scan's grid uses central differences of a quarter of a pixel. by_frames: for half the squared misfit, the frames of x
+    less those of the scan; line integrals are averaged, whatever the detector. motion: that of ``splat_operator`` or
+    ``ray_operator``, with their defaults. device: what ``--device`` takes, or a Runtime. After Choi et al. 2026.
+
+    Raises InputError as the operators do.
+    """
+    check_scan(scan)
+    pitch_mm = np.array(scan.geometry.pixel_size_mm)
+    checks.numbers("by_frames", by_frames, scan.projections.shape)
+    if isinstance(x, Gaussians):
+        in_pixels = splat_operator(scan, motion or "exact", device=device).by_poses(x, by_frames)
+        return in_pixels / np.array([1.0, *pitch_mm])
+    if np.shape(x)[:1] == (ROWS,) and np.ndim(x) == 2:
+        raise InputError("x", f"shape {np.shape(x)}", "Gaussians or a volume", "of rows (11, G): Gaussians.from_rows(rows)")
+    checks.numbers("x", x, scan.grid.shape)
+    gradient, units = np.zeros((scan.frames, 3)), wobble.units_of(scan) * _STEP_PX
+    for kind, unit in enumerate(units):
+        for sign in (1, -1):
+            step = np.zeros((scan.frames, 3))
+            step[:, kind] = sign * unit
+            frames = ray_operator(move_views(scan, step), motion or "per-row", device=device)(x)
+            gradient[:, kind] += sign / (2 * unit) * np.einsum("fvu,fvu->f", frames, by_frames, dtype=np.float64)
+    return gradient

@@ -1,4 +1,4 @@
-"""One interface for everything that projects: values, transposes, frames, and what SciPy asks for."""
+"""One interface for everything that projects: values, transposes, frames, SciPy and PyTorch."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -8,27 +8,29 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator as ScipyOperator
 
 from phyradgs_cl import checks
-from phyradgs_cl.api.arrays import Values, entered, given_back, on_host
+from phyradgs_cl.api.arrays import Values, on_host, to_operator_array, to_user_array
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
 Map = Callable[[Any], Any]
-"""From values to values of the same place."""
+"""A function of values; its result is on the host or the device like its argument."""
 Shape = tuple[int | None, ...]
 
 
 class Operator:
     """A differentiable map between arrays of two shapes, on a device: ``y = A(x)``, and ``A.T(y)``.
 
-    domain_shape, range_shape: shapes of x and y; None stands for any length. ``A.T`` is the transpose of the derivative
-    at the x of the last call. Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays; pyopencl Arrays
-    (float32, C order, on ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its
-    transpose and its frames share their memory on the device: use them one at a time. ``A.frames([3, 7])`` are some of
-    its frames, ``A.intensity`` is the same for a detector that averages photons.
+    domain_shape, range_shape: shapes of x and y; None is any length. ``A.T`` is the transpose of the derivative at the x
+    of the last call. ``A.frames([3, 7])`` is the operator of some frames; ``A.intensity`` is the operator of a detector
+    that averages photons.
 
-    Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. One of your own has a Runtime rt, domain
-    and range_ as (name, shape), at: x to (y, function from dL/dy to dL/dx), and, if it has them, what makes the operators
-    of some frames and of intensity.
+    Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays. pyopencl Arrays (float32, C order, on
+    ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its transpose and its frames
+    share their memory on the device: use one at a time.
+
+    Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. To write another one: rt is its
+    Runtime; domain and range_ are (name, shape); at maps x to (y, the function from dL/dy to dL/dx); frames and intensity
+    make the operators of some frames and of averaged photons, where they exist.
 
     Raises InputError, before anything is computed, for arrays of another shape, type or device.
     """
@@ -62,41 +64,45 @@ class Operator:
 
     @property
     def queue(self) -> Any:
-        """The pyopencl.CommandQueue (in order) on which Arrays have to be."""
+        """The pyopencl.CommandQueue (in order) of the Arrays that the operator takes."""
         return self.rt.queue
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(size of y, size of x), which SciPy asks for, of a ``LinearOperator``; of any other an InputError that says so."""
+        """(size of y, size of x) of a ``LinearOperator``, for SciPy; InputError for any other operator."""
         raise self._not_linear()
 
     def __matmul__(self, x: Any) -> Any:
         raise self._not_linear()
 
     def _not_linear(self) -> InputError:
-        return InputError(repr(self), "what is not linear in x", "a LinearOperator", self._instead)
+        return InputError(repr(self), "an operator that is not linear in x", "a LinearOperator", self._instead)
 
     def to_device(self, values: Any) -> Any:
-        """An x or a y, or a stack of them, as a pyopencl Array, float32, on ``queue``: what loops on the device begin with.
+        """Returns an x or a y, or a stack of them, as a pyopencl Array, float32, on ``queue``: the start of a loop there.
 
-        Raises InputError for what is no array of real numbers, and one whose last axes are those of neither side.
+        Raises InputError for anything but an array of real numbers, and for last axes that are neither those of x nor of y.
         """
         array = on_host("values", values)
         sides = self.domain_shape, self.range_shape
         if not any(_ends_with(array.shape, side) for side in sides):
             expected = " or ".join(_text(side) for side in sides)
             raise InputError("values", f"shape {array.shape}", f"{expected}, or a stack of such")
-        return given_back(self.rt, self.rt.upload(array))
+        return to_user_array(self.rt, self.rt.upload(array))
 
     def __call__(self, x: Any) -> Any:
-        """y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
+        """Returns y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
         y, self._back = self._value(x)
-        return given_back(self.rt, y)
+        return to_user_array(self.rt, y)
 
     def vjp(self, x: Any) -> tuple[Any, Callable[[Any], Any]]:
-        """A(x), and the function from dL/dy to dL/dx at this x, whatever else is called in between."""
+        """Returns A(x), and the function from dL/dy to dL/dx at this x, which later calls do not change."""
         y, back = self._value(x)
-        return given_back(self.rt, y), lambda by_y: given_back(self.rt, back(self._entered(self._range, by_y)))
+
+        def by_x(by_y: Any) -> Any:
+            return to_user_array(self.rt, back(self._to_array(self._range, by_y)))
+
+        return to_user_array(self.rt, y), by_x
 
     @property
     def T(self) -> "Operator":  # noqa: N802
@@ -104,55 +110,54 @@ class Operator:
         return Operator(self.rt, self._range, self._domain, self._at_last)
 
     def frames(self, chosen: Sequence[int]) -> Any:
-        """The operator of some of the frames, by their numbers from 0 and in this order; shares all memory.
+        """Returns the operator of some of the frames, by their numbers from 0 and in this order; it shares all memory.
 
-        Raises InputError for a number that there is not, or none, or an operator without frames.
+        Raises InputError for numbers of missing frames, for no number, and for an operator without frames.
         """
         if self._frames is None:
             raise InputError("frames", repr(self), "an operator from something to frames")
-        count = self._range[1][0]
-        numbers = list(chosen) if isinstance(chosen, Sequence | np.ndarray) else chosen
-        known = isinstance(numbers, list) and all(
-            isinstance(f, int | np.integer) and not isinstance(f, bool) and 0 <= f < (count or 0) for f in numbers
-        )
-        if not known or not numbers:
-            raise InputError("frames", checks.shown(numbers), f"at least one whole number from 0 to {(count or 0) - 1}")
+        count = self._range[1][0] or 0
+        numbers = list(chosen) if isinstance(chosen, Sequence | np.ndarray) else []
+        if not numbers or not all(_is_index(number, count) for number in numbers):
+            raise InputError("frames", checks.shown(chosen), f"at least one whole number from 0 to {count - 1}")
         return self._frames([int(f) for f in numbers])
 
     @cached_property
     def intensity(self) -> "Operator":
-        """The same under a detector that averages photons over an exposure: −ln Σ w exp(−p) of a line's times, not Σ w p.
+        """The operator of a detector that averages photons over an exposure: −ln Σ w exp(−p) over a line's times.
 
-        Its transpose is that of the derivative at its last x. InputError where it is not known (transposes, voxels).
+        Without it a line is Σ w p. ``T`` of the result is the transpose of the derivative at its last x. Raises InputError
+        where it does not exist (transposes, voxels).
         """
         if self._intensity is None:
             raise InputError("intensity", repr(self), "an operator from something to line integrals")
         return self._intensity()
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({_shown(self._domain)} to {_shown(self._range)} on {self.rt.device.name})"
+        domain, range_ = (f"{name} {_text(shape)}" for name, shape in (self._domain, self._range))
+        return f"{type(self).__name__}({domain} to {range_} on {self.rt.device.name})"
 
     def _value(self, x: Any) -> tuple[Values, Map]:
-        return self._at(self._entered(self._domain, x))
+        return self._at(self._to_array(self._domain, x))
 
-    def _entered(self, side: tuple[str, Shape], values: Any) -> Values:
-        return entered(self.rt, side[0], values, side[1])
+    def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
+        return to_operator_array(self.rt, side[0], values, side[1])
 
     def _at_last(self, y: Values) -> tuple[Values, Map]:
         if self._back is None:
             remedy = "call the operator first: its derivative is taken at the last x"
-            raise InputError("T", "no x yet", "the transpose of a derivative somewhere", remedy)
+            raise InputError("T", "no x yet", "the transpose of a derivative at some x", remedy)
         return self._back(y), _no_derivative
 
 
 class LinearOperator(Operator, ScipyOperator):
-    """An ``Operator`` that is linear, and so a scipy.sparse.linalg.LinearOperator, too.
+    """An ``Operator`` that is linear, and therefore a scipy.sparse.linalg.LinearOperator too.
 
-    ``A.T`` is the exact transpose, at any time. For SciPy, ``A.shape`` is (size of y, size of x), vectors are flat, float32,
-    C order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
+    ``A.T`` is the exact transpose, at any time. For SciPy, ``A.shape`` is (size of y, size of x), and vectors are flat,
+    float32, in C order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
 
-    rt, domain, range_, parts: as of ``Operator``; forward and adjoint: the two functions, from values to values. Raises
-    InputError as it does.
+    rt, domain, range_, parts: those of ``Operator``. forward, adjoint: the two functions of values. Raises InputError as
+    ``Operator`` does.
     """
 
     def __init__(
@@ -168,7 +173,7 @@ class LinearOperator(Operator, ScipyOperator):
         ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
         self._pair = forward, adjoint
 
-    shape = (0, 0)  # SciPy's, one for every operator
+    shape = (0, 0)  # SciPy's, which every operator sets
     __matmul__ = ScipyOperator.__matmul__
 
     @property
@@ -188,13 +193,63 @@ class LinearOperator(Operator, ScipyOperator):
     _adjoint = _transpose  # of real numbers
 
 
+def as_torch(operator: Operator) -> Callable[..., Any]:
+    """Returns the operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])``.
+
+    x (domain_shape) may be on any device and of any floating type; y (range_shape) is like it. The work is done in float32
+    on the operator's device; float32 tensors on the host are not copied, by DLPack. Linear operators can be differentiated
+    any number of times, others once, and ``backward`` renders nothing again.
+
+    Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does.
+    """
+    torch: Any = checks.package("torch", "for as_torch", "torch")
+    if not isinstance(operator, Operator):
+        expected = "what ray_operator, splat_operator or voxel_operator gives"
+        raise InputError("operator", type(operator).__name__, expected)
+
+    def array(tensor: Any) -> np.ndarray:  # DLPack works with any pair of versions of torch and numpy
+        return np.from_dlpack(tensor.detach().to("cpu", torch.float32).contiguous())
+
+    def tensor(values: np.ndarray, like: Any) -> Any:
+        return torch.from_dlpack(values).to(like.device, like.dtype)
+
+    class Linear(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, x: Any, of: LinearOperator) -> Any:
+            ctx.of = of
+            return tensor(of(array(x)), x)
+
+        @staticmethod
+        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
+            return Linear.apply(by_y, ctx.of.T), None
+
+    class Curved(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, x: Any, of: Operator) -> Any:
+            y, ctx.back = of.vjp(array(x))
+            return tensor(y, x)
+
+        @staticmethod
+        @torch.autograd.function.once_differentiable
+        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
+            return tensor(ctx.back(array(by_y)), by_y), None
+
+    def function(x: Any, frames: Sequence[int] | None = None) -> Any:
+        if not isinstance(x, torch.Tensor):
+            raise InputError("x", checks.shown(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
+        of = operator if frames is None else operator.frames(frames)
+        return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
+
+    return function
+
+
+def _is_index(number: object, count: int) -> bool:
+    is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+    return is_whole and 0 <= number < count  # type: ignore[operator]
+
+
 def _no_derivative(_: Values) -> Values:
-    raise InputError("T", "a transpose's derivative", "that of the operator itself")
-
-
-def _shown(side: tuple[str, Shape]) -> str:
-    name, shape = side
-    return f"{name} {_text(shape)}"
+    raise InputError("T", "the derivative of a transpose", "that of the operator itself")
 
 
 def _text(shape: Shape) -> str:
@@ -203,7 +258,7 @@ def _text(shape: Shape) -> str:
 
 def _ends_with(shape: tuple[int, ...], side: Shape) -> bool:
     last = shape[len(shape) - len(side) :]
-    return len(shape) >= len(side) and all(n in (None, found) for n, found in zip(side, last, strict=True))
+    return len(shape) >= len(side) and all(n in (None, size) for n, size in zip(side, last, strict=True))
 
 
 def _size(side: tuple[str, Shape]) -> int:

@@ -1,4 +1,4 @@
-"""Operators of whole scans: voxels or Gaussians to frames, and Gaussians to voxels."""
+"""Operators of whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -17,8 +17,7 @@ from phyradgs_cl.acquisition.motion import (
     motion_of,
     motions_for,
 )
-from phyradgs_cl.api.arrays import Values, computed, placed
-from phyradgs_cl.api.devices import Device, runtime_of
+from phyradgs_cl.api.arrays import Device, Values, computed, moved_to, runtime_of
 from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.errors import InputError, naming_arguments
@@ -46,13 +45,13 @@ _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 def ray_operator(
     scan: Scan, motion: str | Motion = "per-row", *, grid: Grid | None = None, device: Device = None
 ) -> LinearOperator:
-    """Joseph's projector of a scan and its exact transpose: volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns).
+    """Returns Joseph's projector of a scan: volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns), and its transpose.
 
-    motion: how frames see the moving gantry (docs/methods.md, but ``exact``), or a model of your own. grid: the voxels,
-    the scan's own when None. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors
-    that average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
+    motion: the motion model of docs/methods.md, any except ``exact``, or an object of your class. grid: the voxels; None
+    is the scan's grid. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors that
+    average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
-    Raises InputError for what is no Scan or Grid, and for a motion that there is not or that moves within a cell.
+    Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell.
     """
     model, voxels = _checked(scan, motion, motions_for(RAYS)), scan.grid if grid is None else _a_grid(grid)
     rt = runtime_of(device)
@@ -76,17 +75,20 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        here, there = copy(engine), isinstance(volume, DeviceArray)  # a copy, whose derivative stays at this volume
-        return _own(rt, here.expected, volume, engine.frames_shape), partial(
-            computed, rt, there, lambda frames: _own(rt, here.adjoint, frames, engine.volume_shape)
-        )
+        here, on_device = copy(engine), isinstance(volume, DeviceArray)  # the copy's derivative stays at this volume
+
+        def adjoint(frames: Values) -> Values:
+            return _in_new_memory(rt, here.adjoint, frames, engine.volume_shape)
+
+        expected = _in_new_memory(rt, here.expected, volume, engine.frames_shape)
+        return expected, partial(computed, rt, on_device, adjoint)
 
     domain, frames = (_VOLUME, engine.volume_shape), (_FRAMES, engine.frames_shape)
     return Operator(rt, domain, frames, at, frames=lambda chosen: _intensities(rt, engine.subset(chosen)))
 
 
-def _own(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """``function(values)`` in its own memory: the engine's is used again when its arrays, if not their views, are gone."""
+def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
+    """Returns ``function(values)`` in a new array: the engine reuses its memory while views of it may exist."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
@@ -100,14 +102,14 @@ def splat_operator(
     pixel_footprint: bool = False,
     device: Device = None,
 ) -> "SplatProjection":
-    """The paper's projector Φ of a scan: ``Gaussians``, or their parameter rows (11, G), to frames (F, rows, columns).
+    """Returns the projector Φ of PhyRadGS (Eq. 3): ``Gaussians`` or parameter rows (11, G) to frames (F, rows, columns).
 
-    Rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: any model of
-    docs/methods.md that splats have. affine: R2-Gaussian's approximation. cutoff_sigma: Mahalanobis radius where a
-    Gaussian ends, 0 never. pixel_footprint: pixels average over their area. device: what ``--device`` takes, or a
-    Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames. PhyRadGS, Eq. 3.
+    The rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: a model of
+    docs/methods.md that splats support. affine: use R2-Gaussian's approximation. cutoff_sigma: the Mahalanobis radius at
+    which a Gaussian ends; 0 never cuts. pixel_footprint: average over the area of a pixel. device: what ``--device``
+    takes, or a Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames.
 
-    Raises InputError for what is no Scan, for a motion that there is not, and a cutoff out of range.
+    Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range.
     """
     model = _checked(scan, motion, motions_for(RAYS, SPLATS))
     if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
@@ -134,35 +136,35 @@ def splat_operator(
 
 
 class GaussianOperator(Operator):
-    """An ``Operator`` whose x are Gaussians, or their parameter rows (11, G)."""
+    """An ``Operator`` on Gaussians, or on their parameter rows (11, G)."""
 
     def __init__(self, engine: SplatOperator | VoxelOperator, range_: tuple[str, Shape], **parts: Any) -> None:
         self._engine = engine
-        super().__init__(engine.rt, (_ROWS, (ROWS, None)), range_, self._seen, **parts)
+        super().__init__(engine.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
 
-    def _seen(self, rows: Values) -> tuple[Values, Map]:
+    def _at_rows(self, rows: Values) -> tuple[Values, Map]:
         rt, engine = self.rt, self._engine
-        point = engine.rows.enter(placed(rt, rows, True))
-        y = placed(rt, engine.forward(point), isinstance(rows, DeviceArray))
+        point = engine.rows.enter(moved_to(rt, rows, True))
+        y = moved_to(rt, engine.forward(point), isinstance(rows, DeviceArray))
         return y, partial(computed, rt, True, partial(engine.back, point))
 
-    def _entered(self, side: tuple[str, Shape], values: Any) -> Values:
+    def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
         given = values.rows() if isinstance(values, Gaussians) else values
-        array = super()._entered(side, given)
+        array = super()._to_array(side, given)
         if isinstance(array, np.ndarray) and side is self._domain:
             _check_rows(array)
         return array
 
 
 class SplatProjection(GaussianOperator):
-    """What ``splat_operator`` gives: an ``Operator`` from Gaussians to frames."""
+    """The ``Operator`` from Gaussians to frames that ``splat_operator`` returns."""
 
     _instead = f"of_densities(gaussians) is linear in densities; {Operator._instead}"
 
     def __init__(
         self, engine: SplatOperator, chosen: Sequence[int], intensity: Callable[[Sequence[int]], SplatOperator] | None
     ) -> None:
-        """Of the ``chosen`` frames of a scan; ``intensity`` makes the engine that averages photons in such frames."""
+        """Takes an engine for the ``chosen`` frames; ``intensity`` makes one that averages photons in given frames."""
         self._splats = engine
         super().__init__(
             engine,
@@ -172,19 +174,19 @@ class SplatProjection(GaussianOperator):
         )
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
-        """dL/d(turn in rad, shifts along columns and rows in pixels) of each frame, (F, 3) float64, from dL/dframes."""
+        """Returns dL/d(turn in rad, shifts along columns and rows in pixels) of each frame, (F, 3), from dL/dframes."""
         rt, engine = self.rt, self._splats
         if engine.is_layered:
             raise InputError("by_poses", "averages of intensity", "averages of line integrals")
-        point = engine.rows.enter(placed(rt, self._entered(self._domain, gaussians), True))
-        return engine.by_poses(point, placed(rt, self._entered(self._range, by_frames), True))
+        point = engine.rows.enter(moved_to(rt, self._to_array(self._domain, gaussians), True))
+        return engine.by_poses(point, moved_to(rt, self._to_array(self._range, by_frames), True))
 
     def of_densities(self, gaussians: Gaussians) -> LinearOperator:
-        """The part that is linear: densities (G,) in 1/mm of this cloud to frames; not under ``intensity``."""
-        rt, engine, rows = self.rt, self._splats, self._entered(self._domain, gaussians)
+        """Returns the operator from the densities (G,) in 1/mm of this cloud to frames; InputError under ``intensity``."""
+        rt, engine, rows = self.rt, self._splats, self._to_array(self._domain, gaussians)
         if engine.is_layered:
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
-        linear = DensityOperator(engine, engine.rows.enter(placed(rt, rows, True)))
+        linear = DensityOperator(engine, engine.rows.enter(moved_to(rt, rows, True)))
         return _densities(rt, linear, rows.shape[1], engine.frames_shape)
 
 
@@ -205,11 +207,12 @@ def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: S
 
 @naming_arguments()
 def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
-    """Gaussians, or parameter rows (11, G) as ``splat_operator`` takes them, to a volume (nz, ny, nx) in 1/mm on ``grid``.
+    """Returns the operator from Gaussians, or parameter rows (11, G), to their volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    The field is evaluated at the voxels' centres in mm, and the device holds all of them. cutoff_sigma, device: as there.
+    The field is evaluated at the voxels' centres in mm, and the device holds the whole volume. cutoff_sigma, device: those
+    of ``splat_operator``.
 
-    Raises InputError for what is no Grid, and a cutoff out of range.
+    Raises InputError for anything but a Grid, and for a cutoff out of range.
     """
     _check_cutoff(cutoff_sigma)
     engine = VoxelOperator(runtime_of(device), _a_grid(grid), cutoff_sigma=cutoff_sigma)
@@ -220,15 +223,16 @@ def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, de
 def voxelise(
     gaussians: Gaussians, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None
 ) -> np.ndarray:
-    """The field of a cloud at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
+    """Returns the field of a cloud at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
 
-    gaussians: in mm and 1/mm. grid: of any size, the device holds a brick at a time; ``voxel_operator`` has the gradient.
-    cutoff_sigma: Mahalanobis radius where a Gaussian ends, 0 never. device: what ``--device`` takes, or a Runtime.
+    gaussians: in mm and 1/mm. grid: of any size, since the device holds one brick at a time. cutoff_sigma: the Mahalanobis
+    radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. ``voxel_operator`` also
+    has the gradient.
 
-    Raises InputError for what is no cloud or Grid, and a cutoff out of range.
+    Raises InputError for anything but a cloud and a Grid, and for a cutoff out of range.
     """
     _check_cutoff(cutoff_sigma)
-    length_mm = _a_grid(grid).half_longest_mm  # the kernels' float32 likes lengths of order 1
+    length_mm = _a_grid(grid).half_longest_mm  # float32 kernels are most accurate for lengths near 1
     if not isinstance(gaussians, Gaussians):
         raise InputError("gaussians", type(gaussians).__name__, "Gaussians", "of rows (11, G): Gaussians.from_rows(rows)")
     rows = gaussians.scaled(1 / length_mm, 1.0).rows()
@@ -237,12 +241,12 @@ def voxelise(
 
 @naming_arguments()
 def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Device = None) -> Gaussians:
-    """The cloud in mm and 1/mm with which ``phyradgs`` begins: ``count`` Gaussians drawn from an FDK volume.
+    """Returns the cloud in mm and 1/mm from which ``phyradgs`` starts: Gaussians drawn from an FDK volume.
 
-    count: 0 chooses it from the scan's grid; fewer come back where too few voxels attenuate. seed: of the draw. The
-    result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
+    count: their number; 0 derives it from the scan's grid, and there are fewer where too few voxels attenuate. seed: of
+    the draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
 
-    Raises InputError for what is no Scan, and a count or a seed below 0.
+    Raises InputError for anything but a Scan, and for a count or a seed below 0.
     """
     check_scan(scan)
     checks.whole("count (0 chooses it from the grid)", count, 0, 100_000_000)
@@ -254,7 +258,7 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
 
 
 def _checked(scan: Scan, motion: str | Motion, taken: tuple[Motion, ...]) -> Motion:
-    """The model of a motion that fits the scan."""
+    """Returns the model of a motion, checked against the scan."""
     check_scan(scan)
     model = motion_of(motion)
     check_motion(model, taken)
@@ -273,7 +277,7 @@ def _check_cutoff(cutoff_sigma: float) -> None:
 
 
 def _check_rows(rows: np.ndarray) -> None:
-    """What would become NaN without a word."""
+    """Raises InputError for rows whose rendering would be NaN."""
     checks.finite(_ROWS, rows)
     if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
         raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")

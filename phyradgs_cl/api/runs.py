@@ -1,4 +1,4 @@
-"""Scans and volumes: read, written, simulated, reconstructed."""
+"""Scans and volumes: reading, writing, simulating, preparing, reconstructing."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api.devices import Device, runtime_of
+from phyradgs_cl.api.arrays import Device, runtime_of
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Grid
@@ -40,31 +40,32 @@ from phyradgs_cl.text import near_miss
 
 @naming_arguments()
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
-    """A scan file (docs/formats.md) as a ``Scan``: line integrals (F, rows, columns), lengths in mm, times in s.
+    """Reads a scan file (docs/formats.md): line integrals (F, rows, columns), lengths in mm, times in s.
 
-    path: the HDF5 file. flats: their ``mean``, or by ``time`` or ``pca`` (docs/prepare.md). Raises InputError, which names
-    what is wrong by its HDF5 path.
+    path: the HDF5 file. flats: how flat fields correct a frame, by their ``mean``, by ``time`` or by ``pca``
+    (docs/prepare.md). Raises InputError, which names the HDF5 path of the wrong value.
     """
     scan = read_scan(_checked_path(path), flat_correction(flats))
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
 
 def save_scan(path: str | Path, scan: Scan) -> None:
-    """Writes a scan file, whole or not at all: line integrals (F, rows, columns), lengths in mm, times in s.
+    """Writes a complete scan file, or nothing: line integrals (F, rows, columns), lengths in mm, times in s.
 
-    path: the HDF5 file; one that exists is replaced. scan: a trajectory of your own is sampled into a table of poses.
-    Raises InputError for what is no scan, or one that the format cannot express, OutputError where nothing can be written.
+    path: the HDF5 file; an existing one is replaced. scan: a trajectory of a class of yours is sampled into a table of
+    poses. Raises InputError for anything but a Scan, and for a scan that the format cannot express; OutputError where
+    nothing can be written.
     """
     check_scan(scan)
     write_scan(_checked_path(path), scan)
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """A volume file: volume (nz, ny, nx) in 1/mm, its grid, Gaussians, record, facts, a disagreement (nz, ny, nx) in 1/mm
-    where there is one and, of an interrupted run, its state.
+    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, disagreement (nz, ny, nx), state.
 
-    path: the HDF5 file, or one of ``phyradgs export`` (docs/export.md) with a grid, which has no more than that. Raises
-    InputError, which names what is wrong by its HDF5 path.
+    A disagreement is in 1/mm, where the method has one; only an interrupted run has a state.
+    path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only. Raises
+    InputError, which names the HDF5 path of the wrong value.
     """
     file = _checked_path(path)
     if foreign_volume(file) is not None:
@@ -83,12 +84,13 @@ def load_volume(path: str | Path) -> Reconstruction:
 def save_volume(
     path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None
 ) -> None:
-    """Writes a volume file, whole or not at all: volume (nz, ny, nx) in 1/mm, lengths in mm.
+    """Writes a complete volume file, or nothing: volume (nz, ny, nx) in 1/mm, lengths in mm.
 
-    path: the HDF5 file; one that exists is replaced. Under a suffix of ``phyradgs export`` (.nii, .mha, .nrrd, .tif, .npy;
-    .ply and .npz of the Gaussians) that format is written, which holds nothing else. result: what to write; the partial one
-    of an interrupted run keeps how it goes on. metrics: as from ``compare``, kept with it.
-    Raises InputError for what is no result, or a suffix of what cannot be written, OutputError where nothing can be written.
+    path: the HDF5 file; an existing one is replaced. A suffix of ``phyradgs export`` (.nii, .mha, .nrrd, .tif, .npy; .ply
+    and .npz of the Gaussians) writes that format, which holds the volume or the Gaussians only. result: what
+    ``reconstruct`` returns; the file of an interrupted run can be resumed. metrics: the result of ``compare``, stored too.
+    Raises InputError for anything but a result, and for a suffix that cannot be written; OutputError where nothing can be
+    written.
     """
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
@@ -121,17 +123,17 @@ def simulate(
     device: Device = None,
     **options: Any,
 ) -> Scan:
-    """A fly-scan (or, with ``protocol="static"``, a stop-and-shoot scan) of a phantom, with its truth as reference.
+    """Simulates a fly-scan of a phantom, or a stop-and-shoot scan with ``protocol="static"``; its truth is the reference.
 
-    phantom: a name, or the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm, or of a .toml of beads and wires.
+    phantom: a name, the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
-    size: voxels along the longest side of grid and reference. detector: columns, rows in proportion.
-    detector_offset_mm: of the panel's centre (v, u). truncation: share of the columns cut off, half at each side.
-    pixel_samples: rays along each side of a pixel. device: what ``--device`` takes, or a Runtime.
-    options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
+    size: number of voxels along the longest side of grid and reference. detector: number of columns; rows in proportion.
+    detector_offset_mm: position of the panel's centre (v, u). truncation: the fraction of the columns that is cut off, half
+    of it at each side. pixel_samples: number of rays along each side of a pixel. device: what ``--device`` takes, or a
+    Runtime. options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
     readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
-    Raises InputError for what there is not, or what is out of range.
+    Raises InputError for unknown names and for values out of range.
     """
     if not isinstance(phantom, str | Path):
         raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
@@ -155,12 +157,12 @@ def simulate(
 
 @naming_arguments()
 def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **options: Any) -> Scan:
-    """The scan without what the panel and the beam did to it, by the steps of docs/prepare.md, names with commas between.
+    """Corrects a scan's line integrals (F, rows, columns), dimensionless, for effects of the panel and the beam.
 
-    Line integrals (F, rows, columns), dimensionless, go in and come out. device: what ``--device`` takes, or a Runtime.
-    options: tables of the steps' own (``rings={"window": 11}``), and what else comes before every method. What each step did
-    stands in the scan's provenance, under ``prepared``. Raises InputError for what is no step or option, or a scan that does
-    not show what a step looks for.
+    steps: the steps of docs/prepare.md, names with commas. device: what ``--device`` takes, or a Runtime. options: tables
+    of options of a step (``rings={"window": 11}``), and the other options of preprocessing. The scan's provenance lists the
+    facts of each step under ``prepared``. Raises InputError for an unknown step or option, and for a scan that does not
+    show what a step looks for.
     """
     check_scan(scan)
     before = preprocessing_of({"steps": steps, **options})
@@ -183,29 +185,31 @@ def reconstruct(
     device: Device = None,
     **options: Any,
 ) -> Reconstruction:
-    """The volume (nz, ny, nx) of a scan in 1/mm, by any method of docs/methods.md, and of splats the Gaussians in mm.
+    """Reconstructs the volume (nz, ny, nx) of a scan in 1/mm, and with splats the Gaussians in mm.
 
-    method: a name, "package.module:name" or a function ``(scan, options, rt, ...)`` of your own (docs/api.md).
-    options: the method's own by name; ``motion``, ``strips``, ``sub_intervals`` and so on choose the motion model, nested
-    ones are dicts (``control={"every": 50}``). preset: where they start from.
-    grid: its voxels, in place of the scan's; or ``size``, ``voxel_mm`` and ``roi_mm`` say what is to be different, and
-    ``margin_mm`` how much beyond is filled and not kept (docs/methods.md#the-grid). holdout: percent of the pixels that the
-    method does not see; how far the volume is from them stands in the result's facts
-    (docs/methods.md#quality-without-a-truth). tune: "NAME", or "NAME=VALUE,VALUE,VALUE", of an option that trials on this
-    scan choose, and what they found is in the facts (docs/methods.md#weights-from-the-data).
-    seed: of what is drawn at random; the same seed on the same device gives the same bits.
-    report: a function that is called with every ``Progress``, of voxels each iteration, of splats every 50 and where ten
-    seconds went by; True: a line with rate and time left, on a terminal or in a
-    notebook; False: nothing. A function that raises KeyboardInterrupt ends the run as Ctrl-C does.
-    resume: the partial result of an interrupted run of the same scan, options, seed and first volume, to go on from.
-    initial: a volume from which an iterative or splatting method starts: a result, resampled where its grid is another, or
-    an array (nz, ny, nx) in 1/mm on the scan's grid.
-    on_interrupt: what Ctrl-C or a notebook's stop button does once the iteration under way is done: "raise" a
-    KeyboardInterrupt whose attribute ``partial`` is the result so far, or None; "return" that result.
+    method: a name of docs/methods.md, "package.module:name", or a function ``(scan, options, rt, ...)`` of yours
+    (docs/api.md). options: the options of the method by name. ``motion``, ``strips``, ``sub_intervals`` and so on choose the
+    motion model; nested options are dicts (``control={"every": 50}``). preset: the values from which they start.
+
+    grid: the voxels, in place of the scan's. Or ``size``, ``voxel_mm`` and ``roi_mm`` change parts of the scan's grid, and
+    ``margin_mm`` adds a margin that is filled and discarded (docs/methods.md#the-grid).
+    holdout: percentage of the pixels that the method does not see; the facts of the result have the error there
+    (docs/methods.md#quality-without-a-truth). tune: "NAME" or "NAME=VALUE,VALUE,VALUE" of an option that trials on this scan
+    choose; the facts have the trials (docs/methods.md#weights-from-the-data).
+    seed: of all random numbers; the same seed on the same device gives the same bits.
+
+    report: a function that gets every ``Progress``: every iteration of voxels, and every 50 iterations or ten seconds of
+    splats. True: a line with rate and remaining time, in a terminal or a notebook. False: nothing. A function that raises
+    KeyboardInterrupt ends the run like Ctrl-C.
+    resume: the partial result of an interrupted run of the same scan, options, seed and first volume.
+    initial: the volume from which an iterative or splatting method starts: a result, resampled to this grid, or an array
+    (nz, ny, nx) in 1/mm on the scan's grid.
+    on_interrupt: what Ctrl-C or a notebook's stop button does after the present iteration: "raise" a KeyboardInterrupt
+    whose attribute ``partial`` is the result so far, or None; "return" that result.
     device: what ``--device`` takes, or a Runtime.
 
     Raises:
-        InputError: options that the method does not have, or what is no scan, method, grid or partial result.
+        InputError: options that the method does not have, or anything but a scan, method, grid or partial result.
         NumericalError: numbers overflow.
         KeyboardInterrupt: see ``on_interrupt``.
     """
@@ -231,7 +235,7 @@ def reconstruct(
 
 
 def _first_volume(initial: object, grid: Grid) -> InitialVolume:
-    """What ``initial`` says, with its grid; InputError for what is no volume, or has other voxels."""
+    """Returns the first volume with its grid; InputError for anything else, and for other voxels."""
     if isinstance(initial, Reconstruction):
         return InitialVolume(initial.volume, initial.grid)
     if not isinstance(initial, np.ndarray):
@@ -246,7 +250,7 @@ def _checked_path(path: object) -> Path:
 
 
 def check_scan(scan: object, subject: str = "scan") -> None:
-    """InputError for what is no Scan."""
+    """Raises InputError for anything but a Scan."""
     if not isinstance(scan, Scan):
         remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
         raise InputError(subject, checks.shown(scan), "a Scan", remedy)
@@ -263,7 +267,7 @@ def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt:
 
 @contextmanager
 def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
-    """The report that is meant, and what says the line's last words; the line is ended with the body."""
+    """Yields the report, and a function that ends its line with a text."""
     if not isinstance(report, bool):
         yield report, lambda text: None
     elif not (report and has_reader()):

@@ -1,4 +1,4 @@
-"""Scans from arrays: frames, a geometry and angles are enough."""
+"""Scans from arrays: frames, a geometry and angles."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -23,7 +23,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
 
 log = logging.getLogger(__name__)
-# how messages call what ``fly_scan`` takes under another name
+# the arguments of ``fly_scan`` that have another name in a Scan
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "readout_s": "readout_ratio", "readout_axis": "readout",
 }  # fmt: skip
@@ -52,26 +52,27 @@ def fly_scan(
     grid: Grid | None = None,
     **others: Any,
 ) -> Scan:
-    """A scan whose gantry never stops, from arrays.
+    """Returns a scan whose gantry never stops, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts where ``flats`` are given.
+    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts together with ``flats``.
     geometry: distances and pixels in mm.
-    angles_deg: (F,) the gantry's in degrees, as each frame's first line opens; 0 with the source on +x, counterclockwise
-    seen from above (+z). A sample that turns has the opposite sign.
-    exposure_deg: the arc of one line's exposure, below 0 for a gantry that turns clockwise; by fps and exposure_s when None.
-    readout_ratio: readout over exposure time, from the first line's opening to the last's; 0, when None: a global shutter.
-    readout: what is read out at one time, "rows" or "columns". readout_direction: 1 index 0 first, -1 last.
-    exposure_s: of one line, s; 1 when None, or by fps and exposure_deg.
-    first, fps, readout_ms: a data sheet's words. first: which line is read first, "top", "bottom", "left" or "right" seen
-    from the source, for readout and readout_direction. fps: frames per second. readout_ms: for readout_ratio.
-    flats, darks: (n, rows, columns) counts without an object, and without a beam (0 when None).
-    mask: (rows, columns) or (F, rows, columns), non-zero where a pixel must not be used.
-    quantity: what ``frames`` hold, "attenuation", "transmission" or "counts", where ``flats`` do not say it.
-    grid: the cube that a full turn sees, no higher than the panel does, in voxels of one pixel at the axis, when None.
+    angles_deg: (F,) the gantry's angle in degrees when a frame's first line opens; 0 with the source on +x,
+    counterclockwise seen from above (+z). A sample that turns has the opposite sign.
+    exposure_deg: the arc of one line's exposure, below 0 for a clockwise gantry; None takes it from fps and exposure_s.
+    readout_ratio: readout over exposure time, from the opening of the first line to that of the last; None is 0, a global
+    shutter. readout: the lines that are read one after the other, "rows" or "columns". readout_direction: 1 reads index 0
+    first, -1 last. exposure_s: of one line, in s; None is 1, or follows from fps and exposure_deg.
+    first, fps, readout_ms: the terms of data sheets. first: the line that is read first, "top", "bottom", "left" or "right"
+    seen from the source, in place of readout and readout_direction. fps: frames per second. readout_ms: in place of
+    readout_ratio.
+    flats, darks: (n, rows, columns) counts without an object, and without a beam (None is 0).
+    mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
+    quantity: of ``frames``, "attenuation", "transmission" or "counts", where ``flats`` do not tell.
+    grid: None is the cube that a full turn sees, as high as the panel sees, in voxels of one pixel at the axis.
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
-    Raises InputError for shapes that do not fit, numbers out of range or implausible, words that contradict each other, and
-    angles that turn against the exposure.
+    Raises InputError for shapes that do not fit, numbers out of range or implausible, contradictory arguments, and angles
+    whose sense differs from the exposure's.
     """
     check_others(others, _keywords(fly_scan))
     axis, direction = readout_order(first, readout, readout_direction, lambda name: _ARGUMENTS.get(name, name))
@@ -106,7 +107,7 @@ def fly_scan(
 
 
 def _warn_of_exposure(steps: np.ndarray) -> None:
-    """Warns of steps (F − 1,), in exposures, that are as long as if the exposure were in radians."""
+    """Warns of steps (F − 1,), in exposures, that suggest an exposure in radians."""
     least_step = steps.min(initial=np.inf)
     if np.rad2deg(1 - _SLACK) < least_step < np.inf:
         log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
@@ -124,10 +125,10 @@ def static_scan(
     grid: Grid | None = None,
     **others: Any,
 ) -> Scan:
-    """A scan whose gantry stops for every frame, from arrays.
+    """Returns a scan whose gantry stops for every frame, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's, from
-    +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: as of ``fly_scan``.
+    frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's angle
+    from +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: those of ``fly_scan``.
 
     Raises InputError for shapes that do not fit and numbers out of range.
     """
@@ -141,14 +142,14 @@ def static_scan(
 
 
 def _warn_of_transmission(frames: np.ndarray) -> None:
-    """Says what frames (F, rows, columns) look like that are 1 in air, at their left and right borders, and less within."""
+    """Warns of frames (F, rows, columns) that look like transmissions: 1 at the left and right borders, less between."""
     border, brighter = np.median(frames[..., [0, -1]]), np.count_nonzero(frames > 1 + _AIR_SLACK)
     if abs(border - 1) < _AIR_SLACK and brighter < 0.01 * frames.size and np.min(frames) < 1 - _AIR_SLACK:
         log.warning('frames: 1 at their borders, and less within: are they transmissions? quantity="transmission"')
 
 
 def _keywords(function: Callable[..., Scan]) -> list[str]:
-    """Names of what a function takes by name only."""
+    """Returns the names of a function's keyword-only arguments."""
     return [one.name for one in signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
 
 
@@ -160,7 +161,7 @@ def _pixels(
     mask: "ArrayLike | None",
     quantity: str | None,
 ) -> LineIntegrals:
-    """Frames of any quantity as line integrals, with the pixels not to be used."""
+    """Returns frames of any quantity as line integrals, with the mask of unusable pixels."""
     if not isinstance(geometry, ConeGeometry):
         raise InputError("geometry", checks.shown(geometry), "a ConeGeometry")
     panel = geometry.detector_shape
@@ -206,7 +207,7 @@ def _scan(
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
-    """Frames (n, rows, columns) of real numbers."""
+    """Returns checked frames (n, rows, columns) of real numbers."""
     stack = checks.real_array(name, frames)
     checks.shape(name, stack, (None, *panel))
     if len(stack) == 0:

@@ -55,7 +55,7 @@ def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS
 
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``, for two volumes (z, y, x).
+    """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``; volume and reference are (z, y, x).
 
     Raises InputError for an empty reference, shapes that differ, NaN and infinity.
     """
