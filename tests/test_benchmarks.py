@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cost_model
 import h5py
 import numpy as np
 import pytest
@@ -88,7 +87,6 @@ def test_benchmarks_that_append_lines_are_resumed(tmp_path) -> None:
     with h5py.File(tmp_path / "ball_32.h5", "w") as file:
         file["volume"] = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < 0.5).astype(np.float32)
     for name, words, row, count in (
-        ("time_to_psnr.py", "{tmp} {lines} --quick --names ball", "| ball | 16 | exact |", 2),
         ("calibrate.py", "{tmp} {lines} --cases wobble --size 16 --views 8 --seeds 1", "| wobble | 16, 8 | shift-u", 1),
         ("bead_bias.py", "{lines} --size XS --trials stop-and-shoot", "| stop-and-shoot | fista-tv |", 1),
     ):
@@ -123,27 +121,3 @@ def test_estimates_are_checked(tmp_path) -> None:
     (line,) = facts["runs"]
     assert line["ratio"]["device_bytes"] == pytest.approx(1, rel=0.3)
     assert line["happened"]["host_bytes"] > 10_000_000
-
-
-def test_margins_of_coarser_voxels() -> None:
-    *_, line = run("coarse_margin.py", "--phantoms", "jaw", "--size", "16", "--iterations", "2").splitlines()
-    assert line.startswith("| jaw |") and line.count("|") == 5
-
-
-def test_startup(tmp_path) -> None:
-    told = run("startup.py", "--repeat", "1", "--json", str(tmp_path / "facts.json"))
-    rows = json.loads((tmp_path / "facts.json").read_text())["rows"]
-    assert len(rows) == 6 and all(f"| `{row['command']}` |" in told for row in rows)
-    assert all(row["import_s"] > 0 and row["cpu_s"] > 0 for row in rows)
-
-
-def test_a_model_of_cost_reads_what_oclgrind_counts() -> None:
-    """Registers are no instructions; the longer of both bounds is taken, in milliseconds."""
-    counts = "  1,000 - load global (4 bytes)\n  30 - fmul\n  7 - phi\n  5 - load private (20 bytes)\n".replace(",", "")
-    report = "".join(f"Instructions executed for kernel '{name}':\n{counts}\n" for name in ("one", "two"))
-    assert cost_model.instructions(report) == [("one", 1030), ("two", 1030)]
-    costs = {"one": (41.3e9, 1.008e9), "two": (41.3e6, 2.016e9)}
-    assert cost_model.times_ms(costs)["RTX 4090"] == {
-        "one": (pytest.approx(1), "instructions"), "two": (pytest.approx(2), "bytes")
-    }  # fmt: skip
-    assert "| all | | | **3** |" in cost_model.table("both", costs)

@@ -1,4 +1,4 @@
-"""What a command imports before it answers: seconds that nobody has to wait for. Times: benchmarks/startup.py."""
+"""What a command imports before it answers: seconds that nobody has to wait for."""
 
 import subprocess
 import sys
