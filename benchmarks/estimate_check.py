@@ -18,7 +18,7 @@ from measuring import Facts, child, finish, median, parser_of, where
 
 from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.api import save_scan
-from phyradgs_cl.estimate import estimate, peak_host_bytes, seconds_around, seconds_since_start
+from phyradgs_cl.estimate import estimate, peak_host_bytes, seconds_around
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.runtime import Runtime
@@ -52,7 +52,7 @@ def said(scan: Path, name: str, device: str | None, iterations: int | None) -> F
     """What an estimate says, in this process."""
     method, changes = changed(name, iterations)
     loaded, rt = load_scan(scan), Runtime(device)
-    before_s = seconds_since_start()
+    before_s = time.process_time()
     plan = plan_run(method, changes)
     found = estimate(loaded, plan, rt, around=lambda result: before_s + seconds_around(scan, loaded, result))
     return {

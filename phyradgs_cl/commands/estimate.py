@@ -1,10 +1,12 @@
 """estimate: what a reconstruction would take."""
 
+import time
+
 from phyradgs_cl.commands.console import say
 from phyradgs_cl.commands.options import Scan
 from phyradgs_cl.commands.run_options import GROUPS as GROUPS
 from phyradgs_cl.commands.run_options import with_run_options
-from phyradgs_cl.estimate import duration, estimate, seconds_around, seconds_since_start
+from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.reconstructors import Reconstruction
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan
@@ -18,7 +20,7 @@ def estimate_command(scan: Scan, settings: Settings) -> None:
     plan = settings.plan()
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
-    before_s = seconds_since_start()  # a run will have started, and read the scan, as this did
+    before_s = time.process_time()  # a run will start, and read the scan, as this command did
 
     def around(result: Reconstruction) -> float:
         return before_s + seconds_around(scan, loaded, result)

@@ -29,9 +29,10 @@ _FORM = "a function (scan, options, rt, …)"
 
 @dataclass(frozen=True)
 class Method:
-    """A reconstruction method: how to run it, its option presets (the first is the default), can it be resumed, can
-    several ranks share its work, may it start from a volume, are short runs the beginnings of longer ones, may it end before
-    its last iteration with some options.
+    """A reconstruction method: its function, and its presets of options, of which the first is the default.
+
+    is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
+    ends_anywhere: its short runs are the beginnings of its long ones.
     """
 
     run: Callable[..., Reconstruction]
@@ -40,7 +41,6 @@ class Method:
     is_shared: bool = False
     takes_initial: bool = False
     ends_anywhere: bool = False
-    stops_itself: Callable[[Any], bool] = lambda options: False
 
 
 @dataclass(frozen=True)

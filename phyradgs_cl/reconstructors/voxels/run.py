@@ -173,8 +173,7 @@ def voxel_method(
             volumes=held, frames=frames,
         )  # fmt: skip
 
-    presets, stops = {"default": default}, lambda options: options.noise_stop > 0
-    return Method(run, presets, is_shared=True, takes_initial=True, ends_anywhere=True, stops_itself=stops)
+    return Method(run, {"default": default}, is_shared=True, takes_initial=True, ends_anywhere=True)
 
 
 class _Iterations:
