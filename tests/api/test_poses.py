@@ -85,19 +85,6 @@ def test_gauges_are_left_out(scan) -> None:
     assert np.allclose(kept.trajectory.pose(0, np.zeros(1)), scan.trajectory.pose(0, np.zeros(1)))
 
 
-def test_what_does_not_fit_is_named(rt, scan, cloud) -> None:
-    for call, subject in (
-        (lambda: move_views(scan, np.zeros((2, 3))), "views"),
-        (lambda: pose_gradient(scan, cloud, np.zeros((2, 3)), device=rt), "by_frames"),
-        (lambda: pose_gradient(scan, cloud.rows(), weights(scan), device=rt), "x: .*from_rows"),
-        (lambda: pose_gradient(scan, cloud, np.full_like(weights(scan), np.nan), device=rt), "by_frames"),
-        (lambda: pose_gradient(scan, scan.reference, np.zeros((2, 3)), device=rt), "by_frames"),
-        (lambda: splat_operator(scan, device=rt).intensity.by_poses(cloud, weights(scan)), "by_poses"),
-    ):
-        with pytest.raises(InputError, match=subject):
-            call()
-
-
 def test_a_file_with_one_pose_at_a_time_says_so(rt, tmp_path) -> None:
     scan = simulate("jaw", size=8, detector=12, views=6, exposure_deg=60.0, device=rt)
     assert scan.shutter.span_s > np.diff(scan.frame_start_s).min()

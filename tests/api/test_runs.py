@@ -137,24 +137,3 @@ def test_a_volume_file_can_be_scanned(rt, scan, tmp_path) -> None:
     api.save_volume(tmp_path / "v.h5", result)
     again = api.simulate(tmp_path / "v.h5", size=6, detector=10, views=2, device=rt)
     assert again.grid.shape == (6, 6, 6) and again.projections.max() > 0
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: api.simulate("foot", dosis=3), "option dosis.*dose"),
-        (lambda: api.simulate("foot", size=0), "size"),
-        (lambda: api.simulate("foot", truncation=2), "^truncation: found 2"),
-        (lambda: api.simulate("elbow"), "elbow"),
-        (lambda: api.simulate("foot", protocol="slow"), "protocol"),
-        (lambda: api.load_scan("nowhere.h5"), "nowhere.h5"),
-    ],
-)
-def test_what_is_wrong_is_named(call, words) -> None:
-    with pytest.raises(InputError, match=words):
-        call()
-
-
-def test_an_unknown_option_of_a_method_is_named(scan) -> None:
-    with pytest.raises(InputError, match="iteration.*did you mean"):
-        api.reconstruct(scan, "sart", iteration=3)

@@ -9,7 +9,6 @@ from phyradgs_cl.acquisition import CircularOrbit, PoseTable
 from phyradgs_cl.api import (
     ConeGeometry,
     Gaussians,
-    Grid,
     Scan,
     load_scan,
     reconstruct,
@@ -154,31 +153,3 @@ def test_rows_may_run_down(rt, scan) -> None:
     for method in ({"method": "fdk"}, {"method": "sirt", "iterations": 3}):
         up, turned = (reconstruct(s, device=rt, **method).volume for s in (still, down))
         assert np.abs(up - turned).max() < 1e-4 * up.max(), method
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: Scan.from_tigre(tigre(mode="parallel"), ANGLES, FRAMES), "geo.mode: found 'parallel'"),
-        (lambda: Scan.from_tigre(tigre(DSD=None), ANGLES, FRAMES), "geo.DSD: found nothing"),
-        (
-            lambda: Scan.from_tigre(tigre(rotDetector=np.array([0.1, 0, 0])), ANGLES, FRAMES),
-            "geo.rotDetector: found 0.1",
-        ),
-        (
-            lambda: Scan.from_tigre(tigre(), np.ones((4, 3)), FRAMES),
-            "angles: found 1.0; expected turns about z",
-        ),
-        (lambda: Scan.from_tigre(tigre(DSO=np.ones(3)), ANGLES, FRAMES), r"geo.DSO: found shape \(3,\)"),
-        (lambda: Scan.from_tigre(tigre(nVoxel=[8, 8.5, 8]), ANGLES, FRAMES), "geo.nVoxel.*whole numbers"),
-        (lambda: Scan.from_tigre(tigre(), ANGLES, FRAMES[:3]), r"frames: found shape \(3, 23, 29\)"),
-        (lambda: Scan.from_astra(FRAMES.swapaxes(0, 1), astra_vectors()), r"frames.swapaxes\(0, 1\)"),
-        (lambda: Scan.from_astra(FRAMES, astra_vectors()[:, :9]), r"vectors: found shape \(4, 9\)"),
-        (lambda: Scan.from_poses(FRAMES, np.zeros((4, 12))), "poses: found parallel pixel steps"),
-        (lambda: Scan.from_tigre(tigre(), ANGLES, FRAMES, grid=Grid.cube(4, 2.0)), "grid: found no such option"),
-        (lambda: Scan.from_astra(FRAMES, exchanged()), "poses: found the grid behind the panel .*exchanged"),
-    ],
-)
-def test_what_does_not_fit_is_named(make, words) -> None:
-    with pytest.raises(InputError, match=words):
-        make()

@@ -1,4 +1,4 @@
-"""Mutation testing of a room: python -m tests.mutation ROOM [--count N] [--seed N] [--timeout S] [--again FILE].
+"""Mutation testing of a room: python -m tests.mutation ROOM [--count N] [--seed N].
 
 Changes a copy of the sources in one place after the other and runs the room's tests, which are to fail. One line per
 mutant on standard output; docs/results/tests.md has a verdict on those that live. POSIX only: a test run is a fork of a
@@ -34,7 +34,7 @@ TESTS = {
 
 
 def main() -> int:
-    asked = _arguments()
+    options = _arguments()
     for name in IMPORTED:
         importlib.import_module(name)
     with tempfile.TemporaryDirectory() as folder:
@@ -46,16 +46,16 @@ def main() -> int:
             else:
                 shutil.copy(source, tree / name)
         started = time.monotonic()
-        if _outcome(tree, asked.room, 600) != "lives":
+        if _outcome(tree, options.room, 600) != "lives":
             print("the tests fail without any mutant", file=sys.stderr)
             return 1
-        limit_s = int(asked.timeout or 3 * (time.monotonic() - started) + 10)
+        limit_s = int(3 * (time.monotonic() - started) + 10)
         sys.dont_write_bytecode = True  # two mutants of one size in one second would share their bytecode
-        shutil.rmtree(tree / "phyradgs_cl" / asked.room / "__pycache__", ignore_errors=True)
+        shutil.rmtree(tree / "phyradgs_cl" / options.room / "__pycache__", ignore_errors=True)
         counts = {"killed": 0, "lives": 0, "too long": 0}
-        for path, mutant in _chosen(asked):
-            counts[_tried(tree, asked.room, path, mutant, limit_s)] += 1
-    print(f"{asked.room}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
+        for path, mutant in _drawn(options):
+            counts[_tried(tree, options.room, path, mutant, limit_s)] += 1
+    print(f"{options.room}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
     return 0
 
 
@@ -64,30 +64,21 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("room", choices=TESTS)
     parser.add_argument("--count", type=int, help="draw so many of all mutants")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--timeout", type=float, help="seconds that the tests may take (3 times as long as without)"
-    )
-    parser.add_argument("--again", type=Path, help="only those that live in this earlier output")
     return parser.parse_args()
 
 
-def _chosen(asked: argparse.Namespace) -> list[tuple[Path, Mutant]]:
+def _drawn(options: argparse.Namespace) -> list[tuple[Path, Mutant]]:
     every = [
         (path.relative_to(ROOT), mutant)
-        for path in sorted((ROOT / "phyradgs_cl" / asked.room).glob("*.py"))
+        for path in sorted((ROOT / "phyradgs_cl" / options.room).glob("*.py"))
         if path.name != "plot.py"  # figures: tests/api looks at them
         for mutant in mutants(path.read_bytes())
     ]
     chosen = every
-    if asked.again is not None:
-        lived = {
-            line.partition(": ")[2] for line in asked.again.read_text().splitlines() if "lives" in line[:5]
-        }
-        chosen = [one for one in every if f"{one[0]}:{one[1]}" in lived]
-    elif asked.count is not None and asked.count < len(every):
-        drawn = random.Random(asked.seed).sample(every, asked.count)
+    if options.count is not None and options.count < len(every):
+        drawn = random.Random(options.seed).sample(every, options.count)
         chosen = sorted(drawn, key=lambda one: (one[0], one[1].start))
-    print(f"{asked.room}: {len(every)} mutants, {len(chosen)} tried", flush=True)
+    print(f"{options.room}: {len(every)} mutants, {len(chosen)} tried", flush=True)
     return chosen
 
 
